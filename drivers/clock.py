@@ -1,0 +1,36 @@
+"""Time as a parameter: everything that waits takes a Clock.
+
+The in-process fake bus brings a clock of its own on which sleeping costs nothing; see `fakes.clock`.
+"""
+
+import time
+from typing import Protocol
+
+SPIN_S = 300e-6
+"""How long before a deadline the wall clock stops sleeping and spins. Sleeping wakes up to 0.2 ms late."""
+
+
+class Clock(Protocol):
+    """Monotonic time in seconds, and the means to wait for it."""
+
+    def now(self) -> float:
+        """Seconds since an arbitrary start, never going back."""
+        ...
+
+    def wait_until(self, deadline: float) -> None:
+        """Return at `deadline` [s, on this clock], or at once when it has passed."""
+        ...
+
+
+class WallClock:
+    """The machine's monotonic clock. Sleeps to just before the deadline, then spins."""
+
+    def now(self) -> float:
+        return time.perf_counter()
+
+    def wait_until(self, deadline: float) -> None:
+        remaining = deadline - time.perf_counter()
+        if remaining > SPIN_S:
+            time.sleep(remaining - SPIN_S)
+        while time.perf_counter() < deadline:
+            pass

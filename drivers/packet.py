@@ -1,0 +1,175 @@
+"""Dynamixel Protocol 2.0 packets, both directions: CRC, byte stuffing, building and finding them in a stream.
+
+Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". A packet on the wire is
+
+    FF FF FD 00  ID  LEN_L LEN_H  INST  [ERR]  PARAM...  CRC_L CRC_H
+
+LEN counts from INST to the CRC. Stuffing is applied to INST..last parameter, then LEN is set, then the CRC is taken
+over everything before it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+from fastcrc import crc16
+
+HEADER = b"\xff\xff\xfd\x00"
+BROADCAST_ID = 0xFE
+MAX_ID = 252
+MAX_LENGTH = 1024
+"""Longest LEN believed; beyond it the bytes are noise that looks like a header."""
+
+_STUFFED = b"\xff\xff\xfd"
+
+
+class Instruction(IntEnum):
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    CONTROL_TABLE_BACKUP = 0x20
+    STATUS = 0x55
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
+
+
+class StatusError(IntEnum):
+    """Low seven bits of a status packet's ERR byte."""
+
+    NONE = 0
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    CRC = 3
+    DATA_RANGE = 4
+    DATA_LENGTH = 5
+    DATA_LIMIT = 6
+    ACCESS = 7
+
+
+ALERT = 0x80
+"""ERR bit 7: the servo's Hardware Error Status is not zero."""
+
+
+class HardwareError(IntFlag):
+    """Bits of Hardware Error Status and of the Shutdown mask."""
+
+    INPUT_VOLTAGE = 1 << 0
+    OVERHEATING = 1 << 2
+    ENCODER = 1 << 3
+    ELECTRICAL_SHOCK = 1 << 4
+    OVERLOAD = 1 << 5
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet with its stuffing removed. `body` is what stands between INST and CRC; in a status, ERR comes first."""
+
+    id: int
+    instruction: int
+    body: bytes
+
+    @property
+    def is_status(self) -> bool:
+        return self.instruction == Instruction.STATUS
+
+    @property
+    def error(self) -> int:
+        """The ERR byte of a status packet."""
+        return self.body[0]
+
+    @property
+    def data(self) -> bytes:
+        """The parameters of a status packet."""
+        return self.body[1:]
+
+
+def crc(data: bytes) -> int:
+    """CRC-16 of the servos: polynomial 0x8005, initial value 0, not reflected."""
+    return int(crc16.umts(data))
+
+
+def stuff(payload: bytes) -> bytes:
+    """Insert an FD after every FF FF FD, so that a header can never appear inside a packet."""
+    return payload.replace(_STUFFED, _STUFFED + b"\xfd")
+
+
+def unstuff(payload: bytes) -> bytes:
+    """Undo `stuff`."""
+    return payload.replace(_STUFFED + b"\xfd", _STUFFED)
+
+
+def encode(packet_id: int, instruction: int, body: bytes = b"") -> bytes:
+    """The bytes of one packet on the wire."""
+    payload = stuff(bytes((instruction,)) + body)
+    unsigned = HEADER + bytes((packet_id,)) + (len(payload) + 2).to_bytes(2, "little") + payload
+    return unsigned + crc(unsigned).to_bytes(2, "little")
+
+
+def encode_status(packet_id: int, error: int, data: bytes = b"") -> bytes:
+    """The bytes of one status packet on the wire."""
+    return encode(packet_id, Instruction.STATUS, bytes((error,)) + data)
+
+
+class Framer:
+    """Finds packets in a stream of bytes, and finds the next one again after noise.
+
+    A packet whose CRC does not match is kept too (`bad_crc` counts them), because a servo answers it with an error.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.bad_crc = 0
+        self.noise_bytes = 0
+
+    def feed(self, data: bytes) -> Iterator[Packet]:
+        """Take bytes as they come; yield each whole packet with a good CRC."""
+        self._buffer += data
+        while (packet := self._next()) is not None:
+            yield packet
+
+    def reset(self) -> None:
+        """Forget a packet that was begun, as a servo does after a gap of 1.5 ms between bytes."""
+        self.noise_bytes += len(self._buffer)
+        self._buffer.clear()
+
+    def _next(self) -> Packet | None:
+        buffer = self._buffer
+        while True:
+            start = buffer.find(HEADER)
+            if start < 0:
+                # Keep what may be the beginning of a header.
+                self._drop(max(0, len(buffer) - len(HEADER) + 1))
+                return None
+            self._drop(start)
+            if len(buffer) < 7:
+                return None
+            length = buffer[5] | buffer[6] << 8
+            if length < 3 or length > MAX_LENGTH or buffer[4] == 0xFF:
+                self._drop(1)
+                continue
+            end = 7 + length
+            if len(buffer) < end:
+                return None
+            raw = bytes(buffer[:end])
+            if crc(raw[:-2]) != raw[-2] | raw[-1] << 8:
+                # The length itself may be what was corrupted: look for a header right behind this one.
+                self.bad_crc += 1
+                self._drop(1)
+                continue
+            del buffer[:end]
+            payload = unstuff(raw[7:-2])
+            return Packet(raw[4], payload[0], payload[1:])
+
+    def _drop(self, count: int) -> None:
+        if count:
+            self.noise_bytes += count
+            del self._buffer[:count]

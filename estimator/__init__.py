@@ -1,0 +1,1 @@
+"""Mathematics without input or output: excitation, arm model, Fourier analysis, estimators, uncertainty."""
