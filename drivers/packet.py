@@ -73,7 +73,7 @@ class HardwareError(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet with its stuffing removed. `body` is what stands between INST and CRC; in a status, ERR comes first."""
+    """One packet with its stuffing removed. `body` stands between INST and CRC; in a status, ERR comes first."""
 
     id: int
     instruction: int

@@ -1,0 +1,110 @@
+"""Control tables: which register stands where in which model.
+
+Read from the `.model` files that the `dynamixel-sdk` package ships (one per model, tab separated), so that no table is
+copied here. They hold addresses and sizes; what a register means is in the ROBOTIS e-Manual.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from types import MappingProxyType
+
+from drivers.errors import UnknownModel
+
+_SIGNED = frozenset(
+    {
+        "Homing Offset",
+        "Goal PWM",
+        "Goal Current",
+        "Goal Velocity",
+        "Goal Position",
+        "Present PWM",
+        "Present Current",
+        "Present Load",
+        "Present Velocity",
+        "Present Position",
+        "Velocity Trajectory",
+        "Position Trajectory",
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """One entry of a control table; `size` in bytes."""
+
+    name: str
+    address: int
+    size: int
+
+    @property
+    def signed(self) -> bool:
+        """Whether the value is two's complement. The `.model` files say so of a few registers only."""
+        return self.name in _SIGNED
+
+    def encode(self, value: int) -> bytes:
+        """The register's bytes; OverflowError when the value does not fit."""
+        return value.to_bytes(self.size, "little", signed=self.signed)
+
+    def decode(self, data: bytes) -> int:
+        return int.from_bytes(data, "little", signed=self.signed)
+
+
+@dataclass(frozen=True, slots=True)
+class ControlTable:
+    """All registers of one model, by name. `number` is what the servo answers to a ping."""
+
+    model: str
+    number: int
+    registers: Mapping[str, Register]
+
+    def __getitem__(self, name: str) -> Register:
+        return self.registers[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.registers
+
+
+def _folder() -> Path:
+    # find_spec does not import the package, which would load more than we read.
+    spec = find_spec("dynamixel_easy_sdk")
+    if spec is None or spec.origin is None:
+        raise UnknownModel(
+            "The package dynamixel-sdk (4.1 or newer), which holds the control tables, is not installed."
+        )
+    return Path(spec.origin).parent / "control_table"
+
+
+@cache
+def model_names() -> Mapping[int, str]:
+    """Model number -> model name as printed on the servo, for every model with a control table."""
+    names: dict[int, str] = {}
+    for line in (_folder() / "dynamixel.model").read_text(encoding="utf-8").splitlines()[1:]:
+        number, _, file = line.partition("\t")
+        if file:
+            names[int(number)] = file.strip().removesuffix(".model").upper().replace("_", "-")
+    return MappingProxyType(names)
+
+
+@cache
+def load_control_table(model: str) -> ControlTable:
+    """The control table of a model, e.g. "XM430-W350"; raises UnknownModel."""
+    for number, name in model_names().items():
+        if name == model.upper():
+            file = _folder() / f"{name.lower().replace('-', '_')}.model"
+            registers = _read_registers(file)
+            return ControlTable(name, number, MappingProxyType(registers))
+    raise UnknownModel(f"Unknown servo model {model!r}. Known: {', '.join(sorted(model_names().values()))}.")
+
+
+def _read_registers(file: Path) -> dict[str, Register]:
+    _, _, section = file.read_text(encoding="utf-8").partition("[control table]")
+    registers: dict[str, Register] = {}
+    for line in section.splitlines():
+        fields = line.strip().split("\t")
+        if len(fields) == 3 and fields[0].isdigit():
+            address, size, name = int(fields[0]), int(fields[1]), fields[2]
+            registers[name] = Register(name, address, size)
+    return registers

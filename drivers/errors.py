@@ -1,0 +1,53 @@
+"""What can go wrong between the computer and the servos.
+
+DriverError
+├── UnknownModel        a model name or number that no control table describes
+├── PortNotOpened       the port does not exist, is taken, or may not be opened
+├── PortLost            the port was open and then failed: cable pulled, adapter gone
+├── NoReply             a servo did not answer: wrong ID, wrong baud rate, no power
+├── WrongReply          a servo answered with something that is not an answer to the question
+├── ServoRefused        a servo answered with an error code: access, range, limit
+├── WrongModel          another model, or one whose firmware is too old, answers at this ID
+├── WrongSetting        a register holds a value with which no experiment may start
+└── TorqueNotOff        a servo could not be confirmed to be without torque
+"""
+
+
+class DriverError(Exception):
+    """Anything that went wrong between the computer and the servos."""
+
+
+class UnknownModel(DriverError):
+    """No control table describes this model. Example: `model = "XM430-W351"` in the TOML."""
+
+
+class PortNotOpened(DriverError):
+    """The port could not be opened. Example: the adapter is unplugged, or the user is not in group `dialout`."""
+
+
+class PortLost(DriverError):
+    """The port failed after it was open. Example: the USB cable was pulled while the arm moved."""
+
+
+class NoReply(DriverError):
+    """A servo did not answer in time. Example: no power on the bus, or a baud rate that is not the servo's."""
+
+
+class WrongReply(DriverError):
+    """The answer was damaged or not one to the question. Example: two servos with the same ID talk at once."""
+
+
+class ServoRefused(DriverError):
+    """The servo understood and refused. Example: an EEPROM register written while torque is on."""
+
+
+class WrongModel(DriverError):
+    """Not the servo that the configuration describes. Example: an XL430 where an XM430-W350 should be."""
+
+
+class WrongSetting(DriverError):
+    """A register forbids the experiment. Example: Drive Mode with Torque On by Goal Update."""
+
+
+class TorqueNotOff(DriverError):
+    """Torque off could not be confirmed for every servo. Example: the cable was pulled: cut the supply."""
