@@ -1,7 +1,7 @@
 """Control tables of the fake servos: what each register is, where it lies, what may be written to it.
 
-Addresses and sizes come from the `.model` files of dynamixel-sdk. Area, access, factory values and ranges are not in
-those files; they are written down here, from the control tables of the ROBOTIS e-Manual (pages x/<model>). Two
+Addresses, sizes and signs come from `drivers.control_table`. Area, access, factory values and ranges are not known
+there; they are written down here, from the control tables of the ROBOTIS e-Manual (pages x/<model>). Two
 entries differ from what some revisions of those pages print: the Min Voltage Limit's range, given there as 110 to 300
 around a factory value of 95, is 95 to 160 as on the sister models; and Protocol Type accepts 2 alone, because a fake
 servo speaks nothing else.
@@ -12,8 +12,8 @@ Indirect addresses and data (168 and up) are not part of these tables yet: readi
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.util import find_spec
-from pathlib import Path
+
+from drivers.control_table import load_control_table
 
 EEPROM_END = 64
 """First address of the RAM area on every X-series servo."""
@@ -60,17 +60,15 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class _Facts:
-    """What the SDK's file does not say about one register. `limits` None: everything its bytes can hold."""
+    """What `drivers.control_table` does not say about one register. `limits` None: everything its bytes can hold."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None
     writable: bool = True
-    signed: bool = False
 
 
 _GAIN = (0, 16_383)
 _READ_ONLY = _Facts(writable=False)
-_READ_ONLY_SIGNED = _Facts(writable=False, signed=True)
 
 _X_SERIES: dict[str, _Facts] = {
     "Model Number": _READ_ONLY,
@@ -83,7 +81,7 @@ _X_SERIES: dict[str, _Facts] = {
     "Operating Mode": _Facts(3, (0, 16)),
     "Secondary(Shadow) ID": _Facts(255),
     "Protocol Type": _Facts(2, (2, 2)),
-    "Homing Offset": _Facts(0, (-1_044_479, 1_044_479), signed=True),
+    "Homing Offset": _Facts(0, (-1_044_479, 1_044_479)),
     "Moving Threshold": _Facts(10, (0, 1023)),
     "Temperature Limit": _Facts(80, (0, 100)),
     "Max Voltage Limit": _Facts(160, (95, 160)),
@@ -111,22 +109,22 @@ _X_SERIES: dict[str, _Facts] = {
     "Feedforward 2nd Gain": _Facts(0, _GAIN),
     "Feedforward 1st Gain": _Facts(0, _GAIN),
     "Bus Watchdog": _Facts(0, (0, 127)),
-    "Goal PWM": _Facts(signed=True),
-    "Goal Current": _Facts(signed=True),
-    "Goal Velocity": _Facts(signed=True),
+    "Goal PWM": _Facts(),
+    "Goal Current": _Facts(),
+    "Goal Velocity": _Facts(),
     "Profile Acceleration": _Facts(0, (0, 32_767)),
     "Profile Velocity": _Facts(0, (0, 32_767)),
-    "Goal Position": _Facts(signed=True),
+    "Goal Position": _Facts(),
     "Realtime Tick": _READ_ONLY,
     "Moving": _READ_ONLY,
     "Moving Status": _READ_ONLY,
-    "Present PWM": _READ_ONLY_SIGNED,
-    "Present Current": _READ_ONLY_SIGNED,
-    "Present Load": _READ_ONLY_SIGNED,
-    "Present Velocity": _READ_ONLY_SIGNED,
-    "Present Position": _READ_ONLY_SIGNED,
-    "Velocity Trajectory": _READ_ONLY_SIGNED,
-    "Position Trajectory": _READ_ONLY_SIGNED,
+    "Present PWM": _READ_ONLY,
+    "Present Current": _READ_ONLY,
+    "Present Load": _READ_ONLY,
+    "Present Velocity": _READ_ONLY,
+    "Present Position": _READ_ONLY,
+    "Velocity Trajectory": _READ_ONLY,
+    "Position Trajectory": _READ_ONLY,
     "Present Input Voltage": _READ_ONLY,
     "Present Temperature": _READ_ONLY,
     "External Port Data 1": _Facts(0),
@@ -137,7 +135,6 @@ _X_SERIES: dict[str, _Facts] = {
 
 @dataclass(frozen=True, slots=True)
 class _ModelFacts:
-    number: int
     current_unit_a: float
     fast_read_firmware: int
     differs: Mapping[str, _Facts] = field(default_factory=dict)
@@ -146,10 +143,9 @@ class _ModelFacts:
 
 
 _MODELS: dict[str, _ModelFacts] = {
-    "XM430-W350": _ModelFacts(1020, 2.69e-3, 45),
-    "XM430-W210": _ModelFacts(1030, 2.69e-3, 45, {"Velocity Limit": _Facts(330, (0, 1023))}),
+    "XM430-W350": _ModelFacts(2.69e-3, 45),
+    "XM430-W210": _ModelFacts(2.69e-3, 45, {"Velocity Limit": _Facts(330, (0, 1023))}),
     "XH430-W350": _ModelFacts(
-        1000,
         2.69e-3,
         45,
         {
@@ -159,13 +155,11 @@ _MODELS: dict[str, _ModelFacts] = {
         },
     ),
     "XM540-W270": _ModelFacts(
-        1120,
         2.69e-3,
         45,
         {"Current Limit": _Facts(2047, (0, 2047)), "Velocity Limit": _Facts(128, (0, 1023))},
     ),
     "XL330-M288": _ModelFacts(
-        1200,
         1.0e-3,
         46,
         {
@@ -183,7 +177,6 @@ _MODELS: dict[str, _ModelFacts] = {
         nominal_voltage_v=5.0,
     ),
     "XC330-T288": _ModelFacts(
-        1220,
         1.0e-3,
         46,
         {
@@ -201,7 +194,6 @@ _MODELS: dict[str, _ModelFacts] = {
         nominal_voltage_v=11.1,
     ),
     "XL430-W250": _ModelFacts(
-        1060,
         0.0,
         45,
         {
@@ -230,14 +222,15 @@ def load_model(name: str) -> Model:
     """
     facts = _MODELS[name]
     table = _X_SERIES | facts.differs
+    addresses = load_control_table(name)
     registers = {
-        register: _register(register, address, size, table[register])
-        for register, address, size in _addresses(name)
-        if address < INDIRECT_START
+        entry.name: _register(entry.name, entry.address, entry.size, entry.signed, table[entry.name])
+        for entry in addresses.registers.values()
+        if entry.address < INDIRECT_START
     }
     return Model(
         name=name,
-        number=facts.number,
+        number=addresses.number,
         current_unit_a=facts.current_unit_a,
         operating_modes=facts.operating_modes,
         fast_read_firmware=facts.fast_read_firmware,
@@ -246,15 +239,15 @@ def load_model(name: str) -> Model:
     )
 
 
-def _register(name: str, address: int, size: int, facts: _Facts) -> Register:
+def _register(name: str, address: int, size: int, signed: bool, facts: _Facts) -> Register:
     bits = 8 * size
-    everything = (-(1 << bits - 1), (1 << bits - 1) - 1) if facts.signed else (0, (1 << bits) - 1)
+    everything = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     minimum, maximum = facts.limits or everything
     return Register(
         name=name,
         address=address,
         size=size,
-        signed=facts.signed,
+        signed=signed,
         eeprom=address < EEPROM_END,
         writable=facts.writable,
         initial=facts.initial,
@@ -262,13 +255,3 @@ def _register(name: str, address: int, size: int, facts: _Facts) -> Register:
         maximum=maximum,
     )
 
-
-def _addresses(model: str) -> list[tuple[str, int, int]]:
-    """Name, address and size of every register, from dynamixel-sdk's file of the model."""
-    spec = find_spec("dynamixel_easy_sdk")  # finds the package without running it
-    if spec is None or spec.origin is None:
-        raise FileNotFoundError("dynamixel-sdk with its control tables is not installed: pip install dynamixel-sdk")
-    file = Path(spec.origin).parent / "control_table" / (model.lower().replace("-", "_") + ".model")
-    section = file.read_text(encoding="utf-8").split("[control table]")[1]
-    rows = [line.split("\t") for line in section.strip().splitlines()[1:]]
-    return [(name.strip(), int(address), int(size)) for address, size, name in rows]
