@@ -9,8 +9,9 @@ over everything before it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from struct import Struct
+from typing import NamedTuple
 
 from fastcrc import crc16
 
@@ -20,6 +21,7 @@ MAX_ID = 252
 MAX_LENGTH = 1024
 """Longest LEN believed; beyond it the bytes are noise that looks like a header."""
 
+_FRONT = Struct("<4sBH")  # header, ID, LEN
 _STUFFED = b"\xff\xff\xfd"
 _NO_ID = (0xFD, 0xFF)
 """IDs that no packet has, because they could be part of a header."""
@@ -71,8 +73,7 @@ class HardwareError(IntFlag):
     OVERLOAD = 1 << 5
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """One packet with its stuffing removed. `body` stands between INST and CRC; in a status, ERR comes first."""
 
     id: int
@@ -114,7 +115,7 @@ def unstuff(payload: bytes) -> bytes:
 def encode(packet_id: int, instruction: int, body: bytes = b"") -> bytes:
     """The bytes of one packet on the wire."""
     payload = stuff(bytes((instruction,)) + body)
-    unsigned = HEADER + bytes((packet_id,)) + (len(payload) + 2).to_bytes(2, "little") + payload
+    unsigned = _FRONT.pack(HEADER, packet_id, len(payload) + 2) + payload
     return unsigned + crc(unsigned).to_bytes(2, "little")
 
 
@@ -140,7 +141,7 @@ class Framer:
     def feed(self, data: bytes) -> Iterator[Packet]:
         """Take bytes as they come; yield each whole packet."""
         self._buffer += data
-        while (packet := self._next()) is not None:
+        while self._buffer and (packet := self._next()) is not None:
             yield packet
 
     @property
@@ -161,7 +162,8 @@ class Framer:
                 # Keep what may be the beginning of a header.
                 self._drop(max(0, len(buffer) - len(HEADER) + 1))
                 return None
-            self._drop(start)
+            if start:
+                self._drop(start)
             if len(buffer) < 7:
                 return None
             length = buffer[5] | buffer[6] << 8
@@ -171,19 +173,18 @@ class Framer:
             end = 7 + length
             if len(buffer) < end:
                 return None
-            raw = bytes(buffer[:end])
-            if crc(raw[:-2]) != raw[-2] | raw[-1] << 8:
+            raw = bytes(buffer[: end - 2])
+            if crc(raw) != buffer[end - 2] | buffer[end - 1] << 8:
                 self.bad_crc += 1
                 if self._give_damaged:
                     self._drop(end)
-                    return Packet(raw[4], raw[7], raw[8:-2], damaged=True)
+                    return Packet(raw[4], raw[7], raw[8:], damaged=True)
                 self._drop(1)
                 continue
             del buffer[:end]
-            payload = unstuff(raw[7:-2])
+            payload = unstuff(raw[7:])
             return Packet(raw[4], payload[0], payload[1:])
 
     def _drop(self, count: int) -> None:
-        if count:
-            self.noise_bytes += count
-            del self._buffer[:count]
+        self.noise_bytes += count
+        del self._buffer[:count]

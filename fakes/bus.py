@@ -1,9 +1,10 @@
 """A half-duplex serial bus with fake servos on it and a plant behind them, in the bus's own time.
 
-Bytes take wire time (ten bits each). A packet acts when its last byte arrives: the plant is advanced to that moment with
-the motor currents in force before, then the addressed servos act. Replies go onto the wire after the servo's return
-delay and reach the host `adapter_latency_us` later. Everything is worked out when the host writes or reads; between
-two packets only a Bus Watchdog can act, and the plant's advance is split at the moment it does.
+Bytes take wire time (ten bits each). A packet acts when its last byte arrives: the plant is advanced to that moment
+with the motor currents in force before, then the addressed servos act. Replies go onto the wire after the servo's
+return delay and reach the host `adapter_latency_us` later. Everything is worked out when the host writes, up to the
+last packet of that write, even where that lies ahead of the clock; between two packets only a Bus Watchdog can act, and
+the plant's advance is split at the moment it does.
 
 Where the manual is silent:
 
@@ -22,7 +23,7 @@ Instructions of the next stage (Factory Reset, Clear, Control Table Backup, the 
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from drivers.clock import Clock
 from drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet, StatusError, crc, encode_status
@@ -37,8 +38,7 @@ BITS_PER_BYTE = 10
 _ID_ADDRESS = 7
 
 
-@dataclass(frozen=True, slots=True)
-class _Arriving:
+class _Arriving(NamedTuple):
     """Bytes on their way to the host: when the first is there, and how far apart they come [s]."""
 
     data: bytes
@@ -144,21 +144,26 @@ class FakeBus:
         """
         now = self.clock.now()
         deadline = now + timeout_s
-        parts: list[bytes] = []
-        while size and self._arriving:
-            segment = self._arriving[0]
+        if timeout_s > 0:
+            # Time moves on even when the timeout is too short to change the sum: a client that waits in a loop for the
+            # end of its timeout gets there.
+            deadline = max(deadline, math.nextafter(now, math.inf))
+        taken = b""
+        arriving = self._arriving
+        while size and arriving:
+            segment = arriving[0]
             count = min(size, segment.count_by(deadline))
             if not count:
                 break
-            parts.append(segment.data[:count])
+            taken += segment.data[:count]
             size -= count
             now = segment.first + (count - 1) * segment.byte_s
             if count == len(segment.data):
-                self._arriving.popleft()
+                arriving.popleft()
             else:
-                self._arriving[0] = segment.after(count)
+                arriving[0] = segment.after(count)
         self.clock.wait_until(deadline if size and deadline < math.inf else now)
-        return b"".join(parts)
+        return taken
 
     @property
     def in_waiting(self) -> int:
@@ -216,7 +221,7 @@ class FakeBus:
             return
         for servo in self._servos:
             if servo.hears(now, self._baud):
-                servo.heard_at = now
+                servo.heard_at = now  # feeds its watchdog, and says below that it heard this packet
         if packet.id != BROADCAST_ID:
             self._single(packet, now)
         elif packet.instruction in self._broadcast:
@@ -281,7 +286,7 @@ class FakeBus:
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
         for at in range(4, len(body) - length, length + 1):
             for servo in self._by_id.get(body[at], ()):
-                if servo.hears(now, self._baud):
+                if servo.heard_at == now:
                     servo.write(address, body[at + 1 : at + 1 + length])
         if address <= _ID_ADDRESS:
             self._route()
@@ -321,9 +326,9 @@ class FakeBus:
     def _answering(self, servo_id: int, now: float) -> Servo | None:
         """The servo that answers a group read under this ID; None when there is none or more than one."""
         servos = self._by_id.get(servo_id, ())
-        if len(servos) == 1 and servos[0].hears(now, self._baud) and servos[0].status_return_level > 0:
-            return servos[0]
-        return None
+        if len(servos) != 1 or servos[0].heard_at != now or servos[0].status_return_level == 0:
+            return None
+        return servos[0]
 
     def _listening(self, now: float) -> list[Servo]:
         return [servo for servo in self._servos if servo.hears(now, self._baud)]

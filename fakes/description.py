@@ -70,9 +70,7 @@ class FakeServo(BaseModel):
             if register is None or not register.eeprom or not register.writable:
                 raise ValueError(f'registers: "{name}" is not an EEPROM register of the {self.model} that can be set')
             if not register.minimum <= value <= register.maximum:
-                raise ValueError(
-                    f'registers: "{name}" = {value}: {register.minimum} to {register.maximum} is allowed'
-                )
+                raise ValueError(f'registers: "{name}" = {value}: {register.minimum} to {register.maximum} is allowed')
         return self
 
 

@@ -26,8 +26,8 @@ SCHEME = "fake://"
 class FakeSerial(SerialBase):
     """A pyserial port onto a fake bus.
 
-    The arm is built when the port is first opened and lives as long as the port object: closing and reopening finds it as
-    it was left, with time gone on, as real servos would be. Two port objects never share an arm.
+    The arm is built when the port is first opened and lives as long as the port object: closing and reopening finds it
+    as it was left, with time gone on, as real servos would be. Two port objects never share an arm.
 
     Beside pyserial's interface it has `clock` and `bus`.
     """
@@ -73,19 +73,19 @@ class FakeSerial(SerialBase):
 
     def _reconfigure_port(self, force_update: bool = False) -> None:
         """Take over the settings that mean something here: the baud rate. The frame is always 8N1."""
-        if self._baudrate <= 0:
-            raise ValueError(f"a baud rate of {self._baudrate} is not positive")
+        if self.baudrate <= 0:
+            raise ValueError(f"a baud rate of {self.baudrate} is not positive")
         if self._bus is not None:
-            self._bus.baud = self._baudrate
+            self._bus.baud = self.baudrate
 
     def read(self, size: int = 1) -> bytes:
         """Up to `size` bytes, waiting on `clock` for them, at most the port's timeout.
 
-        With timeout None a real port would wait for ever for bytes that are not coming. Here nothing else can send them, so
-        that wait is refused with `serial.SerialException`; bytes already received stay to be read.
+        With timeout None a real port would wait for ever for bytes that are not coming. Here nothing else can send
+        them, so that wait is refused with `serial.SerialException`; bytes already received stay to be read.
         """
         bus = self._open_bus()
-        timeout = self._timeout
+        timeout = self.timeout
         if timeout is None and bus.on_the_way < size:
             raise serial.SerialException(
                 f"reading {size} bytes without a timeout would wait for ever: "

@@ -221,7 +221,7 @@ def load_model(name: str) -> Model:
     Raises KeyError when the fake does not know the model; `MODEL_NAMES` lists those it knows.
     """
     facts = _MODELS[name]
-    table = _X_SERIES | facts.differs
+    table = _X_SERIES | dict(facts.differs)
     addresses = load_control_table(name)
     registers = {
         entry.name: _register(entry.name, entry.address, entry.size, entry.signed, table[entry.name])
@@ -254,4 +254,3 @@ def _register(name: str, address: int, size: int, signed: bool, facts: _Facts) -
         minimum=minimum,
         maximum=maximum,
     )
-

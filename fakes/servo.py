@@ -8,7 +8,8 @@ module decides as follows, choosing what asks more of a client:
   undefined address an Access error. A read may begin inside a register; undefined bytes between two registers read 0,
   and a read that begins or ends at an undefined address is an Access error.
 - A goal beyond its limit register is refused with Data Limit (some firmware may clamp instead).
-- When the Bus Watchdog trips, Goal Current becomes 0 and torque stays enabled. While tripped, only 0 may be written to it.
+- When the Bus Watchdog trips, Goal Current becomes 0 and torque stays enabled. While tripped, only 0 may be written
+  to it.
 - After a shutdown, a write of 1 to Torque Enable is answered without an error number but leaves torque off.
 - At power-up, as after a change of Operating Mode, Goal Current is Current Limit: a client that enables torque in
   current mode without writing a goal first gets full current.
@@ -25,7 +26,6 @@ from struct import Struct
 from drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from fakes.registers import (
     BAUD_RATES,
-    EEPROM_END,
     TICKS_PER_TURN,
     VELOCITY_UNIT_RPM,
     Model,
@@ -156,7 +156,7 @@ class Servo:
         return self.baud == baud and self.connected and now >= self.ready_at
 
     def measure(self, now: float, position: float, velocity: float, current: float) -> None:
-        """Put the joint's angle [rad], velocity [rad/s] and motor current [A] at time `now` into the present registers."""
+        """Put the joint's angle [rad], velocity [rad/s] and motor current [A] at `now` into the present registers."""
         sign = self._sign
         unit = self.model.current_unit_a
         velocity_ticks = round(sign * velocity * _TICKS_PER_RAD_S)
@@ -241,29 +241,28 @@ class Servo:
 
         Read is not among them: the bus answers it with `read`, after `measure`.
         """
+        if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
+            return StatusError.DATA_LENGTH, b""
         match instruction:
             case Instruction.PING:
                 return StatusError.NONE, bytes(self._memory[0:2] + self._memory[6:7])
-            case Instruction.WRITE if len(body) > 2:
+            case Instruction.WRITE:
                 return self.write(body[0] | body[1] << 8, body[2:]), b""
-            case Instruction.REG_WRITE if len(body) > 2:
+            case Instruction.REG_WRITE:
                 return self._register_write(body), b""
             case Instruction.ACTION:
                 return self._act(), b""
             case Instruction.REBOOT:
                 self.power_up(now, position, BOOT_S)
                 return StatusError.NONE, b""
-            case Instruction.WRITE | Instruction.REG_WRITE:
-                return StatusError.DATA_LENGTH, b""
-            case _:
-                return StatusError.INSTRUCTION, b""
+        return StatusError.INSTRUCTION, b""
 
     def read(self, address: int, length: int) -> tuple[int, bytes]:
         """Error number and bytes of a stretch of the control table."""
         if (address, length) not in self._readable:
             if not self._can_read(address, length):
                 return StatusError.ACCESS, b""
-            self._readable.add((address, length))
+            self._readable.add((address, length))  # the answer never changes
         return StatusError.NONE, bytes(self._memory[address : address + length])
 
     def write(self, address: int, data: bytes) -> int:
@@ -298,7 +297,7 @@ class Servo:
 
     def _split(self, address: int, data: bytes) -> tuple[list[tuple[Register, int]], int]:
         """The registers that a write covers with their values, and the error if it does not fit them."""
-        writes = []
+        writes: list[tuple[Register, int]] = []
         at, end = address, address + len(data)
         while at < end:
             register = self._starting_at.get(at)
@@ -317,17 +316,19 @@ class Servo:
         name = register.name
         if not register.writable or (register.eeprom and self.torque_enabled):
             return StatusError.ACCESS
+        in_range = register.minimum <= value <= register.maximum
+        if name == "Operating Mode":
+            in_range = value in self.model.operating_modes
         if self.watchdog_tripped and (name in _GOALS or (name == "Bus Watchdog" and value != 0)):
+            in_range = False
+        if not in_range:
             return StatusError.DATA_RANGE
-        if not register.minimum <= value <= register.maximum:
-            return StatusError.DATA_RANGE
-        if name == "Operating Mode" and value not in self.model.operating_modes:
-            return StatusError.DATA_RANGE
-        if name in _LIMIT_OF_GOAL and abs(value) > self.value(_LIMIT_OF_GOAL[name]):
-            return StatusError.DATA_LIMIT
-        if name == "Goal Position" and not self._goal_position_allowed(value):
-            return StatusError.DATA_LIMIT
-        return StatusError.NONE
+        within = True
+        if name in _LIMIT_OF_GOAL:
+            within = abs(value) <= self.value(_LIMIT_OF_GOAL[name])
+        elif name == "Goal Position":
+            within = self._goal_position_allowed(value)
+        return StatusError.NONE if within else StatusError.DATA_LIMIT
 
     def _goal_position_allowed(self, ticks: int) -> bool:
         if self.operating_mode == POSITION_MODE:
@@ -406,13 +407,11 @@ class Servo:
         self._driven = self.torque_enabled and self.operating_mode == CURRENT_MODE
         self.motor_current_a = 0.0
         """Current that the motor is told to carry, in the joint's direction [A]."""
-        self._takes_goal_current = False
-        if "Goal Current" in self._registers:
-            self._current_limit = self.value("Current Limit")
-            by_goal = self.value("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
-            self._takes_goal_current = not by_goal and not self.watchdog_tripped
-            if self._driven:
-                self.motor_current_a = self.goal_current_ticks * self._current_per_tick
+        if self._driven:
+            self.motor_current_a = self.goal_current_ticks * self._current_per_tick
+        self._current_limit = self.value("Current Limit") if "Goal Current" in self._registers else -1
+        by_goal = self.value("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
+        self._takes_goal_current = self._current_limit >= 0 and not by_goal and not self.watchdog_tripped
 
     def _position_ticks(self, position: float) -> int:
         ticks = round(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
