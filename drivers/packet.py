@@ -9,8 +9,9 @@ over everything before it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from struct import Struct
+from typing import NamedTuple
 
 from fastcrc import crc16
 
@@ -20,7 +21,10 @@ MAX_ID = 252
 MAX_LENGTH = 1024
 """Longest LEN believed; beyond it the bytes are noise that looks like a header."""
 
+_FRONT = Struct("<4sBH")  # header, ID, LEN
 _STUFFED = b"\xff\xff\xfd"
+_NO_ID = (0xFD, 0xFF)
+"""IDs that no packet has, because they could be part of a header."""
 
 
 class Instruction(IntEnum):
@@ -69,13 +73,14 @@ class HardwareError(IntFlag):
     OVERLOAD = 1 << 5
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """One packet with its stuffing removed. `body` stands between INST and CRC; in a status, ERR comes first."""
 
     id: int
     instruction: int
     body: bytes
+    damaged: bool = False
+    """True when the CRC does not match. Only a `Framer` that was asked for such packets gives them."""
 
     @property
     def is_status(self) -> bool:
@@ -110,7 +115,7 @@ def unstuff(payload: bytes) -> bytes:
 def encode(packet_id: int, instruction: int, body: bytes = b"") -> bytes:
     """The bytes of one packet on the wire."""
     payload = stuff(bytes((instruction,)) + body)
-    unsigned = HEADER + bytes((packet_id,)) + (len(payload) + 2).to_bytes(2, "little") + payload
+    unsigned = _FRONT.pack(HEADER, packet_id, len(payload) + 2) + payload
     return unsigned + crc(unsigned).to_bytes(2, "little")
 
 
@@ -122,19 +127,27 @@ def encode_status(packet_id: int, error: int, data: bytes = b"") -> bytes:
 class Framer:
     """Finds packets in a stream of bytes, and finds the next one again after noise.
 
-    A packet whose CRC does not match is kept too (`bad_crc` counts them), because a servo answers it with an error.
+    A packet whose CRC does not match is counted in `bad_crc`. A host then looks for a header right behind the failed
+    one, since its length may be what was corrupted. With `damaged=True` the framer does as a servo: it believes the
+    length and gives the packet marked as damaged, because a servo answers it with an error.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, damaged: bool = False) -> None:
         self._buffer = bytearray()
+        self._give_damaged = damaged
         self.bad_crc = 0
         self.noise_bytes = 0
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Take bytes as they come; yield each whole packet with a good CRC."""
+        """Take bytes as they come; yield each whole packet."""
         self._buffer += data
-        while (packet := self._next()) is not None:
+        while self._buffer and (packet := self._next()) is not None:
             yield packet
+
+    @property
+    def pending(self) -> int:
+        """How many bytes were taken and not yet given as a packet or dropped as noise."""
+        return len(self._buffer)
 
     def reset(self) -> None:
         """Forget a packet that was begun, as a servo does after a gap of 1.5 ms between bytes."""
@@ -149,27 +162,29 @@ class Framer:
                 # Keep what may be the beginning of a header.
                 self._drop(max(0, len(buffer) - len(HEADER) + 1))
                 return None
-            self._drop(start)
+            if start:
+                self._drop(start)
             if len(buffer) < 7:
                 return None
             length = buffer[5] | buffer[6] << 8
-            if length < 3 or length > MAX_LENGTH or buffer[4] == 0xFF:
+            if length < 3 or length > MAX_LENGTH or buffer[4] in _NO_ID:
                 self._drop(1)
                 continue
             end = 7 + length
             if len(buffer) < end:
                 return None
-            raw = bytes(buffer[:end])
-            if crc(raw[:-2]) != raw[-2] | raw[-1] << 8:
-                # The length itself may be what was corrupted: look for a header right behind this one.
+            raw = bytes(buffer[: end - 2])
+            if crc(raw) != buffer[end - 2] | buffer[end - 1] << 8:
                 self.bad_crc += 1
+                if self._give_damaged:
+                    self._drop(end)
+                    return Packet(raw[4], raw[7], raw[8:], damaged=True)
                 self._drop(1)
                 continue
             del buffer[:end]
-            payload = unstuff(raw[7:-2])
+            payload = unstuff(raw[7:])
             return Packet(raw[4], payload[0], payload[1:])
 
     def _drop(self, count: int) -> None:
-        if count:
-            self.noise_bytes += count
-            del self._buffer[:count]
+        self.noise_bytes += count
+        del self._buffer[:count]

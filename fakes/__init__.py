@@ -1,1 +1,9 @@
 """Servos that exist only as bytes: control tables, a half-duplex bus, and a simulated arm behind it."""
+
+
+def register() -> None:
+    """Teach pyserial the URL `fake://PATH/TO/ARM.toml`; see `fakes.protocol_fake`. Harmless when repeated."""
+    import serial  # noqa: PLC0415  (keeps `import fakes` free of it)
+
+    if __name__ not in serial.protocol_handler_packages:
+        serial.protocol_handler_packages.append(__name__)

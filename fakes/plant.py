@@ -30,7 +30,7 @@ class Plant(Protocol):
         ...
 
     def advance(self, until: float, current: Sequence[float]) -> None:
-        """Move on to time `until` [s] with the commanded motor currents [A] held constant from the plant's present time.
+        """Move on to time `until` [s] with the commanded motor currents [A] held constant from the present time on.
 
         Returns at once when `until` is not later than the plant's present time.
         """

@@ -1,0 +1,108 @@
+"""The fake arm's physics: links, drives, and what the estimator should find in them."""
+
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Link(BaseModel):
+    """One rigid link, without the servo bodies."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    length: Positive = Field(description="from its joint to the next joint [m]")
+    mass: NotNegative = Field(description="mass [kg]")
+    centre: Finite = Field(description="from its joint to its centre of mass [m]")
+    inertia: NotNegative = Field(description="inertia about its centre of mass [kg m^2]")
+
+
+class Drive(BaseModel):
+    """One servo: body, rotor and gears, current loop, friction."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mass: NotNegative = Field(description="the servo's body, which sits at its joint [kg]")
+    rotor_inertia: NotNegative = Field(description="inertia of the rotor before the gears [kg m^2]")
+    gear_ratio: Positive = Field(description="turns of the rotor per turn of the joint")
+    torque_constant: Positive = Field(description="torque at the output shaft per motor current [N m/A]")
+    current_lag: NotNegative = Field(0.0, description="time constant of the current loop, first order [s]")
+    viscous: NotNegative = Field(0.0, description="friction per velocity [N m s/rad]")
+    coulomb: NotNegative = Field(0.0, description="dry friction while sliding fast [N m]")
+    coulomb_width: NotNegative = Field(
+        0.0,
+        description="0 sticks; more is smooth, coulomb * tanh(velocity / width) [rad/s]",
+    )
+    stribeck_rise: NotNegative = Field(0.0, description="static friction above Coulomb, as a fraction of it")
+    stribeck_velocity: Positive = Field(0.1, description="velocity where the rise is down to 1/e [rad/s]")
+    load: NotNegative = Field(0.0, description="dry friction added per motor torque [N m per N m]")
+    offset: Finite = Field(0.0, description="constant torque on the side of the load [N m]")
+    ripple: NotNegative = Field(0.0, description="torque ripple over the angle, as a fraction of torque")
+    ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
+
+    @model_validator(mode="after")
+    def _width_is_resolved(self) -> Self:
+        if 0.0 < self.coulomb_width < 1e-3:
+            raise ValueError(
+                f"coulomb_width is {self.coulomb_width:g} rad/s: give 0 for friction that sticks, "
+                "or at least 0.001 rad/s for a smooth step"
+            )
+        return self
+
+
+class Arm(BaseModel):
+    """A planar arm of one or two joints; joint 1 is measured from the horizontal, joint 2 from link 1."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    gravity: NotNegative = Field(9.81, description="0 for an arm in a horizontal plane [m/s^2]")
+    start: tuple[Finite, ...] = Field(description="joint angles at time 0 [rad]")
+    links: tuple[Link, ...] = Field(min_length=1, max_length=2, description="from the base outwards")
+    drives: tuple[Drive, ...] = Field(description="one for each link, at its joint")
+
+    @model_validator(mode="after")
+    def _one_of_each_per_joint(self) -> Self:
+        if not len(self.links) == len(self.drives) == len(self.start):
+            raise ValueError(
+                f"{len(self.links)} links, {len(self.drives)} drives and {len(self.start)} angles in start: "
+                "give one of each per joint"
+            )
+        return self
+
+
+def base_parameters(arm: Arm) -> dict[str, float]:
+    """The truth an identification of this arm should find, by the estimator's names and in its order [SI].
+
+    Dry friction above Coulomb (Stribeck rise, load) and the current lag are no base parameters: left out.
+    """
+    parameters = _rigid_body(arm)
+    for quantity in ("viscous", "coulomb", "offset"):
+        for joint, drive in enumerate(arm.drives, start=1):
+            parameters[f"{quantity}_{joint}"] = getattr(drive, quantity)
+    return parameters
+
+
+def armature(drive: Drive) -> float:
+    """Inertia of the rotor as the joint feels it [kg m^2]."""
+    return drive.rotor_inertia * drive.gear_ratio**2
+
+
+def _rigid_body(arm: Arm) -> dict[str, float]:
+    first = arm.links[0]
+    inertia_1 = first.inertia + first.mass * first.centre**2 + armature(arm.drives[0])
+    moment_1 = first.mass * first.centre
+    if len(arm.links) == 1:
+        return {"inertia_1": inertia_1, "gravity_1": moment_1 * arm.gravity}
+    second = arm.links[1]
+    beyond_elbow = second.mass + arm.drives[1].mass
+    return {
+        "inertia_1": inertia_1 + beyond_elbow * first.length**2,
+        "coupling": second.mass * first.length * second.centre,
+        "inertia_2": second.inertia + second.mass * second.centre**2,
+        "armature_2": armature(arm.drives[1]),
+        "gravity_1": (moment_1 + beyond_elbow * first.length) * arm.gravity,
+        "gravity_2": second.mass * second.centre * arm.gravity,
+    }

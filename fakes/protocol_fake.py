@@ -1,0 +1,152 @@
+"""The pyserial URL `fake://PATH/TO/ARM.toml`: a serial port behind which a fake arm hangs, in virtual time.
+
+After `fakes.register()`, `serial.serial_for_url("fake://configs/fake_two_link.toml")` opens the arm of that file's
+[fake] table; a path without a leading slash is relative to the working directory. `open_fake` does the same from Python
+without a file. pyserial finds this module by its name.
+
+Everything happens on `port.clock`: a program that waits must wait on that clock (or in `read`), because wall-clock time
+does not move the arm. In particular dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
+sees no answers.
+"""
+
+import math
+from pathlib import Path
+
+import serial
+from serial.serialutil import SerialBase
+
+from drivers.clock import Clock
+from fakes.bus import FakeBus
+from fakes.clock import VirtualClock
+from fakes.description import DescriptionError, FakeArm, load_fake, make_bus
+
+SCHEME = "fake://"
+
+
+class FakeSerial(SerialBase):
+    """A pyserial port onto a fake bus.
+
+    The arm is built when the port is first opened and lives as long as the port object: closing and reopening finds it
+    as it was left, with time gone on, as real servos would be. Two port objects never share an arm.
+
+    Beside pyserial's interface it has `clock` and `bus`.
+    """
+
+    def __init__(
+        self,
+        port: str | None = None,
+        *args: object,
+        description: FakeArm | None = None,
+        clock: Clock | None = None,
+        **kwargs: object,
+    ) -> None:
+        self._description = description
+        self.clock: Clock = clock or VirtualClock()
+        self._bus: FakeBus | None = None
+        super().__init__(port, *args, **kwargs)  # type: ignore[arg-type]  # pyserial's long list of settings
+
+    @property
+    def bus(self) -> FakeBus:
+        """The bus and its servos; `serial.PortNotOpenError` before the port is opened for the first time."""
+        if self._bus is None:
+            raise serial.PortNotOpenError
+        return self._bus
+
+    def open(self) -> None:
+        """Open the port; `serial.SerialException` says why the arm cannot be built."""
+        if self.is_open:
+            raise serial.SerialException(f"{self.name or SCHEME} is already open")
+        if self._bus is None:
+            self._bus = self._build()
+        self._reconfigure_port()
+        self.is_open = True
+
+    def _build(self) -> FakeBus:
+        try:
+            description = self._description or load_fake(_path(self.port))
+        except (DescriptionError, OSError) as error:
+            raise serial.SerialException(str(error)) from error
+        return make_bus(description, self.clock)
+
+    def close(self) -> None:
+        self.is_open = False
+
+    def _reconfigure_port(self, force_update: bool = False) -> None:
+        """Take over the settings that mean something here: the baud rate. The frame is always 8N1."""
+        if self.baudrate <= 0:
+            raise ValueError(f"a baud rate of {self.baudrate} is not positive")
+        if self._bus is not None:
+            self._bus.baud = self.baudrate
+
+    def read(self, size: int = 1) -> bytes:
+        """Up to `size` bytes, waiting on `clock` for them, at most the port's timeout.
+
+        With timeout None a real port would wait for ever for bytes that are not coming. Here nothing else can send
+        them, so that wait is refused with `serial.SerialException`; bytes already received stay to be read.
+        """
+        bus = self._open_bus()
+        timeout = self.timeout
+        if timeout is None and bus.on_the_way < size:
+            raise serial.SerialException(
+                f"reading {size} bytes without a timeout would wait for ever: "
+                f"{bus.on_the_way} are there or on their way; set a timeout"
+            )
+        return bus.read(size, math.inf if timeout is None else timeout)
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
+        """Put bytes on the wire; returns at once, as a driver with a buffer does."""
+        data = bytes(data)
+        self._open_bus().write(data)
+        return len(data)
+
+    def flush(self) -> None:
+        """Wait on `clock` until everything written has left."""
+        self.clock.wait_until(self._open_bus().sent_by)
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that have arrived by now and were not read."""
+        return self._open_bus().in_waiting
+
+    def reset_input_buffer(self) -> None:
+        """Drop what has arrived. Bytes still on the wire are not dropped: they arrive later."""
+        self._open_bus().discard_input()
+
+    def reset_output_buffer(self) -> None:
+        """Do nothing but check that the port is open: what was written is already on its way."""
+        self._open_bus()
+
+    def _open_bus(self) -> FakeBus:
+        if not self.is_open or self._bus is None:
+            raise serial.PortNotOpenError
+        return self._bus
+
+    def _update_rts_state(self) -> None:
+        """No such line on this port; pyserial calls this when the setting changes."""
+
+    def _update_dtr_state(self) -> None:
+        """No such line on this port; pyserial calls this when the setting changes."""
+
+    def _update_break_state(self) -> None:
+        """No such line on this port; pyserial calls this when the setting changes."""
+
+
+def open_fake(
+    description: FakeArm, clock: Clock | None = None, *, baud: int = 1_000_000, timeout_s: float | None = 0.1
+) -> FakeSerial:
+    """An open port onto the arm described, on `clock` (a new `VirtualClock` unless given)."""
+    port = FakeSerial(None, description=description, clock=clock, baudrate=baud, timeout=timeout_s)
+    port.open()
+    return port
+
+
+def serial_class_for_url(url: str) -> tuple[str, type[FakeSerial]]:
+    """What pyserial asks of a module that handles a URL: the port's name and its class."""
+    return url, FakeSerial
+
+
+def _path(url: str | None) -> Path:
+    path = (url or "").removeprefix(SCHEME)
+    if not path:
+        raise DescriptionError(f'"{url or ""}" names no file: write {SCHEME}PATH/TO/ARM.toml')
+    return Path(path)
