@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from drivers.joint import Joint
 from drivers.servo_model import CURRENT_MODELS, servo_model
 from fakes.description import FakeArm
-from hil.config_errors import describe
+from fakes.table_errors import describe
 from hil.errors import ConfigError
 
 FAKE_URL = "fake://"

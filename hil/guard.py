@@ -58,6 +58,6 @@ class Guard:
         self._missing[index] += 1
         if self._missing[index] > self._max_missing:
             raise SafetyStop(
-                f"{self._names[index]} missed {self._missing[index]} replies in a row; {self._max_missing} are allowed. "
-                "Check its cable and its supply."
+                f"{self._names[index]} missed {self._missing[index]} replies in a row; {self._max_missing} are allowed."
+                " Check its cable and its supply."
             )

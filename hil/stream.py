@@ -95,8 +95,8 @@ class Stream:
                 return
             former = latest
         raise NotSettled(
-            f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still changes "
-            f"by {difference.max():.1%} of its RMS from one period to the next; experiment.settle_within allows "
+            f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
+            f"changes by {difference.max():.1%} of its RMS from one period to the next; experiment.settle_within allows "
             f"{self._plan.settle_within:.1%}. Look for play, a dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )

@@ -1,4 +1,4 @@
-"""The control cycle against a scripted wire: what it sends, and what it makes of good, stuffed, missing and late bytes."""
+"""The control cycle against a scripted wire: what it sends, and what it makes of stuffed, missing and late bytes."""
 
 import struct
 from collections.abc import Sequence

@@ -21,17 +21,18 @@ _EXPECTED = {
 }
 
 
-def describe(error: ValidationError, path: Path, root: type[BaseModel]) -> str:
-    """All faults of one file, a line each."""
-    faults = [_fault(detail, root) for detail in error.errors(include_url=False)]
+def describe(error: ValidationError, path: Path | str, root: type[BaseModel], table: str = "") -> str:
+    """All faults of one file, a line each. table: where in the file the checked model stands, "" for all of it."""
+    faults = [_fault(detail, root, table) for detail in error.errors(include_url=False)]
     if len(faults) == 1:
         return f"{path}: {faults[0]}."
     lines = "".join(f"\n  {fault}" for fault in faults)
     return f"{path}: {len(faults)} faults:{lines}"
 
 
-def _fault(detail: Any, root: type[BaseModel]) -> str:
-    key, kind, context = _key(detail["loc"]), detail["type"], detail.get("ctx", {})
+def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
+    location = (table, *detail["loc"]) if table else detail["loc"]
+    key, kind, context = _key(location), detail["type"], detail.get("ctx", {})
     if kind == "missing":
         return f"{key} is missing"
     if kind == "extra_forbidden":
