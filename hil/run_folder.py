@@ -15,12 +15,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from hil import __version__
 from hil.config import Config, parse_config
 from hil.errors import RunFolderError
 from hil.plan import Plan
 
 SCHEMA = 1
-_PACKAGES = ("hil", "numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
+_PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class RunFolder:
             "schema": SCHEMA,
             **asdict(facts),
             "started": datetime.now().astimezone().isoformat(timespec="seconds"),
-            "versions": {name: version(name) for name in _PACKAGES},
+            "versions": {"hil": __version__, **{name: version(name) for name in _PACKAGES}},
             "python": platform.python_version(),
             "machine": platform.platform(),
             "excitation": [

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.bus import ServoBus, State
-from estimator.settling import period_difference
 from hil.config import Config
 from hil.errors import ExperimentError, NotSettled
 from hil.guard import Guard
 from hil.plan import Plan, Segment
 from hil.recording import Phase, Recorder, missed
+from hil.settled import settling_difference
 from hil.stop import StopRequest
 
 _WATCH_EVERY_S = 0.05
@@ -87,16 +87,16 @@ class Stream:
         former = self._play_period(segment, 0)
         for period in range(1, self._plan.max_settling_periods + 1):
             latest = self._play_period(segment, period)
-            difference = period_difference(np.stack([former, latest])).relative
-            if difference.max() <= self._plan.settle_within:
-                self._note(f"{segment.role}: period {period} is settled, {difference.max():.2%} from the one before")
+            difference = settling_difference(former, latest)
+            if difference <= self._plan.settle_within:
+                self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                 return
             former = latest
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
-            f"changes by {difference.max():.1%} of its RMS from one period to the next; experiment.settle_within allows "
+            f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
             f"{self._plan.settle_within:.1%}. Look for play, a dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
