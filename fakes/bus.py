@@ -26,7 +26,17 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from drivers.clock import Clock
-from drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet, StatusError, crc, encode_status
+from drivers.packet import (
+    BROADCAST_ID,
+    HEADER,
+    MAX_LENGTH,
+    Framer,
+    Instruction,
+    Packet,
+    StatusError,
+    crc,
+    encode_status,
+)
 from fakes.plant import Plant
 from fakes.servo import PRESENT_END, PRESENT_START, Servo
 
@@ -34,6 +44,9 @@ GAP_S = 1.5e-3
 """A pause between two bytes of a packet after which a servo forgets its beginning [s]."""
 
 BITS_PER_BYTE = 10
+
+ROUNDING_S = 1e-9
+"""Less than this two bytes on the wire do not overlap, they follow each other [s]."""
 
 _ID_ADDRESS = 7
 
@@ -89,8 +102,7 @@ class FakeBus:
         self._arriving: deque[_Arriving] = deque()
         self._origin = self._now = clock.now()
         self._sent_by = self._now
-        # From when to when servos speak, in answer to what was received last.
-        self._reply_from, self._reply_by = math.inf, -math.inf
+        self._reply_by = -math.inf  # when the last servo will have spoken
         for joint, servo in enumerate(self._servos):
             servo.power_up(self._now, plant.position[joint])
         self._broadcast: dict[int, Callable[[bytes, float], None]] = {
@@ -130,9 +142,7 @@ class FakeBus:
         end = self._sent_by = start + len(data) * byte_s
         for packet in self._framer.feed(data):
             arrived = end - self._framer.pending * byte_s
-            if start < self._reply_by and arrived > self._reply_from:
-                self._collide(start)
-            else:
+            if start >= self._reply_by or not self._collide(start, arrived):
                 self._receive(packet, arrived)
             start = arrived
 
@@ -214,8 +224,6 @@ class FakeBus:
 
     def _receive(self, packet: Packet, now: float) -> None:
         self.advance(now)
-        if now >= self._reply_by:
-            self._reply_from = math.inf
         if packet.damaged:
             self._address(packet.id, lambda _: (StatusError.CRC, b""), now)
             return
@@ -310,6 +318,8 @@ class FakeBus:
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
         ids = body[4:]
         size = 1 + len(ids) * (length + 4)
+        if size > MAX_LENGTH:
+            return
         whole = HEADER + bytes((BROADCAST_ID,)) + size.to_bytes(2, "little") + bytes((Instruction.STATUS,))
         at = now
         sent = 0
@@ -343,23 +353,34 @@ class FakeBus:
 
     def _send(self, data: bytes, start: float) -> float:
         """Put a servo's bytes on the wire from time `start`; the time at which the last one is over."""
-        if start < self._reply_by:
-            self._collide(start)
-            return start
-        self._reply_from = min(self._reply_from, start)
         byte_s = self._byte_s
-        self._reply_by = start + len(data) * byte_s
+        end = start + len(data) * byte_s
+        waiting = start < self._reply_by
+        if waiting and self._collide(start, end):
+            return end
         self._arriving.append(_Arriving(data, start + byte_s + self._latency_s, byte_s))
-        return self._reply_by
+        if waiting:  # behind an earlier instruction's reply that is still to come
+            self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
+        self._reply_by = max(self._reply_by, end)
+        return end
 
-    def _collide(self, start: float) -> None:
-        """Lose what servos say from time `start` on; whoever began then is lost by not being heard."""
-        self.collisions += 1
-        heard = start + self._latency_s
-        kept = [segment for segment in self._arriving if segment.last <= heard]
+    def _collide(self, start: float, end: float) -> bool:
+        """Whether a servo speaks while someone else does, from `start` to `end`.
+
+        Then its bytes from `start` on are lost; who began at `start` is lost by not being heard.
+        """
+        kept: deque[_Arriving] = deque()
+        collided = False
         for segment in self._arriving:
-            count = segment.count_by(heard)
-            if segment.last > heard and count:
-                kept.append(_Arriving(segment.data[:count], segment.first, segment.byte_s))
-        self._arriving = deque(kept)
-        self._reply_by = start
+            begins = segment.first - segment.byte_s - self._latency_s
+            ends = segment.last - self._latency_s
+            if begins < end - ROUNDING_S and ends > start + ROUNDING_S:
+                collided = True
+                count = segment.count_by(start + self._latency_s)
+                if count:
+                    kept.append(segment._replace(data=segment.data[:count]))
+            else:
+                kept.append(segment)
+        self._arriving = kept
+        self.collisions += collided
+        return collided

@@ -93,10 +93,9 @@ class FakeSerial(SerialBase):
             )
         return bus.read(size, math.inf if timeout is None else timeout)
 
-    def write(self, data: bytes) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
+    def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
         """Put bytes on the wire; returns at once, as a driver with a buffer does."""
-        data = bytes(data)
-        self._open_bus().write(data)
+        self._open_bus().write(bytes(data))
         return len(data)
 
     def flush(self) -> None:

@@ -15,6 +15,8 @@ module decides as follows, choosing what asks more of a client:
   current mode without writing a goal first gets full current.
 - Reverse mode (Drive Mode bit 0) mirrors Present Position about half a turn.
 
+A model without a current sensor (XL430-W250) has no current mode and reads a Present Load of 0.
+
 Only current control mode moves the motor. In the other operating modes every register can be written and read and
 Torque Enable reads back 1, but the motor gets no current.
 """
@@ -243,19 +245,22 @@ class Servo:
         """
         if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
             return StatusError.DATA_LENGTH, b""
+        data = b""
+        error: int = StatusError.NONE
         match instruction:
             case Instruction.PING:
-                return StatusError.NONE, bytes(self._memory[0:2] + self._memory[6:7])
+                data = bytes(self._memory[0:2] + self._memory[6:7])
             case Instruction.WRITE:
-                return self.write(body[0] | body[1] << 8, body[2:]), b""
+                error = self.write(body[0] | body[1] << 8, body[2:])
             case Instruction.REG_WRITE:
-                return self._register_write(body), b""
+                error = self._register_write(body)
             case Instruction.ACTION:
-                return self._act(), b""
+                error = self._act()
             case Instruction.REBOOT:
                 self.power_up(now, position, BOOT_S)
-                return StatusError.NONE, b""
-        return StatusError.INSTRUCTION, b""
+            case _:
+                error = StatusError.INSTRUCTION
+        return error, data
 
     def read(self, address: int, length: int) -> tuple[int, bytes]:
         """Error number and bytes of a stretch of the control table."""
@@ -409,7 +414,7 @@ class Servo:
         """Current that the motor is told to carry, in the joint's direction [A]."""
         if self._driven:
             self.motor_current_a = self.goal_current_ticks * self._current_per_tick
-        self._current_limit = self.value("Current Limit") if "Goal Current" in self._registers else -1
+        self._current_limit: int = self.value("Current Limit") if "Goal Current" in self._registers else -1
         by_goal = self.value("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
         self._takes_goal_current = self._current_limit >= 0 and not by_goal and not self.watchdog_tripped
 
