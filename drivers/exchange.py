@@ -117,7 +117,7 @@ class Exchange:
             remaining = deadline - self._clock.now()
             if len(found) == len(self.ids) or remaining <= 0:
                 break
-            # One byte, then what has come with it: the length of a stuffed packet is not known beforehand.
+            # Byte by byte: how long a stuffed packet is shows only as it comes.
             received = self._port.read(1, remaining)
         self._late_possible = len(found) < len(self.ids)
         return [found.get(servo_id) for servo_id in self.ids]

@@ -12,7 +12,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 class Link(BaseModel):
     """One rigid link, without the servo bodies."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     length: Positive = Field(description="from its joint to the next joint [m]")
     mass: NotNegative = Field(description="mass [kg]")
@@ -23,7 +23,7 @@ class Link(BaseModel):
 class Drive(BaseModel):
     """One servo: body, rotor and gears, current loop, friction."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     mass: NotNegative = Field(description="the servo's body, which sits at its joint [kg]")
     rotor_inertia: NotNegative = Field(description="inertia of the rotor before the gears [kg m^2]")
@@ -56,12 +56,12 @@ class Drive(BaseModel):
 class Arm(BaseModel):
     """A planar arm of one or two joints; joint 1 is measured from the horizontal, joint 2 from link 1."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     gravity: NotNegative = Field(9.81, description="0 for an arm in a horizontal plane [m/s^2]")
-    start: tuple[Finite, ...] = Field(description="joint angles at time 0 [rad]")
-    links: tuple[Link, ...] = Field(min_length=1, max_length=2, description="from the base outwards")
-    drives: tuple[Drive, ...] = Field(description="one for each link, at its joint")
+    start: tuple[Finite, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
+    links: tuple[Link, ...] = Field(strict=False, min_length=1, max_length=2, description="from the base outwards")
+    drives: tuple[Drive, ...] = Field(strict=False, description="one for each link, at its joint")
 
     @model_validator(mode="after")
     def _one_of_each_per_joint(self) -> Self:

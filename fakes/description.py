@@ -2,7 +2,7 @@
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -12,6 +12,7 @@ from fakes.arm import Arm
 from fakes.bus import FakeBus
 from fakes.registers import BAUD_RATES, MODEL_NAMES, load_model
 from fakes.servo import Servo
+from fakes.table_errors import describe
 from fakes.two_link import make_plant
 
 
@@ -22,7 +23,7 @@ class DescriptionError(ValueError):
 class FakeServo(BaseModel):
     """One servo, as it lies on the bench: set up for its arm, switched on, torque off."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
@@ -77,13 +78,13 @@ class FakeServo(BaseModel):
 class FakeArm(BaseModel):
     """The whole [fake] table: an adapter, servos on its bus, and the arm that they move."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     seed: Annotated[int, Field(ge=0, description="of everything random here; nothing is, so far")] = 0
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="from the wire to the host's read, for every byte [us]")
     ] = 0.0
-    servos: Annotated[tuple[FakeServo, ...], Field(min_length=1, description="in the order of the joints")]
+    servos: Annotated[tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")]
     arm: Annotated[Arm, Field(description="links and drives")]
 
     @model_validator(mode="after")
@@ -112,8 +113,7 @@ def load_fake(path: Path | str) -> FakeArm:
     try:
         return FakeArm.model_validate(table)
     except ValidationError as error:
-        problems = "\n".join(_explain(problem) for problem in error.errors())
-        raise DescriptionError(f"{path}:\n{problems}") from error
+        raise DescriptionError(describe(error, path, FakeArm, "fake")) from error
 
 
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
@@ -135,12 +135,3 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     ]
     return FakeBus(servos, make_plant(fake.arm), clock, adapter_latency_us=fake.adapter_latency_us)
 
-
-def _explain(problem: Any) -> str:
-    """One line for one of pydantic's findings: key, value, what is allowed."""
-    key = "fake" + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in problem["loc"])
-    message = problem["msg"].removeprefix("Value error, ")
-    value = problem["input"]
-    if isinstance(value, dict | BaseModel):
-        return f"  {key}: {message}"
-    return f"  {key} = {value!r}: {message}"

@@ -1,0 +1,102 @@
+"""The main job's figures: errors against the fake arms' truth, residual, held-out prediction, and time.
+
+    python benchmarks/identify.py [--json] [--seeds N]
+
+Each arm is identified with N seeds (other phases of the multisine); the worst seed is printed. `demo_seconds` is
+`hil identify configs/fake_two_link.toml` in a new process with an empty numba cache.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from machine import machine
+
+from hil.config import Config, load_config
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
+from hil.run_folder import RunFolder
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+GROUPS = {
+    "inertia": ("inertia_1", "coupling", "inertia_2", "armature_2"),
+    "gravity": ("gravity_1", "gravity_2"),
+    "friction": ("viscous_1", "viscous_2", "coulomb_1", "coulomb_2"),
+}
+
+
+def identify(config: Config) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        run = RunFolder.create(Path(folder) / "run", config)
+        run_experiment(config, run, config.path, lambda _: None)
+        return estimate_run(run)
+
+
+def figures(result: dict[str, Any]) -> dict[str, float]:
+    found, truth = result["parameters"], result["truth"]
+    worst = {
+        f"{group}_error": max(abs(found[name]["value"] / truth[name] - 1) for name in names)
+        for group, names in GROUPS.items()
+    }
+    offsets = max(abs(found[n]["value"] - truth[n]) / found[n]["std"] for n in ("offset_1", "offset_2"))
+    return {
+        **worst,
+        "offset_error_in_std": offsets,
+        "residual_ticks": max(result["fit"]["residual_rms_ticks"]),
+        "held_out_rms": max(result["validation"]["held_out_rms"]),
+        "estimation_seconds": result["timing"]["estimation_seconds"],
+    }
+
+
+def worst_of_seeds(name: str, seeds: int) -> dict[str, float]:
+    config = load_config(CONFIGS / f"{name}.toml")
+    runs = []
+    for seed in range(1, seeds + 1):
+        experiment = config.experiment.model_copy(update={"seed": seed})
+        runs.append(figures(identify(config.model_copy(update={"experiment": experiment}))))
+    return {key: max(run[key] for run in runs) for key in runs[0]}
+
+
+def seconds_of(*command: str) -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        started = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "hil", *command],
+            check=True,
+            capture_output=True,
+            cwd=folder,
+            env={**os.environ, "NUMBA_CACHE_DIR": folder},
+        )
+        return time.perf_counter() - started
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args()
+    measured: dict[str, Any] = {
+        name: worst_of_seeds(name, options.seeds) for name in ("fake_two_link_ideal", "fake_two_link")
+    }
+    measured["demo_seconds"] = seconds_of("identify", str(CONFIGS / "fake_two_link.toml"))
+    measured["help_seconds"] = min(seconds_of("--help") for _ in range(5))
+    if options.json:
+        print(json.dumps(measured))
+        return
+    print(f"{machine()}; worst of {options.seeds} seeds")
+    for name in ("fake_two_link_ideal", "fake_two_link"):
+        print(name)
+        for key, value in measured[name].items():
+            shown = f"{100 * value:.3f} %" if key.endswith(("_error", "_rms")) else f"{value:.3f}"
+            print(f"  {key:22s} {shown}")
+    print(f"demo, cold {measured['demo_seconds']:.1f} s; hil --help {measured['help_seconds']:.2f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,9 @@
+"""One line that says when and on what a figure was measured."""
+
+import os
+import platform
+from datetime import date
+
+
+def machine() -> str:
+    return f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"

@@ -1,0 +1,96 @@
+"""What is wrong with a TOML file, in words: key, value, and what is allowed."""
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+_EXPECTED = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text in quotes",
+    "list_type": "must be a list [...]",
+    "tuple_type": "must be a list [...]",
+    "finite_number": "must be a finite number",
+    "model_type": "must be a table",
+    "model_attributes_type": "must be a table",
+}
+
+
+def describe(error: ValidationError, path: Path | str, root: type[BaseModel], table: str = "") -> str:
+    """All faults of one file, a line each. table: where in the file the checked model stands, "" for all of it."""
+    faults = [_fault(detail, root, table) for detail in error.errors(include_url=False)]
+    if len(faults) == 1:
+        return f"{path}: {faults[0]}."
+    lines = "".join(f"\n  {fault}" for fault in faults)
+    return f"{path}: {len(faults)} faults:{lines}"
+
+
+def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
+    location = (table, *detail["loc"]) if table else detail["loc"]
+    key, kind, context = _key(location), detail["type"], detail.get("ctx", {})
+    if kind == "missing":
+        return f"{key} is missing"
+    if kind == "extra_forbidden":
+        return f"{key} is not a known key; {_allowed_keys(detail['loc'], root)}"
+    if kind == "value_error":
+        return f"{key}: {context['error']}" if key else str(context["error"])
+    message = _EXPECTED.get(kind) or _constraint(kind, context) or str(detail["msg"])
+    return f"{key} = {_shown(detail['input'])}: {message}"
+
+
+def _constraint(kind: str, context: dict[str, Any]) -> str | None:
+    match kind:
+        case "greater_than":
+            return f"must be greater than {context['gt']}"
+        case "greater_than_equal":
+            return f"must be at least {context['ge']}"
+        case "less_than":
+            return f"must be less than {context['lt']}"
+        case "less_than_equal":
+            return f"must be at most {context['le']}"
+        case "literal_error":
+            return f"must be one of {context['expected']}"
+        case "too_short":
+            return f"needs at least {context['min_length']} entries"
+        case "too_long":
+            return f"may have at most {context['max_length']} entries"
+    return None
+
+
+def _key(location: Sequence[str | int]) -> str:
+    """`("joints", 1, "id")` as `joints[2].id`: people count joints from one."""
+    text = ""
+    for part in location:
+        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if text else part
+    return text
+
+
+def _shown(value: object) -> str:
+    text = repr(value).replace("True", "true").replace("False", "false")
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
+    model: Any = root
+    for part in location[:-1]:
+        if isinstance(part, str):
+            model = _model_in(model.model_fields[part].annotation)
+    names = [name for name, field in model.model_fields.items() if not field.exclude]
+    close = difflib.get_close_matches(str(location[-1]), names, n=1)
+    return f"did you mean {close[0]}?" if close else f"allowed: {', '.join(names)}"
+
+
+def _model_in(annotation: Any) -> Any:
+    """The pydantic model inside `list[Model]`, `tuple[Model, ...]` or `Model | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in get_args(annotation):
+        found = _model_in(argument)
+        if found is not None:
+            return found
+    return None

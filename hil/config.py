@@ -1,0 +1,210 @@
+"""One TOML file describes the arm, its limits and its experiment; here it is read and checked.
+
+`load_config` returns a frozen `Config` or raises ConfigError, which names file, key, value and what is allowed.
+"""
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+
+from drivers.joint import Joint
+from drivers.servo_model import CURRENT_MODELS, servo_model
+from fakes.description import FakeArm
+from fakes.table_errors import describe
+from hil.errors import ConfigError
+
+FAKE_URL = "fake://"
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class PortConfig(_Table):
+    """`[port]`: where the servos are."""
+
+    url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
+    baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
+
+
+class JointConfig(_Table):
+    """`[[joints]]`: one joint, from the base outwards."""
+
+    name: str = Field(min_length=1, max_length=20)
+    id: int = Field(ge=0, le=252)
+    model: Literal[tuple(CURRENT_MODELS)]  # type: ignore[valid-type]
+    direction: Literal[-1, 1] = 1
+    zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
+    torque_constant: PositiveFloat = Field(le=100, description="N m/A at the output shaft")
+    torque_constant_std: float = Field(0.0, ge=0, description="N m/A")
+    position_limit: Range = Field(description="rad")
+    velocity_limit: PositiveFloat = Field(description="rad/s")
+    current_limit: PositiveFloat = Field(le=30, description="A")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.position_limit
+        if low >= high:
+            raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
+        return self
+
+    @property
+    def joint(self) -> Joint:
+        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks)
+
+
+class ArmConfig(_Table):
+    """`[arm]`: what is known of the mechanism."""
+
+    gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
+    rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
+    rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+
+
+class ExperimentConfig(_Table):
+    """`[experiment]`: the excitation and how it is streamed."""
+
+    rate: float = Field(ge=20, le=4000, description="samples per second")
+    period: float = Field(gt=0, le=1000, description="s")
+    band: Range | None = Field(None, description="Hz: lines shared out between the joints in turn")
+    lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
+    peak_torque: list[PositiveFloat] = Field(description="N m per joint")
+    ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
+    rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
+    settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
+    max_settling_periods: int = Field(5, ge=1, le=100)
+    periods: int = Field(1, ge=1, le=1000, description="settled periods used")
+    held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")
+    seed: int = Field(1, ge=0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        samples = self.rate * self.period
+        if abs(samples - round(samples)) > 1e-9 * samples:
+            raise ValueError(f"rate * period = {samples:g}: must be a whole number of samples")
+        if (self.band is None) == (self.lines is None):
+            raise ValueError("give either band or lines")
+        if self.band is not None:
+            low, high = self.band
+            if not 0 < low < high < self.rate / 4:
+                raise ValueError(f"band = [{low}, {high}]: must be 0 < low < high < rate / 4 = {self.rate / 4:g} Hz")
+        for lines in self.lines or []:
+            if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
+                raise ValueError(f"lines: each list needs different harmonics from 1 to {samples // 4:g}")
+        return self
+
+    @property
+    def samples(self) -> int:
+        """Samples in a period."""
+        return round(self.rate * self.period)
+
+
+class ModelConfig(_Table):
+    """`[model]`: what the estimator may explain the motion with."""
+
+    friction: Literal["coulomb", "stribeck", "stribeck_load"] = "stribeck"
+    drive: Literal["delay", "lag"] = "lag"
+
+
+class SafetyConfig(_Table):
+    """`[safety]`: what stops the arm, beside the joints' own limits."""
+
+    watchdog: float = Field(0.1, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
+    max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")
+    rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
+    rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
+
+
+class Config(_Table):
+    """The whole file. `path` is where it was read from."""
+
+    path: Path = Field(exclude=True)
+    port: PortConfig
+    joints: list[JointConfig] = Field(min_length=1, max_length=2)
+    arm: ArmConfig
+    experiment: ExperimentConfig
+    model: ModelConfig = ModelConfig()
+    safety: SafetyConfig = SafetyConfig()
+    fake: FakeArm | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        count = len(self.joints)
+        _same_length("arm.rest_pose", self.arm.rest_pose, count)
+        _same_length("experiment.peak_torque", self.experiment.peak_torque, count)
+        if self.experiment.lines is not None:
+            _same_length("experiment.lines", self.experiment.lines, count)
+            excited = [line for lines in self.experiment.lines for line in lines]
+            if len(set(excited)) != len(excited):
+                raise ValueError("experiment.lines: two joints share a line; each joint needs its own")
+        for key in ("id", "name"):
+            values = [getattr(joint, key) for joint in self.joints]
+            if len(set(values)) != count:
+                raise ValueError(f"joints: two joints have the same {key} {values[0]!r}")
+        for joint, rest, peak in zip(self.joints, self.arm.rest_pose, self.experiment.peak_torque, strict=True):
+            _check_rest_pose(joint, rest)
+            _check_peak_torque(joint, peak)
+        if self.port.url == FAKE_URL and self.fake is None:
+            raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
+        return self
+
+    @property
+    def url(self) -> str:
+        """The port's URL, with "fake://" completed by the file that describes the fake arm."""
+        return f"{FAKE_URL}{self.path.resolve()}" if self.port.url == FAKE_URL else self.port.url
+
+    @property
+    def is_fake(self) -> bool:
+        return self.port.url.startswith(FAKE_URL)
+
+
+def load_config(path: Path) -> Config:
+    """Read and check a TOML file; raises ConfigError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise ConfigError(f"{path}: cannot be read: {reason}.") from error
+    return parse_config(text, path)
+
+
+def parse_config(text: str, path: Path) -> Config:
+    """Check the text of a TOML file read from `path`; raises ConfigError."""
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}.") from error
+    if "path" in values:
+        raise ConfigError(f"{path}: path is not a known key.")
+    try:
+        return Config(path=path, **values)
+    except ValidationError as error:
+        raise ConfigError(describe(error, path, Config)) from error
+
+
+def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
+    if len(values) != count:
+        raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each of [[joints]]")
+
+
+def _check_rest_pose(joint: JointConfig, rest: float) -> None:
+    low, high = joint.position_limit
+    if not low < rest < high:
+        raise ValueError(
+            f"arm.rest_pose: {rest:g} rad for joint {joint.name!r} is outside its position_limit [{low:g}, {high:g}]"
+        )
+
+
+def _check_peak_torque(joint: JointConfig, peak: float) -> None:
+    most = joint.current_limit * joint.torque_constant
+    if peak > most * (1 + 1e-9):
+        raise ValueError(
+            f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than current_limit * "
+            f"torque_constant = {math.floor(most * 1000) / 1000:g} N m"
+        )

@@ -1,0 +1,53 @@
+"""Everything that can stop hil, as one tree; each leaf names a situation.
+
+HilError                    exit code
+├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
+├── RunFolderError          2   the run folder cannot be written, or holds no readable run
+└── ExperimentError         1   the experiment could not be finished
+    ├── SafetyStop          1   the guard saw a limit passed and stopped the arm
+    ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
+    ├── NotSettled          1   the motion never became periodic
+    └── RecordingCutShort   1   the recording holds no settled period
+
+drivers.errors.DriverError  1   between computer and servos; its leaves are listed there.
+                                UnknownModel, PortNotOpened, WrongModel and WrongSetting are input: 2
+estimator.errors.EstimationError  1   the recording does not determine the parameters; leaves listed there
+"""
+
+
+class HilError(Exception):
+    """Root of hil's own errors."""
+
+    exit_code = 1
+
+
+class ConfigError(HilError):
+    """The configuration is wrong. Example: `rate = "fast"`, or a peak torque above what the current limit gives."""
+
+    exit_code = 2
+
+
+class RunFolderError(HilError):
+    """The run folder cannot be used. Example: `--out` names a folder that holds another run."""
+
+    exit_code = 2
+
+
+class ExperimentError(HilError):
+    """The experiment could not be finished. What was recorded is on file."""
+
+
+class SafetyStop(ExperimentError):
+    """The guard stopped the arm. Example: joint 2 passed its position limit."""
+
+
+class StopRequested(ExperimentError):
+    """Somebody asked for the stop. Example: Ctrl-C."""
+
+
+class NotSettled(ExperimentError):
+    """Successive periods never became alike. Example: a joint that slips, or a cable that drags."""
+
+
+class RecordingCutShort(ExperimentError):
+    """The recording ends before a settled period. Example: the process was killed during settling."""

@@ -1,0 +1,81 @@
+"""The experiment on the bus: open, check, arm, stream, and torque off however it ends."""
+
+from contextlib import suppress
+from pathlib import Path
+
+import fakes
+from drivers.bus import ServoBus
+from drivers.errors import TorqueNotOff
+from hil.config import Config
+from hil.errors import ExperimentError, RunFolderError
+from hil.plan import Plan, make_plan
+from hil.recording import Recorder
+from hil.run_folder import RunFacts, RunFolder
+from hil.stop import StopRequest
+from hil.stream import Stream, Watch
+
+
+def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch) -> str:
+    """Play the configuration's experiment and record it in `run`; the sentence about torque at the end.
+
+    shown_path: the configuration's path as the user wrote it. Raises HilError and DriverError; once torque was on, the
+    exception carries a note that says whether it is off.
+    """
+    plan = make_plan(config)
+    fakes.register()
+    joints = [joint.joint for joint in config.joints]
+    with StopRequest() as stop, ServoBus.open(config.url, config.port.baud, joints) as bus:
+        clock = bus.port.clock
+        run.event(clock.now(), f"opened {config.port.url} at {config.port.baud} baud")
+        bus.check_identity()
+        bus.prepare()
+        _check_pose(config, bus)
+        _write_facts(config, run, plan, bus, shown_path)
+        with Recorder(run.samples_path, len(joints), plan.capacity) as recorder:
+            stop.check()
+            _play(config, run, plan, bus, recorder, stop, watch)
+        torque = str(bus.torque_off_report)
+        run.event(clock.now(), torque)
+        return torque
+
+
+def _play(
+    config: Config, run: RunFolder, plan: Plan, bus: ServoBus, recorder: Recorder, stop: StopRequest, watch: Watch
+) -> None:
+    """Torque on, stream, torque off; whatever stops it is kept among the events."""
+    clock = bus.port.clock
+
+    def note(what: str) -> None:
+        run.event(clock.now(), what)
+
+    try:
+        with bus.torque(config.safety.watchdog):
+            note(f"torque on, watchdog {config.safety.watchdog:g} s")
+            Stream(bus, plan, config, recorder, stop, watch, note).run()
+    except BaseException as error:
+        if not isinstance(error, TorqueNotOff):
+            error.add_note(str(bus.torque_off_report))
+        with suppress(RunFolderError):
+            note(f"stopped: {error} {bus.torque_off_report}")
+        raise
+
+
+def _check_pose(config: Config, bus: ServoBus) -> None:
+    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described."""
+    for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
+        if abs(position - rest) > config.arm.rest_tolerance:
+            ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
+            raise ExperimentError(
+                f"{joint} is at {position:.3f} rad; arm.rest_pose says {rest:.3f} and arm.rest_tolerance allows "
+                f"{config.arm.rest_tolerance:g}. If the arm hangs at rest now, set zero_ticks = {ticks}."
+            )
+
+
+def _write_facts(config: Config, run: RunFolder, plan: Plan, bus: ServoBus, shown_path: Path) -> None:
+    facts = RunFacts(
+        config=str(shown_path),
+        command_to_sample=bus.exchange_timing.command_to_sample,
+        position_step=[joint.servo.position_unit for joint in bus.joints],
+        segments=[segment.role for segment in plan.segments],
+    )
+    run.write_facts(facts, plan)

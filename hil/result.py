@@ -1,0 +1,70 @@
+"""result.json: what an identification found, in one dictionary that a person and a program can read.
+
+schema, method, config, joints
+parameters   the base parameters: value, std, unit
+extra        what the model needed beside them (friction's shape, drive's lag): value, std, unit
+covariance   of parameters and extra together, rows in the order of `names`
+fit          residual of the settled period, in encoder steps, against the encoder's own rounding
+validation   free prediction of another multisine, as a fraction of the motion's RMS
+timing       how the stream kept its ticks, and how long the estimation took
+truth        only on a fake arm
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.identify import Estimate
+from estimator.period import SettledPeriod
+from fakes.arm import base_parameters
+from hil.config import Config
+
+SCHEMA = 1
+QUANTISATION_FLOOR_TICKS = 1 / math.sqrt(12)
+
+
+def make_result(
+    config: Config,
+    shown_path: str,
+    period: SettledPeriod,
+    estimate: Estimate,
+    held_out: NDArray[np.float64] | None,
+    timing: dict[str, Any],
+) -> dict[str, Any]:
+    """The result of one run. held_out: RMS error of the free prediction per joint, as a fraction of the motion's."""
+    base = len(estimate.model.base_names)
+    residual = np.sqrt(np.nanmean(estimate.residual**2, axis=1)) / period.position_step
+    result: dict[str, Any] = {
+        "schema": SCHEMA,
+        "method": f"settled period, least squares on Fourier lines, then maximum likelihood; "
+        f"{config.model.friction} friction, {config.model.drive} drive",
+        "config": shown_path,
+        "joints": len(config.joints),
+        "parameters": _entries(estimate, 0, base),
+        "extra": _entries(estimate, base, len(estimate.names)),
+        "covariance": {"names": list(estimate.names), "matrix": estimate.covariance.tolist()},
+        "fit": {
+            "residual_rms_ticks": [float(value) for value in residual],
+            "quantisation_floor_ticks": round(QUANTISATION_FLOOR_TICKS, 4),
+            "samples_per_period": period.position.shape[1],
+            "periods": period.periods,
+        },
+        "validation": {} if held_out is None else {"held_out_rms": [float(value) for value in held_out]},
+        "timing": timing,
+    }
+    if config.is_fake and config.fake is not None:
+        result["truth"] = base_parameters(config.fake.arm)
+    return result
+
+
+def _entries(estimate: Estimate, start: int, end: int) -> dict[str, Any]:
+    return {
+        estimate.names[index]: {
+            "value": float(estimate.value[index]),
+            "std": float(estimate.std[index]),
+            "unit": estimate.units[index],
+        }
+        for index in range(start, end)
+    }

@@ -1,0 +1,84 @@
+"""A result as a table in the terminal: parameter, unit, value, standard error; on a fake arm the truth too."""
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from hil.config import Config
+
+GOOD_RESIDUAL_TICKS = 0.30
+"""A residual up to here is the encoder's own rounding; what is above it the model has not explained."""
+
+
+def print_result(result: dict[str, Any], config: Config, run: Path, console: Console) -> None:
+    """The table, the fit and what to do next."""
+    console.print(_parameters(result))
+    for line in (*_fit(result), *_torque_constants(config), *_next(result, run)):
+        console.print(line, soft_wrap=True)
+
+
+def _parameters(result: dict[str, Any]) -> Table:
+    truth = result.get("truth")
+    table = Table(title=f"{result['joints']}-joint arm, {result['config']}", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("unit")
+    for heading in ("value", "std. error", *(("truth", "error %", "in std. errors") if truth else ())):
+        table.add_column(heading, justify="right")
+    for name, entry in result["parameters"].items():
+        table.add_row(name, entry["unit"], *_numbers(entry, truth.get(name) if truth else None))
+    table.add_section()
+    for name, entry in result["extra"].items():
+        table.add_row(name, entry["unit"], f"{entry['value']:.5g}", f"{entry['std']:.1e}")
+    return table
+
+
+def _numbers(entry: dict[str, Any], truth: float | None) -> list[str]:
+    value, std = entry["value"], entry["std"]
+    cells = [f"{value:.5g}", f"{std:.1e}"]
+    if truth is not None:
+        error = value - truth
+        percent = f"{100 * error / truth:+.3f}" if truth else "-"
+        cells += [f"{truth:.5g}", percent, f"{error / std:+.1f}" if std > 0 else "-"]
+    return cells
+
+
+def _fit(result: dict[str, Any]) -> list[str]:
+    fit = result["fit"]
+    residual = ", ".join(f"{value:.3f}" for value in fit["residual_rms_ticks"])
+    lines = [
+        f"Residual {residual} encoder steps RMS; the encoder's own rounding is {fit['quantisation_floor_ticks']}.",
+    ]
+    held_out = result["validation"].get("held_out_rms")
+    if held_out:
+        errors = ", ".join(f"{100 * value:.2f} %" for value in held_out)
+        lines.append(
+            f"Free prediction of another multisine, not used for the fit: off by {errors} of the motion's RMS."
+        )
+    return lines
+
+
+def _torque_constants(config: Config) -> list[str]:
+    unsure = [
+        f"{joint.name} {100 * joint.torque_constant_std / joint.torque_constant:.0f} %"
+        for joint in config.joints
+        if joint.torque_constant_std
+    ]
+    if not unsure:
+        return []
+    return [f"Every value also scales with its joint's torque constant, known to: {', '.join(unsure)}."]
+
+
+def _next(result: dict[str, Any], run: Path) -> list[str]:
+    lines = [f"Run folder: {run}"]
+    worst = max(result["fit"]["residual_rms_ticks"])
+    if worst <= GOOD_RESIDUAL_TICKS:
+        lines.append("The model explains the motion down to the encoder's rounding. Estimate again from the recording:")
+    else:
+        lines.append(
+            f"{worst / GOOD_RESIDUAL_TICKS:.1f} times more is left than the encoder explains: something moves that "
+            "the model does not have. Try a richer [model] friction, a larger peak_torque, or look for play. Estimate again:"
+        )
+    lines.append(f"  hil estimate {run}")
+    return lines

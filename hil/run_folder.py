@@ -1,0 +1,155 @@
+"""The run folder: an exact copy of the configuration, what was run on what, events, samples, result.
+
+config.toml     copied byte for byte
+run.json        versions, start time, and the few facts that the samples need to be read again
+events.jsonl    what happened when, one JSON object a line, written as it happens
+samples.npy     every sample (hil.recording)
+result.json     parameters with error bars, fit, validation, timing
+"""
+
+import json
+import platform
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from hil import __version__
+from hil.config import Config, parse_config
+from hil.errors import RunFolderError
+from hil.plan import Plan
+
+SCHEMA = 1
+_PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What `estimate` needs beside configuration and samples.
+
+    command_to_sample: s from the goal currents' arrival at the servos to the sampling of their positions.
+    position_step: rad per encoder step, per joint. segments: the role of each multisine, in the order played.
+    """
+
+    config: str
+    command_to_sample: float
+    position_step: list[float]
+    segments: list[str]
+
+
+class RunFolder:
+    """A folder of one run. `create` makes a new one, `open` reads one that exists."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, path: Path, config: Config) -> "RunFolder":
+        """Make the folder and copy the configuration; raises RunFolderError when it is taken or not writable."""
+        run = cls(path)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            if any(path.iterdir()):
+                raise RunFolderError(f"Run folder {path} is not empty; name another with --out, or remove it.")
+            run.config_path.write_bytes(config.path.read_bytes())
+        except OSError as error:
+            raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> "RunFolder":
+        """A folder that holds a run; raises RunFolderError."""
+        run = cls(path)
+        for needed in (run.config_path, run.run_path, run.samples_path):
+            if not needed.is_file():
+                raise RunFolderError(f"{path} is not a run folder: it has no {needed.name}.")
+        return run
+
+    @property
+    def config_path(self) -> Path:
+        return self.path / "config.toml"
+
+    @property
+    def run_path(self) -> Path:
+        return self.path / "run.json"
+
+    @property
+    def samples_path(self) -> Path:
+        return self.path / "samples.npy"
+
+    @property
+    def result_path(self) -> Path:
+        return self.path / "result.json"
+
+    def load_config(self) -> Config:
+        return parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
+
+    def write_facts(self, facts: RunFacts, plan: Plan) -> None:
+        """Write run.json: the facts, and what was run on what."""
+        described = {
+            "schema": SCHEMA,
+            **asdict(facts),
+            "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+            "versions": {"hil": __version__, **{name: version(name) for name in _PACKAGES}},
+            "python": platform.python_version(),
+            "machine": platform.platform(),
+            "excitation": [
+                {
+                    "role": segment.role,
+                    "lines": [list(map(int, lines)) for lines in segment.multisine.lines],
+                    "crest_factor": [round(float(value), 4) for value in segment.multisine.crest_factor],
+                }
+                for segment in plan.segments
+            ],
+        }
+        write_json(self.run_path, described)
+
+    def load_facts(self) -> RunFacts:
+        values = _read_json(self.run_path)
+        if values.get("schema") != SCHEMA:
+            raise RunFolderError(
+                f"{self.run_path}: schema {values.get('schema')!r} is not {SCHEMA}; this run was made by another hil."
+            )
+        try:
+            return RunFacts(
+                str(values["config"]),
+                float(values["command_to_sample"]),
+                [float(step) for step in values["position_step"]],
+                [str(role) for role in values["segments"]],
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunFolderError(f"{self.run_path} is damaged: {error!r}.") from error
+
+    def event(self, time: float, what: str) -> None:
+        """Append one event, with its time on the port's clock [s]; raises RunFolderError."""
+        line = json.dumps({"time": round(time, 6), "event": what}, ensure_ascii=False)
+        path = self.path / "events.jsonl"
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+        except OSError as error:
+            raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+    def write_result(self, result: dict[str, Any]) -> None:
+        write_json(self.result_path, result)
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write a JSON file whole or not at all."""
+    temporary = path.with_suffix(".partial")
+    try:
+        temporary.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path} cannot be read: {error}.") from error
+    if not isinstance(value, dict):
+        raise RunFolderError(f"{path} is damaged: it holds no JSON object.")
+    return value

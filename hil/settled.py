@@ -1,0 +1,56 @@
+"""From a recording to what the estimator takes: the settled periods of one multisine."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.period import SettledPeriod
+from estimator.settling import period_difference
+from hil.config import Config
+from hil.errors import RecordingCutShort
+from hil.recording import Phase
+from hil.run_folder import RunFacts
+
+
+def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], role: str) -> SettledPeriod:
+    """The settled periods of the multisine played for `role`; raises RecordingCutShort."""
+    experiment = config.experiment
+    count = experiment.samples
+    chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))
+    rows = samples[chosen]
+    whole = len(rows) // count
+    periods = rows[: whole * count].reshape(whole, count)
+    position = np.moveaxis(periods["position"], 2, 1)
+    first = _first_settled(position, experiment.settle_within)
+    if first is None or whole - first < experiment.periods:
+        wanted = experiment.periods + 1
+        raise RecordingCutShort(
+            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods, and among "
+            f"them no {experiment.periods} settled ones; {wanted * count} samples are the least. Record again."
+        )
+    used = periods[first : first + experiment.periods]
+    constants = np.array([joint.torque_constant for joint in config.joints])
+    return SettledPeriod.from_periods(
+        rate=experiment.rate,
+        torque=np.moveaxis(used["goal_current"] * constants, 2, 1),
+        position=position[first : first + experiment.periods],
+        command_to_sample=facts.command_to_sample,
+        position_step=np.array(facts.position_step),
+    )
+
+
+def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
+    """The first period that is like the one before it, as the stream decided."""
+    for period in range(1, len(position)):
+        if settling_difference(position[period - 1], position[period]) <= within:
+            return period
+    return None
+
+
+def settling_difference(former: NDArray[np.float64], latest: NDArray[np.float64]) -> float:
+    """How far a period, (joints, samples) [rad], is from the one before: RMS over the motion's RMS, the worst joint.
+
+    Only the later halves are compared. Where they agree the former period ended settled, so all of the latest one is,
+    even though the former began with the transient of the ramp: a whole period of arm time is saved.
+    """
+    half = former.shape[1] // 2
+    return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())

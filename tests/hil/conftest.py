@@ -1,0 +1,49 @@
+"""A fake arm with a short experiment, and the ports that a test opened, so that it can look at the servos themselves."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from hil.config import Config, load_config
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture
+def ports(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Every port opened during the test, in order; `.bus.servos` are the emulated servos."""
+    opened: list[Any] = []
+    open_port = serial.serial_for_url
+
+    def keep(*args: Any, **kwargs: Any) -> Any:
+        opened.append(open_port(*args, **kwargs))
+        return opened[-1]
+
+    monkeypatch.setattr(serial, "serial_for_url", keep)
+    return opened
+
+
+@pytest.fixture
+def arm_file(tmp_path: Path) -> Callable[..., Path]:
+    """Writes the ideal fake arm with a 2 s period and the changes asked for, (old, new) each; gives its path."""
+
+    def write(*changes: tuple[str, str], base: str = "fake_two_link_ideal") -> Path:
+        text = (CONFIGS / f"{base}.toml").read_text(encoding="utf-8")
+        short = (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
+        for old, new in (*short, *changes):
+            assert old in text, f"{old!r} is not in {base}.toml"
+            text = text.replace(old, new, 1)
+        path = tmp_path / "arm.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def arm(arm_file: Callable[..., Path]) -> Callable[..., Config]:
+    """The same as a checked configuration."""
+    return lambda *changes, **options: load_config(arm_file(*changes, **options))
