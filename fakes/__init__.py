@@ -3,7 +3,7 @@
 
 def register() -> None:
     """Teach pyserial the URL `fake://PATH/TO/ARM.toml`; see `fakes.protocol_fake`. Harmless when repeated."""
-    import serial  # noqa: PLC0415  (keeps `import fakes` free of it)
+    import serial
 
     if __name__ not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append(__name__)

@@ -84,7 +84,9 @@ class FakeArm(BaseModel):
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="from the wire to the host's read, for every byte [us]")
     ] = 0.0
-    servos: Annotated[tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")]
+    servos: Annotated[
+        tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")
+    ]
     arm: Annotated[Arm, Field(description="links and drives")]
 
     @model_validator(mode="after")
@@ -134,4 +136,3 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         for servo in fake.servos
     ]
     return FakeBus(servos, make_plant(fake.arm), clock, adapter_latency_us=fake.adapter_latency_us)
-

@@ -43,9 +43,7 @@ class Motor:
         self.current = 0.0  # A
         self.longest_step = min(LONGEST_STEP, STEP_PER_WIDTH * self._width) if self._width else LONGEST_STEP
 
-    def push(
-        self, step: float, command: float, angle: float, velocity: float
-    ) -> tuple[float, float, float, float]:
+    def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """What the drive does during one step, its angle and velocity given at the step's middle.
 
         Returns the mean torque without dry friction that sticks [N m], the level of that friction [N m], the

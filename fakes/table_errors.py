@@ -25,7 +25,7 @@ def describe(error: ValidationError, path: Path | str, root: type[BaseModel], ta
     """All faults of one file, a line each. table: where in the file the checked model stands, "" for all of it."""
     faults = [_fault(detail, root, table) for detail in error.errors(include_url=False)]
     if len(faults) == 1:
-        return f"{path}: {faults[0]}."
+        return f"{path}: {faults[0]}" + ("" if faults[0].endswith("?") else ".")
     lines = "".join(f"\n  {fault}" for fault in faults)
     return f"{path}: {len(faults)} faults:{lines}"
 
@@ -38,7 +38,9 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
     if kind == "extra_forbidden":
         return f"{key} is not a known key; {_allowed_keys(detail['loc'], root)}"
     if kind == "value_error":
-        return f"{key}: {context['error']}" if key else str(context["error"])
+        # A whole table's fault names its keys itself.
+        about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
+        return f"{about}: {context['error']}" if key else str(context["error"])
     message = _EXPECTED.get(kind) or _constraint(kind, context) or str(detail["msg"])
     return f"{key} = {_shown(detail['input'])}: {message}"
 
@@ -53,6 +55,8 @@ def _constraint(kind: str, context: dict[str, Any]) -> str | None:
             return f"must be less than {context['lt']}"
         case "less_than_equal":
             return f"must be at most {context['le']}"
+        case "multiple_of":
+            return f"must be a multiple of {context['multiple_of']}"
         case "literal_error":
             return f"must be one of {context['expected']}"
         case "too_short":

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from estimator.excitation import Multisine, design_multisine, zippered_lines
 from numpy.typing import NDArray
 
-from estimator.excitation import Multisine, design_multisine, zippered_lines
 from hil.config import Config
 
 IDENTIFY, HELD_OUT = "identify", "held_out"

@@ -78,7 +78,8 @@ def _next(result: dict[str, Any], run: Path) -> list[str]:
     else:
         lines.append(
             f"{worst / GOOD_RESIDUAL_TICKS:.1f} times more is left than the encoder explains: something moves that "
-            "the model does not have. Try a richer [model] friction, a larger peak_torque, or look for play. Estimate again:"
+            "the model does not have. Try a richer [model] friction or a larger peak_torque, or look for play. "
+            "Estimate again:"
         )
     lines.append(f"  hil estimate {run}")
     return lines

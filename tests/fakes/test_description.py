@@ -54,18 +54,26 @@ def test_bus_as_described(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("adapter_latency_us = 60.0", "adapter_latency_us = -1.0", ["fake.adapter_latency_us = -1.0", "greater than"]),
-        ("adapter_latency_us", "adapter_latency", ["fake.adapter_latency = 60.0", "not permitted"]),
-        (FIRST, FIRST + "baud = 9601\n", ["fake.servos[0].baud = 9601", "57600", "are allowed"]),
-        (FIRST, FIRST + "direction = 0\n", ["fake.servos[0].direction = 0", "1 or -1 is allowed"]),
-        (FIRST, FIRST + "return_delay_us = 7\n", ["fake.servos[0].return_delay_us = 7", "multiple of 2"]),
-        (FIRST, FIRST.replace("W350", "W351"), ["fake.servos[0].model = 'XM430-W351'", "XM430-W350, XM430-W210"]),
-        (FIRST, FIRST.replace("id = 1", "id = 253"), ["fake.servos[0].id = 253", "252"]),
+        (
+            "adapter_latency_us = 60.0",
+            "adapter_latency_us = -1.0",
+            ["fake.adapter_latency_us = -1.0", "must be at least 0"],
+        ),
+        (
+            "adapter_latency_us",
+            "adapter_latency",
+            ["fake.adapter_latency is not a known key", "did you mean adapter_latency_us?"],
+        ),
+        (FIRST, FIRST + "baud = 9601\n", ["fake.servos[1].baud = 9601", "57600", "are allowed"]),
+        (FIRST, FIRST + "direction = 0\n", ["fake.servos[1].direction = 0", "1 or -1 is allowed"]),
+        (FIRST, FIRST + "return_delay_us = 7\n", ["fake.servos[1].return_delay_us = 7", "multiple of 2"]),
+        (FIRST, FIRST.replace("W350", "W351"), ["fake.servos[1].model = 'XM430-W351'", "XM430-W350, XM430-W210"]),
+        (FIRST, FIRST.replace("id = 1", "id = 253"), ["fake.servos[1].id = 253", "252"]),
         (FIRST, FIRST.replace("id = 1", "id = 2"), ["IDs 2, 2", "an ID of its own"]),
         (FIRST, "", ["1 servos for 2 drives"]),
         (FIRST, FIRST + 'registers = { "Goal Current" = 1 }\n', ["Goal Current", "not an EEPROM register"]),
         (FIRST, FIRST + 'registers = { "Shutdown" = 256 }\n', ["Shutdown", "0 to 255 is allowed"]),
-        ("gear_ratio = 353.5", "gear_ratio = 0.0", ["fake.arm.drives[0].gear_ratio = 0.0", "greater than 0"]),
+        ("gear_ratio = 353.5", "gear_ratio = 0.0", ["fake.arm.drives[1].gear_ratio = 0.0", "greater than 0"]),
     ],
 )
 def test_errors_name_file_key_value_and_what_is_allowed(tmp_path: Path, old: str, new: str, said: list[str]) -> None:

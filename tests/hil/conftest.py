@@ -1,4 +1,4 @@
-"""A fake arm with a short experiment, and the ports that a test opened, so that it can look at the servos themselves."""
+"""A fake arm with a short experiment, and the ports that a test opened, to look at the servos themselves."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hil.cli import main
@@ -42,7 +43,16 @@ def test_identify_prints_a_table_and_estimate_gives_the_same_numbers_again(
 ) -> None:
     assert hil("identify", arm_file(), "--out", "run") == 0
     printed = capsys.readouterr()
-    for said in ("inertia_1", "kg m^2", "offset_2", "truth", "Residual", "0.2887", "Run folder: run", "hil estimate run"):
+    for said in (
+        "inertia_1",
+        "kg m^2",
+        "offset_2",
+        "truth",
+        "Residual",
+        "0.2887",
+        "Run folder: run",
+        "hil estimate run",
+    ):
         assert said in printed.out
     assert "Torque is off on all 2 servos" in printed.err
     first = json.loads(Path("run/result.json").read_text(encoding="utf-8"))
@@ -114,8 +124,6 @@ def test_bad_arguments_and_files(arm_file: ArmFile, capsys: pytest.CaptureFixtur
 
 def test_a_recording_cut_short_is_said(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("identify", arm_file(), "--out", "run", "--json") == 0
-    import numpy as np  # noqa: PLC0415
-
     path = Path("run/samples.npy")
     whole = np.load(path)
     np.save(path, whole[:1200])
