@@ -45,9 +45,7 @@ def parameter_units(joints: int) -> tuple[str, ...]:
     return tuple(UNITS[name.split("_")[0]] for name in parameter_names(joints))
 
 
-def regressor(
-    position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0
-) -> Array:
+def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0) -> Array:
     """Y of the base parameters (joints, samples, parameters).
 
     `position` [rad], `velocity` [rad/s], `acceleration` [rad/s^2]: (joints, samples). The sign of velocity is

@@ -28,9 +28,7 @@ def motor_torque(
         present.append(held + (np.roll(settled, -shift, axis=1) - held) * fading)
     # lag y' = u - y, integrated over a step: the mean of y is that of u less what the lag has stored.
     step = 1.0 / (steps * rate)
-    means = [
-        (gathered[i + 1] - gathered[i] - lag * (present[i + 1] - present[i])) / step for i in range(steps)
-    ]
+    means = [(gathered[i + 1] - gathered[i] - lag * (present[i + 1] - present[i])) / step for i in range(steps)]
     return np.stack(means, axis=2)
 
 

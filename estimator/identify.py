@@ -80,9 +80,7 @@ def identify(period: SettledPeriod, model: Model) -> Estimate:
     number of joints than `period`, UnidentifiableError and ConvergenceError.
     """
     if model.joints != period.joints:
-        raise ModelError(
-            f"the model has {model.joints} joints and the period {period.joints}: they must agree"
-        )
+        raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     linear = fit_lines(period)
     fit = fit_period(period, model, linear)
     return Estimate(
@@ -113,9 +111,7 @@ def predict(
     """
     joints = estimate.model.joints
     if torque.ndim != 2 or torque.shape[0] != joints:
-        raise ShapeError(
-            f"torque is {torque.shape}, the estimate is of {joints} joints: it must be (joints, samples)"
-        )
+        raise ShapeError(f"torque is {torque.shape}, the estimate is of {joints} joints: it must be (joints, samples)")
     physics = Physics.of(estimate.parameters)
     steps = steps_per_sample(rate)
     step = 1.0 / (rate * steps)

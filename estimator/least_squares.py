@@ -53,9 +53,7 @@ def fit_lines(period: SettledPeriod) -> LinearEstimate:
     # The second time each joint counts by what the first left unexplained of it.
     left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
     theta, std = _solve(A, torque, 1.0 / left)
-    return LinearEstimate(
-        parameter_names(period.joints), theta[:-1], std[:-1], float(theta[-1]), motion, harmonics
-    )
+    return LinearEstimate(parameter_names(period.joints), theta[:-1], std[:-1], float(theta[-1]), motion, harmonics)
 
 
 def _solve(columns: Lines, torque: Lines, weight: Array) -> tuple[Array, Array]:

@@ -45,9 +45,7 @@ def minimise(residual: Residual, start: Array, enough: float) -> Minimum:
     x, r = start, residual(start)
     cost = float(r @ r)
     if not np.isfinite(cost):
-        raise ConvergenceError(
-            "the starting values give no finite motion: check the torque and the period's units"
-        )
+        raise ConvergenceError("the starting values give no finite motion: check the torque and the period's units")
     damping = FIRST_DAMPING
     gained = np.inf
     with ThreadPoolExecutor(os.cpu_count()) as threads:
@@ -83,9 +81,7 @@ def _improve(
         there = residual(at.x + step)
         gained = at.cost - float(there @ there)
         if gained > 0.0:
-            return (at.x + step, there), max(
-                LEAST_DAMPING, damping * (0.1 if gained > 0.5 * foreseen else 1.0)
-            )
+            return (at.x + step, there), max(LEAST_DAMPING, damping * (0.1 if gained > 0.5 * foreseen else 1.0))
         damping = max(10.0 * damping, FIRST_DAMPING)
     return None, damping
 

@@ -56,9 +56,7 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """The base parameters, then the friction terms joint by joint, then the drive's."""
-        terms = (
-            f"{term}_{joint + 1}" for term in FRICTION_TERMS[self.friction] for joint in range(self.joints)
-        )
+        terms = (f"{term}_{joint + 1}" for term in FRICTION_TERMS[self.friction] for joint in range(self.joints))
         return (*self.base_names, *terms, self.drive)
 
     @property

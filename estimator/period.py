@@ -82,24 +82,16 @@ class SettledPeriod:
 
 def _check_shapes(period: SettledPeriod) -> None:
     if period.position.ndim != 2 or period.torque.shape != period.position.shape:
-        raise ShapeError(
-            f"torque {period.torque.shape} and position {period.position.shape} must be (joints, samples)"
-        )
+        raise ShapeError(f"torque {period.torque.shape} and position {period.position.shape} must be (joints, samples)")
     per_joint = (period.position.shape[0],)
     if period.position_step.shape != per_joint:
-        raise ShapeError(
-            f"position_step is {period.position_step.shape}, it must be {per_joint}: one per joint"
-        )
+        raise ShapeError(f"position_step is {period.position_step.shape}, it must be {per_joint}: one per joint")
     if period.position_std is not None and period.position_std.shape != per_joint:
-        raise ShapeError(
-            f"position_std is {period.position_std.shape}, it must be {per_joint}: one per joint"
-        )
+        raise ShapeError(f"position_std is {period.position_std.shape}, it must be {per_joint}: one per joint")
 
 
 def _check_values(period: SettledPeriod) -> None:
-    if not (
-        period.rate > 0.0 and np.isfinite(period.command_to_sample) and np.all(period.position_step > 0.0)
-    ):
+    if not (period.rate > 0.0 and np.isfinite(period.command_to_sample) and np.all(period.position_step > 0.0)):
         raise RecordingError(
             f"rate {period.rate:g} 1/s and position_step {period.position_step} rad must be positive, "
             f"command_to_sample {period.command_to_sample:g} s finite"

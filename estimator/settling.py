@@ -24,9 +24,7 @@ def period_difference(position: Array) -> Settling:
     Missing samples are NaN and left out of both. Raises ShapeError for fewer than two periods.
     """
     if position.ndim != 3 or position.shape[0] < 2:
-        raise ShapeError(
-            f"position is {position.shape}: it must be (periods, joints, samples), two periods or more"
-        )
+        raise ShapeError(f"position is {position.shape}: it must be (periods, joints, samples), two periods or more")
     difference = np.sqrt(np.nanmean(np.diff(position, axis=0) ** 2, axis=2))
     motion = np.nanstd(position[1:], axis=2)
     still = np.where(difference > 0.0, np.inf, 0.0)

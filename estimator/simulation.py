@@ -60,9 +60,7 @@ def _pieces(physics: Physics, step: float) -> int:
 
 
 # Compiled code takes its arguments by position; p is `Physics.vector`.
-def _forces(  # noqa: PLR0917
-    p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float
-) -> tuple[float, ...]:
+def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:
     """Mass matrix's first row, torques left for acceleration, and the slopes of friction."""
     across = p[1] * math.cos(q2)
     turning = p[1] * math.sin(q2)
@@ -74,22 +72,14 @@ def _forces(  # noqa: PLR0917
     return (
         p[0] + p[2] + 2.0 * across,
         p[2] + across,
-        t1
-        - p[10]
-        - p[4] * math.cos(q1)
-        - weight
-        + turning * (2.0 * v1 + v2) * v2
-        - p[6] * v1
-        - level_1 * bend_1,
+        t1 - p[10] - p[4] * math.cos(q1) - weight + turning * (2.0 * v1 + v2) * v2 - p[6] * v1 - level_1 * bend_1,
         t2 - p[11] - weight - turning * v1 * v1 - p[7] * v2 - level_2 * bend_2,
         p[6] + level_1 / p[12] * (1.0 - bend_1 * bend_1),
         p[7] + level_2 / p[13] * (1.0 - bend_2 * bend_2),
     )
 
 
-def _loop(  # noqa: PLR0917
-    p: Any, state: Any, torque: Any, step: float, pieces: int, position: Any
-) -> None:
+def _loop(p: Any, state: Any, torque: Any, step: float, pieces: int, position: Any) -> None:
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
     a1 = a2 = 0.0
     m22 = p[2] + p[3]
@@ -131,6 +121,4 @@ def _loop(  # noqa: PLR0917
 
 
 _forces = numba.njit(cache=True, nogil=True)(_forces)
-_simulate: Callable[[Array, Array, Array, float, int, Array], None] = numba.njit(cache=True, nogil=True)(
-    _loop
-)
+_simulate: Callable[[Array, Array, Array, float, int, Array], None] = numba.njit(cache=True, nogil=True)(_loop)
