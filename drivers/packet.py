@@ -114,14 +114,18 @@ def unstuff(payload: bytes) -> bytes:
 
 def encode(packet_id: int, instruction: int, body: bytes = b"") -> bytes:
     """The bytes of one packet on the wire."""
-    payload = stuff(bytes((instruction,)) + body)
-    unsigned = _FRONT.pack(HEADER, packet_id, len(payload) + 2) + payload
-    return unsigned + crc(unsigned).to_bytes(2, "little")
+    return _seal(packet_id, bytes((instruction,)) + body)
 
 
 def encode_status(packet_id: int, error: int, data: bytes = b"") -> bytes:
     """The bytes of one status packet on the wire."""
-    return encode(packet_id, Instruction.STATUS, bytes((error,)) + data)
+    return _seal(packet_id, bytes((Instruction.STATUS, error)) + data)
+
+
+def _seal(packet_id: int, payload: bytes) -> bytes:
+    payload = stuff(payload)
+    unsigned = _FRONT.pack(HEADER, packet_id, len(payload) + 2) + payload
+    return unsigned + crc(unsigned).to_bytes(2, "little")
 
 
 class Framer:

@@ -30,7 +30,7 @@ class Terminal:
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
 
     def say(self, text: str) -> None:
-        self.console.print(text)
+        self.console.print(text, markup=False)
 
     @contextmanager
     def busy(self, text: str) -> Iterator[None]:

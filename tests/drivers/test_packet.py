@@ -2,7 +2,7 @@
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from drivers.packet import (
@@ -187,9 +187,21 @@ def test_writes_are_the_sdks_bytes(servo_id: int, address: int, data: bytes) -> 
     assert wire.sent == encode(servo_id, Instruction.WRITE, address.to_bytes(2, "little") + data)
 
 
+# The SDK takes FF FD FD for a stuffed byte as well, once it has removed one from the same packet: it looks back into
+# what it has already moved. Such data cannot be compared; the codec's own round trip covers it.
 @given(st.integers(0, MAX_ID), st.integers(0, 255), SPICY)
+@example(1, 0, b"\xff\xff\xfd\xff\xff\xff\x00\x08\x00\x00")  # current -1, velocity -3
 def test_the_sdk_reads_our_statuses(servo_id: int, error: int, data: bytes) -> None:
+    assume(b"\xff\xff\xfd" not in data or b"\xff\xfd\xfd" not in data + b"\xfd")
     received, result = Protocol2PacketHandler().rxPacket(_Wire(encode_status(servo_id, error, data)), False)
     assert result == 0
     assert (received[4], received[8]) == (servo_id, error)
     assert bytes(received[9 : 9 + len(data)]) == data
+
+
+def test_data_that_the_sdk_gets_wrong() -> None:
+    data = b"\xff\xff\xfd\xff\xfd\xfd"
+    (status,) = Framer().feed(encode_status(1, 0, data))
+    assert status.data == data
+    received, _ = Protocol2PacketHandler().rxPacket(_Wire(encode_status(1, 0, data)), False)
+    assert bytes(received[9:15]) != data  # when this fails, the SDK is mended: take the assume above away
