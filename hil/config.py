@@ -10,13 +10,17 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+from drivers.bus import BusConfig
 from drivers.joint import Joint
-from drivers.servo_model import CURRENT_MODELS, servo_model
+from drivers.servo_model import SERVO_MODELS, servo_model
 from fakes.description import FakeArm
 from fakes.table_errors import describe
 from hil.errors import ConfigError
 
 FAKE_URL = "fake://"
+
+SLOW_INTERVAL_S = 0.25
+"""From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
 
 
 class _Table(BaseModel):
@@ -31,6 +35,8 @@ class PortConfig(_Table):
 
     url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
+    one_write: bool = Field(True, description="commands and request in one write; false where hil check says so")
+    fast_sync_read: bool = Field(True, description="read with Fast Sync Read where every servo's firmware has it")
 
 
 class JointConfig(_Table):
@@ -38,7 +44,7 @@ class JointConfig(_Table):
 
     name: str = Field(min_length=1, max_length=20)
     id: int = Field(ge=0, le=252)
-    model: Literal[tuple(CURRENT_MODELS)]  # type: ignore[valid-type]
+    model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
     direction: Literal[-1, 1] = 1
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
     torque_constant: PositiveFloat = Field(le=100, description="N m/A at the output shaft")
@@ -158,6 +164,18 @@ class Config(_Table):
     def url(self) -> str:
         """The port's URL, with "fake://" completed by the file that describes the fake arm."""
         return f"{FAKE_URL}{self.path.resolve()}" if self.port.url == FAKE_URL else self.port.url
+
+    @property
+    def bus(self) -> BusConfig:
+        """What the driver needs to know."""
+        return BusConfig(
+            self.url,
+            self.port.baud,
+            tuple(joint.joint for joint in self.joints),
+            one_write=self.port.one_write,
+            fast_sync_read=self.port.fast_sync_read,
+            slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
+        )
 
     @property
     def is_fake(self) -> bool:

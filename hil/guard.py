@@ -3,8 +3,8 @@
 import math
 from collections.abc import Sequence
 
-from drivers.bus import State
 from drivers.packet import ALERT
+from drivers.state import State
 from hil.config import Config
 from hil.errors import SafetyStop
 
