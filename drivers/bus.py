@@ -24,7 +24,7 @@ class BusConfig:
 
     url: device or pyserial URL. one_write: Sync Write and group read leave in one write; False where `hil check` finds
     that an arm needs two. fast_sync_read: use it where every servo's firmware has it. slow_every: cycles from one
-    reading of tick or voltage and temperature to the next.
+    reading of tick or voltage and temperature to the next. watchdog_required: refuse firmware without Bus Watchdog.
     """
 
     url: str
@@ -33,6 +33,7 @@ class BusConfig:
     one_write: bool = True
     fast_sync_read: bool = True
     slow_every: int = 100
+    watchdog_required: bool = True
 
     def __post_init__(self) -> None:
         modes = {joint.mode for joint in self.joints}
@@ -53,7 +54,7 @@ class TorqueOff:
     def __str__(self) -> str:
         if not self.unconfirmed:
             return f"Torque is off on all {len(self.confirmed)} servos, read back."
-        names = "; ".join(f"{joint}: {why}" for joint, why in self.unconfirmed)
+        names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
         return (
             f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that hears nothing, but cut the "
             "supply before you reach into the arm."
@@ -78,6 +79,7 @@ class ServoBus:
         }
         self._exchange: Exchange | None = None
         self._converter = Converter(self.joints, [NAN] * len(self.joints))
+        self._without_watchdog: set[Joint] = set()
         self.torque_off_report: TorqueOff | None = None
 
     @classmethod
@@ -130,10 +132,16 @@ class ServoBus:
                 )
             firmware = servo.read("Firmware Version")
             if firmware < joint.servo.watchdog_firmware:
-                raise WrongModel(
-                    f"{joint.title}: firmware {firmware} has no Bus Watchdog; {joint.servo.watchdog_firmware} or "
-                    "newer is needed. Update it with DYNAMIXEL Wizard 2.0."
-                )
+                self._no_watchdog(joint, firmware)
+
+    def _no_watchdog(self, joint: Joint, firmware: int) -> None:
+        if self.config.watchdog_required:
+            raise WrongModel(
+                f"{joint.title}: firmware {firmware} has no Bus Watchdog; {joint.servo.watchdog_firmware} or newer is "
+                "needed. Update it with DYNAMIXEL Wizard 2.0. With safety.allow_no_watchdog = true it is accepted, but "
+                "then nothing stops this servo when the program is killed or the cable is pulled."
+            )
+        self._without_watchdog.add(joint)
 
     def prepare(self) -> None:
         """Bring every servo into its mode with torque off, and prepare the exchange.
@@ -228,26 +236,36 @@ class ServoBus:
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
         for joint, servo in self._servos.items():
-            servo.write("Bus Watchdog", 0)
+            watched = joint not in self._without_watchdog
+            if watched:
+                servo.write("Bus Watchdog", 0)
             # Changing Operating Mode leaves Goal Current at Current Limit.
             servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
-            servo.write("Bus Watchdog", ticks)
+            if watched:
+                servo.write("Bus Watchdog", ticks)
         for servo in self._servos.values():
             servo.write("Torque Enable", 1)
 
     def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back. Tries all of them whatever fails; never raises DriverError."""
+        """Cut torque on every servo and read it back. Tries all of them whatever fails; never raises.
+
+        The broadcast goes out a second time before the unconfirmed are given up: a servo that cannot answer may hear.
+        """
         self._broadcast_torque_off()
         confirmed, unconfirmed = [], []
         for joint, servo in self._servos.items():
             try:
                 servo.write("Torque Enable", 0)
-            except DriverError as error:
-                unconfirmed.append((joint, str(error)))
+            except Exception as error:  # whatever one servo does, the next must be tried
+                unconfirmed.append((joint, str(error) or type(error).__name__))
             else:
                 confirmed.append(joint)
+        if unconfirmed:
+            self._broadcast_torque_off()
+        for joint in confirmed:
+            if joint not in self._without_watchdog:
                 with suppress(DriverError):
-                    servo.write("Bus Watchdog", 0)
+                    self._servos[joint].write("Bus Watchdog", 0)
         self.torque_off_report = TorqueOff(tuple(confirmed), tuple(unconfirmed))
         return self.torque_off_report
 

@@ -65,12 +65,30 @@ class JointConfig(_Table):
         return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks)
 
 
+class PriorConfig(_Table):
+    """`[arm.prior]`: best guesses before any identification; one value per joint. What is left out is guessed roughly
+    from link lengths and servo models (hil.prior), with `rough_spread` in place of `spread`.
+    """
+
+    spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
+    rough_spread: PositiveFloat = Field(0.5, le=1, description="of each value guessed from length and model")
+    link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
+    link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
+    link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
+    servo_mass: list[PositiveFloat] | None = Field(None, description="kg")
+    armature: list[PositiveFloat] | None = Field(None, description="kg m^2: rotor inertia times gear ratio squared")
+    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad")
+    coulomb: list[PositiveFloat] | None = Field(None, description="N m")
+
+
 class ArmConfig(_Table):
     """`[arm]`: what is known of the mechanism."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
     rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+    link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
+    prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
 
 
 class ExperimentConfig(_Table):
@@ -80,7 +98,9 @@ class ExperimentConfig(_Table):
     period: float = Field(gt=0, le=1000, description="s")
     band: Range | None = Field(None, description="Hz: lines shared out between the joints in turn")
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
-    peak_torque: list[PositiveFloat] = Field(description="N m per joint")
+    peak_torque: list[PositiveFloat] | None = Field(None, description="N m per joint; with pilot, found by dry runs")
+    pilot: bool = Field(False, description="find peak_torque by a small pilot run first, then raise it to the limits")
+    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" designs on the pilot\'s model')
     ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
     settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
@@ -119,12 +139,37 @@ class ModelConfig(_Table):
 
 
 class SafetyConfig(_Table):
-    """`[safety]`: what stops the arm, beside the joints' own limits."""
+    """`[safety]`: what stops the arm, beside the joints' own limits, and how."""
 
     watchdog: float = Field(0.1, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
+    allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
+    write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
     max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")
+    max_late: int = Field(5, ge=1, le=1000, description="deadlines in a row that may be missed")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
+    slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
+    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
+    min_voltage: float = Field(0.0, ge=0, description="V; the servos' own limits hold beside it")
+    max_voltage: PositiveFloat = Field(30.0, description="V")
+    follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
+    follow_share: PositiveFloat = Field(0.3, le=1, description="of current_limit, by how much it may differ for longer")
+    stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
+    damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
+    limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
+
+
+class StabiliserConfig(_Table):
+    """`[stabiliser]`: a spring and a damper in software around arm.rest_pose, for arms that have no stable rest."""
+
+    stiffness: list[float] = Field(description="N m/rad per joint")
+    damping: list[float] = Field(description="N m s/rad per joint")
+
+    @model_validator(mode="after")
+    def _not_negative(self) -> Self:
+        if min(*self.stiffness, *self.damping) < 0:
+            raise ValueError("stiffness and damping must be at least 0: less would drive the arm away from its pose")
+        return self
 
 
 class Config(_Table):
@@ -137,13 +182,15 @@ class Config(_Table):
     experiment: ExperimentConfig
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
+    stabiliser: StabiliserConfig | None = None
     fake: FakeArm | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         count = len(self.joints)
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
-        _same_length("experiment.peak_torque", self.experiment.peak_torque, count)
+        for key, values in self._per_joint():
+            _same_length(key, values, count)
         if self.experiment.lines is not None:
             _same_length("experiment.lines", self.experiment.lines, count)
             excited = [line for lines in self.experiment.lines for line in lines]
@@ -153,12 +200,34 @@ class Config(_Table):
             values = [getattr(joint, key) for joint in self.joints]
             if len(set(values)) != count:
                 raise ValueError(f"joints: two joints have the same {key} {values[0]!r}")
-        for joint, rest, peak in zip(self.joints, self.arm.rest_pose, self.experiment.peak_torque, strict=True):
+        for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
             _check_rest_pose(joint, rest)
-            _check_peak_torque(joint, peak)
+        if self.experiment.peak_torque is not None:
+            for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
+                _check_peak_torque(joint, peak)
+        self._check_pilot()
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
         return self
+
+    def _per_joint(self) -> list[tuple[str, list[float]]]:
+        """Every list that needs one entry per joint, by its key."""
+        lists = {"experiment.peak_torque": self.experiment.peak_torque, "arm.link_lengths": self.arm.link_lengths}
+        if self.stabiliser is not None:
+            lists |= {"stabiliser.stiffness": self.stabiliser.stiffness, "stabiliser.damping": self.stabiliser.damping}
+        if self.arm.prior is not None:
+            guessed = self.arm.prior.model_dump(exclude={"spread", "rough_spread"})
+            lists |= {f"arm.prior.{key}": value for key, value in guessed.items()}
+        return [(key, value) for key, value in lists.items() if value is not None]
+
+    def _check_pilot(self) -> None:
+        experiment = self.experiment
+        if experiment.pilot and self.arm.link_lengths is None:
+            raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
+        if experiment.peak_torque is None and not experiment.pilot:
+            raise ValueError("experiment.peak_torque is missing: give it in N m, or let pilot = true find it")
+        if experiment.design == "optimal" and not experiment.pilot:
+            raise ValueError('experiment.design = "optimal" needs pilot = true: it designs on the pilot\'s model')
 
     @property
     def url(self) -> str:
@@ -175,6 +244,7 @@ class Config(_Table):
             one_write=self.port.one_write,
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
+            watchdog_required=not self.safety.allow_no_watchdog,
         )
 
     @property

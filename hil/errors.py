@@ -14,6 +14,30 @@ drivers.errors.DriverError  1   between computer and servos; its leaves are list
 estimator.errors.EstimationError  1   the recording does not determine the parameters; leaves listed there
 """
 
+from enum import Enum
+
+
+class Cause(Enum):
+    """What the guard saw. Where the arm can still be felt and driven, a stop may brake first."""
+
+    POSITION = "position limit"
+    VELOCITY = "velocity limit"
+    NOT_A_NUMBER = "not a number"
+    ALERT = "alert"
+    MISSING = "missing replies"
+    LATE = "missed deadlines"
+    JUMP = "encoder jump"
+    NOT_FOLLOWING = "current does not follow"
+    WRONG_SIGN = "wrong sign of response"
+    EARLY_MOTION = "motion before the start"
+    TEMPERATURE = "temperature"
+    VOLTAGE = "supply voltage"
+
+    @property
+    def allows_braking(self) -> bool:
+        """Whether measured velocity and commanded current can still be trusted."""
+        return self in {Cause.POSITION, Cause.VELOCITY, Cause.TEMPERATURE, Cause.VOLTAGE}
+
 
 class HilError(Exception):
     """Root of hil's own errors.
@@ -42,7 +66,11 @@ class ExperimentError(HilError):
 
 
 class SafetyStop(ExperimentError):
-    """The guard stopped the arm. Example: joint 2 passed its position limit."""
+    """The guard stopped the arm, or a dry run forbids it to start. Example: joint 2 passed its position limit."""
+
+    def __init__(self, message: str, cause: Cause) -> None:
+        super().__init__(message)
+        self.cause = cause
 
 
 class StopRequested(ExperimentError):

@@ -14,6 +14,7 @@ from hil.plan import Plan, make_plan
 from hil.realtime import real_time
 from hil.recording import Recorder
 from hil.run_folder import RunFacts, RunFolder
+from hil.servo_limits import servo_limits
 from hil.stop import StopRequest
 from hil.stream import Note, Stream, Watch
 
@@ -36,7 +37,8 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder:
             stop.check()
-            _play(config, run, plan, bus, recorder, stop, watch)
+            with servo_limits(config, bus, lambda what: run.event(clock.now(), what)):
+                _play(config, run, plan, bus, recorder, stop, watch)
         torque = str(bus.torque_off_report)
         run.event(clock.now(), torque)
         return torque

@@ -1,5 +1,6 @@
 """What will be played: the multisines of an experiment as goal currents, sample by sample, ramps included."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from estimator.excitation import Multisine, design_multisine, zippered_lines
 from hil.config import Config
+from hil.errors import ConfigError
 
 IDENTIFY, HELD_OUT = "identify", "held_out"
 ROLES = (IDENTIFY, HELD_OUT)
@@ -50,6 +52,7 @@ class Plan:
     segments: tuple[Segment, ...]
     rest_samples: int
     end_samples: int
+    brake_samples: int
     max_settling_periods: int
     periods: int
     settle_within: float
@@ -59,7 +62,7 @@ class Plan:
         """The largest number of samples that playing can take."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played + self.end_samples
+        return self.rest_samples + played + self.end_samples + self.brake_samples
 
     @property
     def expected(self) -> int:
@@ -76,11 +79,22 @@ def make_plan(config: Config) -> Plan:
         rate=experiment.rate,
         segments=tuple(_segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
         rest_samples=max(1, round(experiment.rest * experiment.rate)),
-        end_samples=max(1, round(config.safety.rest_time * experiment.rate)),
+        end_samples=_whole_windows(config.safety.rest_time, experiment.rate),
+        brake_samples=round(config.safety.damp_time * experiment.rate),
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
         settle_within=experiment.settle_within,
     )
+
+
+def rest_window(rate: float) -> int:
+    """Samples after which the stream looks whether the arm has come to rest."""
+    return max(1, round(0.2 * rate))
+
+
+def _whole_windows(seconds: float, rate: float) -> int:
+    window = rest_window(rate)
+    return window * max(1, math.ceil(seconds * rate / window))
 
 
 def _lines(config: Config) -> Sequence[Sequence[int]]:
@@ -94,6 +108,11 @@ def _lines(config: Config) -> Sequence[Sequence[int]]:
 
 def _segment(config: Config, role: str, seed: int) -> Segment:
     experiment = config.experiment
+    if experiment.peak_torque is None:
+        raise ConfigError(
+            f"{config.path}: experiment.peak_torque is missing. `hil dry-run` finds how much is safe; or set "
+            "pilot = true."
+        )
     multisine = design_multisine(experiment.rate, experiment.period, _lines(config), experiment.peak_torque, seed)
     constants = np.array([joint.torque_constant for joint in config.joints])
     limits = np.array([joint.current_limit for joint in config.joints])

@@ -27,6 +27,7 @@ class Phase(IntEnum):
     PERIODIC = 3
     RAMP_OUT = 4
     COMING_TO_REST = 5
+    BRAKING = 6
 
 
 def sample_type(joints: int) -> np.dtype[np.void]:

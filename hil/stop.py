@@ -1,7 +1,8 @@
 """Ctrl-C, SIGTERM and SIGHUP as a request that the stream sees between two samples.
 
 A signal that raised wherever the program happens to be could land inside the path that cuts torque. So the handlers
-only note the request, and stay in place until torque is off; a second signal changes nothing.
+only note the request, and stay in place until torque is off. A first signal brakes the arm, then cuts torque; a second
+one cuts at once; more change nothing.
 """
 
 import signal
@@ -18,6 +19,7 @@ class StopRequest:
 
     def __init__(self) -> None:
         self._received: signal.Signals | None = None
+        self._count = 0
         self._former: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> "StopRequest":
@@ -36,5 +38,11 @@ class StopRequest:
             name = "Ctrl-C" if self._received == signal.SIGINT else self._received.name
             raise StopRequested(f"Stopped by {name}.")
 
+    @property
+    def insisted(self) -> bool:
+        """Whether a second signal came: no more braking then."""
+        return self._count > 1
+
     def _note(self, number: int, _frame: FrameType | None) -> None:
+        self._count += 1
         self._received = signal.Signals(number)

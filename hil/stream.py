@@ -1,28 +1,33 @@
 """The experiment in time: at each tick one exchange, the guard looks, the recorder keeps.
 
 Played in order: rest; for each multisine a ramp in, periods until two successive ones are alike, the periods that will
-be used, a ramp out; then no current until the arm is at rest.
+be used, a ramp out; then no current until the arm is at rest. Where a stop allows it, the arm is braked before `run`
+raises; torque is cut by whoever switched it on.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.bus import ServoBus
-from drivers.errors import ServoFault
+from drivers.errors import DriverError, ServoFault
 from drivers.rate import FixedRate
 from drivers.state import State
 from hil.config import Config
-from hil.errors import ExperimentError, NotSettled, SafetyStop
+from hil.damping import Brake, may_brake
+from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop
 from hil.guard import Guard
-from hil.plan import Plan, Segment
+from hil.plan import Plan, Segment, rest_window
 from hil.recording import Phase, Recorder, missed
 from hil.settled import settling_difference
+from hil.stabiliser import Stabiliser
 from hil.stop import StopRequest
 
 _WATCH_EVERY_S = 0.05
+_LEAST_MOTION_STEPS = 4
 
 
 class Progress(NamedTuple):
@@ -51,8 +56,10 @@ class Stream:
         self._bus = bus
         self._clock = bus.port.clock
         self._plan = plan
+        self._config = config
         self._safety = config.safety
         self._guard = Guard(config)
+        self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
         self._watch = watch
@@ -63,9 +70,18 @@ class Stream:
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
         self._goal = [0.0] * len(bus.joints)
         self._segment = 0
+        self._state: State | None = None
 
     def run(self) -> None:
         """Play the whole plan; raises ExperimentError, SafetyStop, StopRequested, PortLost."""
+        try:
+            self._play_all()
+        except ExperimentError as error:
+            if may_brake(self._config, error):
+                self._brake()
+            raise
+
+    def _play_all(self) -> None:
         self._rest()
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
@@ -87,6 +103,7 @@ class Stream:
         """Periods until one is like the one before it, which then is the first settled one; then the rest of them."""
         samples = len(segment.period_current)
         former = self._play_period(segment, 0)
+        self._check_motion(former)
         for period in range(1, self._plan.max_settling_periods + 1):
             latest = self._play_period(segment, period)
             difference = settling_difference(former, latest)
@@ -103,6 +120,17 @@ class Stream:
             "max_settling_periods."
         )
 
+    def _check_motion(self, position: NDArray[np.float64]) -> None:
+        """A joint that friction or something harder holds shows after one period, before minutes are spent on it."""
+        for joint, moved in zip(
+            self._bus.joints, np.nanmax(position, axis=1) - np.nanmin(position, axis=1), strict=True
+        ):
+            if moved <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
+                raise ExperimentError(
+                    f"{joint.title} moved by {moved:.4f} rad in a whole period: it is stuck, or friction holds it. Move it "
+                    "by hand with torque off; if it is free, raise experiment.peak_torque."
+                )
+
     def _play_period(self, segment: Segment, period: int) -> NDArray[np.float64]:
         """Play one period; its positions, (joints, samples) [rad], NaN where missing."""
         first = self._recorder.count
@@ -111,10 +139,10 @@ class Stream:
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")
-        window = max(1, round(0.2 * self._plan.rate))
+        window = rest_window(self._plan.rate)
         for _ in range(0, self._plan.end_samples, window):
             self._play(self._silence(window), Phase.COMING_TO_REST)
-            slowest = np.abs(self._recorder.samples["velocity"][-window:]).max()
+            slowest = np.abs(np.nan_to_num(self._recorder.samples["velocity"][-window:])).max()
             if slowest < self._safety.rest_velocity:
                 self._note("at rest")
                 return
@@ -133,25 +161,44 @@ class Stream:
             # Skipped, never caught up in a burst: the servos keep the former goal.
             state = missed(self._goal, now)
         else:
-            self._goal = self._guard.clamp(goal)
+            wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
+            self._goal = self._guard.clamp(wanted)
             state = self._bus.exchange(self._goal)
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
-        if not late:
-            self._look(state)
+        if late:
+            self._guard.late()
+        else:
+            self._look(state, phase)
         self._stop.check()
         if self._index % self._watch_every == 0:
             role = self._plan.segments[self._segment].role
             self._watch(Progress(self._index, self._plan.expected, phase, role, state))
         return state
 
-    def _look(self, state: State) -> None:
+    def _look(self, state: State, phase: Phase) -> None:
         if any(state.error):
             try:
                 self._bus.check_alerts(state)
             except ServoFault as fault:
-                raise SafetyStop(str(fault)) from fault
-        self._guard.look(state)
+                raise SafetyStop(str(fault), Cause.ALERT) from fault
+        former, self._state = self._state, state
+        self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        if phase is Phase.REST and self._stabiliser is None:
+            self._guard.look_at_rest(state)
+
+    def _brake(self) -> None:
+        """Brake until the arm is slow, cannot be felt, time is over, or somebody insists. Never raises."""
+        brake = Brake(self._config)
+        state = self._state
+        with suppress(DriverError):
+            for _ in range(self._plan.brake_samples):
+                goals = None if state is None or self._stop.insisted else brake.goals(state)
+                deadline, _, late = self._ticks.wait()
+                if goals is None or late:
+                    return
+                state = self._bus.exchange(goals)
+                self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))

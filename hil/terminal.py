@@ -19,6 +19,7 @@ _PHASES = {
     Phase.PERIODIC: "exciting",
     Phase.RAMP_OUT: "ramping out",
     Phase.COMING_TO_REST: "coming to rest",
+    Phase.BRAKING: "braking",
 }
 _BAR_WIDTH = 24
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import serial
 
-from drivers.errors import DriverError, NoReply, PortLost, TorqueNotOff, WrongModel, WrongSetting
+from drivers.errors import DriverError, NoReply, PortLost, ServoFault, TorqueNotOff, WrongModel, WrongSetting
 from fakes.protocol_fake import FakeSerial
 from hil.config import Config
 from hil.errors import ExperimentError, NotSettled, RunFolderError, SafetyStop, StopRequested
@@ -115,7 +115,9 @@ def test_a_limit_stops_the_arm_at_the_sample_that_passed_it(
     assert_no_torque(ports[0])
     samples = load_samples(tmp_path / "run" / "samples.npy", 2)
     over = (np.abs(samples["position"][:, 1]) > 0.5) | (np.abs(samples["velocity"][:, 0]) > 2.0)
-    assert over[-1]
+    looked_at = np.flatnonzero(samples["phase"] != Phase.BRAKING)
+    assert over[looked_at[-1]] and not over[looked_at[:-1]].any()
+    assert np.count_nonzero(samples["phase"] == Phase.BRAKING) <= 0.06 * 400
 
 
 def test_a_servo_that_falls_silent_is_named_and_the_other_is_without_torque(
@@ -124,7 +126,7 @@ def test_a_servo_that_falls_silent_is_named_and_the_other_is_without_torque(
     def pull() -> None:
         ports[0].bus.servos[2].connected = False
 
-    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for joint 'elbow' \(ID 2") as caught:
+    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for JOINT 'ELBOW' \(ID 2") as caught:
         run(arm(), tmp_path / "run", at_sample(900, pull))
     assert isinstance(caught.value.__context__, SafetyStop)
     assert "missed 6 replies" in str(caught.value.__context__)
@@ -146,7 +148,7 @@ def test_a_pulled_cable_leaves_the_servos_to_their_watchdogs(
         for method in ("read", "write", "reset_input_buffer"):
             monkeypatch.setattr(FakeSerial, method, gone)
 
-    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for joint 'shoulder'.*'elbow'.*cut the supply") as caught:
+    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for JOINT 'SHOULDER'.*'ELBOW'.*cut the supply") as caught:
         run(arm(), tmp_path / "run", at_sample(900, pull))
     assert isinstance(caught.value.__context__, PortLost)
     port = ports[0]
@@ -182,7 +184,7 @@ def test_a_motion_that_never_settles_is_said(arm: Arm, tmp_path: Path, ports: li
         (('model = "XM430-W350"', 'model = "XM540-W270"'), WrongModel, r"a XM430-W350 answers at ID 1"),
         (("rest_pose = [-1.5707963, 0.0]", "rest_pose = [-1.5707963, 0.5]"), ExperimentError, r"set zero_ticks = 1722"),
         ((SERVO_1, SERVO_1 + 'registers = { "Drive Mode" = 8 }\n'), WrongSetting, r"'shoulder'.*Drive Mode is 8"),
-        ((SERVO_1, SERVO_1 + "input_voltage_v = 5.0\n"), WrongSetting, r"'shoulder' \(ID 1.*INPUT_VOLTAGE"),
+        ((SERVO_1, SERVO_1 + "input_voltage_v = 5.0\n"), ServoFault, r"'shoulder' \(ID 1.*input voltage"),
     ],
 )
 def test_what_forbids_an_experiment_is_found_before_torque(

@@ -1,0 +1,80 @@
+"""A spring and a damper in software, for arms that have no stable pose of their own: horizontal, inverted.
+
+The estimator is given the torque that was really commanded, spring and damper included; what they did can be computed
+from the recording at any time, since they act on the former sample's position and velocity alone.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.state import State
+from hil.config import Config
+
+
+class Stabiliser:
+    """Adds its currents to a goal. A joint whose reply was missing keeps the current that it had."""
+
+    def __init__(self, config: Config) -> None:
+        assert config.stabiliser is not None
+        self._gains = [
+            (stiffness / joint.torque_constant, damping / joint.torque_constant, pose)
+            for joint, stiffness, damping, pose in zip(
+                config.joints,
+                config.stabiliser.stiffness,
+                config.stabiliser.damping,
+                config.arm.rest_pose,
+                strict=True,
+            )
+        ]
+        self._added = [0.0] * len(self._gains)
+
+    def add(self, goal: list[float], former: State | None) -> list[float]:
+        """Goal currents [A] with the stabiliser's own added. former: the sample before this command."""
+        if former is None:
+            return goal
+        added = self._added
+        for index, (spring, damper, pose) in enumerate(self._gains):
+            if not former.missing[index]:
+                added[index] = spring * (pose - former.position[index]) - damper * former.velocity[index]
+        return [wanted + more for wanted, more in zip(goal, added, strict=True)]
+
+
+@dataclass(frozen=True)
+class StabiliserShare:
+    """What the stabiliser did during the periods, per joint [N m]: RMS and peak of its torque, RMS of all torque."""
+
+    rms: NDArray[np.float64]
+    peak: NDArray[np.float64]
+    commanded_rms: NDArray[np.float64]
+
+    def __str__(self) -> str:
+        each = ", ".join(
+            f"{rms:.3f} of {whole:.3f} N m RMS (peak {peak:.3f})"
+            for rms, whole, peak in zip(self.rms, self.commanded_rms, self.peak, strict=True)
+        )
+        return f"The stabiliser gave {each}."
+
+
+def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
+    """From consecutive recorded rows of one multisine (hil.recording)."""
+    torque = feedback_torque(config, samples)
+    constants = np.array([joint.torque_constant for joint in config.joints])
+    commanded = samples["goal_current"][1:] * constants
+    return StabiliserShare(
+        np.sqrt(np.nanmean(torque**2, axis=0)),
+        np.nanmax(np.abs(torque), axis=0),
+        np.sqrt(np.mean(commanded**2, axis=0)),
+    )
+
+
+def feedback_torque(config: Config, samples: NDArray[np.void]) -> NDArray[np.float64]:
+    """The stabiliser's torque in all rows but the first, (rows - 1, joints) [N m]; NaN where a reply was missing."""
+    assert config.stabiliser is not None
+    stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
+    former = samples[:-1]
+    torque: NDArray[np.float64] = (
+        stiffness * (np.array(config.arm.rest_pose) - former["position"]) - damping * former["velocity"]
+    )
+    return torque
