@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,12 @@ class Segment:
         index = np.arange(count) % len(self.period_current)
         return self.period_current[index] * fade[:, None]
 
+    @property
+    def peak_torque(self) -> NDArray[np.float64]:
+        """Largest commanded torque (joints,) [N m]."""
+        peaks: NDArray[np.float64] = np.abs(self.multisine.torque).max(axis=1)
+        return peaks
+
     def _before(self, count: int) -> NDArray[np.float64]:
         index = np.arange(-count, 0) % len(self.period_current)
         return self.period_current[index]
@@ -57,6 +63,10 @@ class Plan:
     periods: int
     settle_within: float
 
+    def first_segment(self) -> "Plan":
+        """The plan with its first multisine alone."""
+        return replace(self, segments=self.segments[:1])
+
     @property
     def capacity(self) -> int:
         """The largest number of samples that playing can take."""
@@ -69,6 +79,27 @@ class Plan:
         """The number of samples when the second period is settled, as on most arms."""
         played = sum((1 + self.periods) * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
         return self.rest_samples + played
+
+
+def scaled(config: Config, plan: Plan, peak_torque: NDArray[np.float64]) -> Plan:
+    """The same waves with other peaks, (joints,) [N m]; each segment's own peaks are brought to these."""
+    return replace(plan, segments=tuple(_scaled_segment(config, segment, peak_torque) for segment in plan.segments))
+
+
+def _scaled_segment(config: Config, segment: Segment, peak_torque: NDArray[np.float64]) -> Segment:
+    wave = segment.multisine
+    factor = peak_torque / np.abs(wave.torque).max(axis=1)
+    amplitudes = tuple(tuple(float(f * a) for a in each) for f, each in zip(factor, wave.amplitudes, strict=True))
+    multisine = replace(wave, amplitudes=amplitudes, torque=wave.torque * factor[:, None])
+    return Segment(segment.role, multisine, period_current(config, multisine), segment.ramp_samples)
+
+
+def period_current(config: Config, multisine: Multisine) -> NDArray[np.float64]:
+    """One period of goal currents within the limits, (samples, joints) [A]."""
+    constants = np.array([joint.torque_constant for joint in config.joints])
+    limits = np.array([joint.current_limit for joint in config.joints])
+    clipped: NDArray[np.float64] = np.clip(multisine.torque.T / constants, -limits, limits)
+    return clipped
 
 
 def make_plan(config: Config) -> Plan:
@@ -114,7 +145,4 @@ def _segment(config: Config, role: str, seed: int) -> Segment:
             "pilot = true."
         )
     multisine = design_multisine(experiment.rate, experiment.period, _lines(config), experiment.peak_torque, seed)
-    constants = np.array([joint.torque_constant for joint in config.joints])
-    limits = np.array([joint.current_limit for joint in config.joints])
-    current = np.clip(multisine.torque.T / constants, -limits, limits)
-    return Segment(role, multisine, current, round(experiment.ramp * experiment.rate))
+    return Segment(role, multisine, period_current(config, multisine), round(experiment.ramp * experiment.rate))

@@ -127,8 +127,8 @@ class Stream:
         ):
             if moved <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 raise ExperimentError(
-                    f"{joint.title} moved by {moved:.4f} rad in a whole period: it is stuck, or friction holds it. Move it "
-                    "by hand with torque off; if it is free, raise experiment.peak_torque."
+                    f"{joint.title} moved by {moved:.4f} rad in a whole period: it is stuck, or friction holds it. "
+                    "Move it by hand with torque off; if it is free, raise experiment.peak_torque."
                 )
 
     def _play_period(self, segment: Segment, period: int) -> NDArray[np.float64]:

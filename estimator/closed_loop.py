@@ -1,0 +1,148 @@
+"""The arm's motion under commands that depend on its motion: a spring and damper in software, a brake.
+
+The equations and the integration step are those of `estimator.simulation`. A command is worked out once a sample
+from the state of the sample before, as the computer on the bus does it, clipped, and held; the motor follows it with
+a first-order lag. A pure delay of the drive is taken as more of that lag, which is the same to first order.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from estimator.arrays import Array
+from estimator.physics import Physics
+from estimator.simulation import GAMMA, _forces, _pieces, steps_per_sample
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """torque = command + stiffness (pose - position) - damping velocity, of the former sample, within +-limit.
+
+    All (joints,) [N m/rad, N m s/rad, rad, N m].
+    """
+
+    stiffness: Array
+    damping: Array
+    pose: Array
+    limit: Array
+
+    @classmethod
+    def none(cls, joints: int) -> "Feedback":
+        """Commands as they are."""
+        nothing = np.zeros(joints)
+        return cls(nothing, nothing, nothing, np.full(joints, np.inf))
+
+
+@dataclass(frozen=True)
+class Response:
+    """A simulated motion."""
+
+    position: Array
+    """At the samples (joints, samples) [rad]."""
+    velocity: Array
+    """(joints, samples) [rad/s]."""
+    torque: Array
+    """Commanded, feedback included (joints, samples) [N m]."""
+    state: Array
+    """After the last sample: angles, velocities, motor torques, then angles and velocities at the last sample
+    (5, joints) [rad, rad/s, N m, rad, rad/s]; what `respond` takes to go on."""
+
+
+def resting(pose: Array) -> Array:
+    """The state of an arm at rest in `pose` (joints,) [rad], as `respond` takes it."""
+    nothing = np.zeros_like(pose)
+    return np.stack((pose, nothing, nothing, pose, nothing))
+
+
+def respond(physics: Physics, state: Array, command: Array, rate: float, feedback: Feedback) -> Response:
+    """Simulate one sample for each of `command` (joints, samples) [N m], at `rate` [1/s], from `state`."""
+    joints, samples = command.shape
+    steps = steps_per_sample(rate)
+    step = 1.0 / (rate * steps)
+    gains = np.zeros((4, 2))
+    gains[:, :joints] = feedback.stiffness, feedback.damping, feedback.pose, feedback.limit
+    # A pendulum is a two-joint arm whose second joint has no torque and moves nothing.
+    both = np.zeros((2, samples))
+    both[:joints] = command
+    full = np.zeros((5, 2))
+    full[:, :joints] = state
+    position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
+    lag = physics.lag + max(physics.delay, 0.0)
+    _respond(physics.vector, full, both, gains, lag, step, steps, _pieces(physics, step), position, velocity, torque)
+    return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
+
+
+# Compiled code takes its arguments by position.
+def _loop(
+    p: Any,
+    state: Any,
+    command: Any,
+    gains: Any,
+    lag: float,
+    step: float,
+    steps: int,
+    pieces: int,
+    position: Any,
+    velocity: Any,
+    torque: Any,
+) -> None:
+    q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
+    t1, t2 = state[2, 0], state[2, 1]
+    s1, s2, w1, w2 = state[3, 0], state[3, 1], state[4, 0], state[4, 1]
+    a1 = a2 = 0.0
+    m22 = p[2] + p[3]
+    fallen = 1.0 - math.exp(-step / lag) if lag > 0.0 else 1.0
+    share = fallen * lag / step if lag > 0.0 else 0.0
+    for k in range(command.shape[1]):
+        c1 = command[0, k] + gains[0, 0] * (gains[2, 0] - s1) - gains[1, 0] * w1
+        c2 = command[1, k] + gains[0, 1] * (gains[2, 1] - s2) - gains[1, 1] * w2
+        c1 = min(max(c1, -gains[3, 0]), gains[3, 0])
+        c2 = min(max(c2, -gains[3, 1]), gains[3, 1])
+        s1, s2, w1, w2 = q1, q2, v1, v2
+        position[0, k] = q1
+        position[1, k] = q2
+        velocity[0, k] = v1
+        velocity[1, k] = v2
+        torque[0, k] = c1
+        torque[1, k] = c2
+        for _ in range(steps):
+            # The motor's mean torque over the step, exactly, while the command holds.
+            m1 = c1 + (t1 - c1) * share
+            m2 = c2 + (t2 - c2) * share
+            t1 += (c1 - t1) * fallen
+            t2 += (c2 - t2) * fallen
+            near_1 = p[8] > 0.0 and abs(v1) < 6.0 * p[12] + 2.0 * step * abs(a1)
+            near_2 = p[9] > 0.0 and abs(v2) < 6.0 * p[13] + 2.0 * step * abs(a2)
+            cuts = pieces if near_1 or near_2 else 1
+            h = step / cuts
+            for _ in range(cuts):
+                m11, m12, f1, f2, slope_1, slope_2 = _forces(p, q1, q2, v1, v2, m1, m2)
+                w11 = m11 + GAMMA * h * slope_1
+                w22 = m22 + GAMMA * h * slope_2
+                w = w11 * w22 - m12 * m12
+                k1 = (w22 * f1 - m12 * f2) / w
+                k2 = (w11 * f2 - m12 * f1) / w
+                u1 = v1 + h * k1
+                u2 = v2 + h * k2
+                n11, n12, f1, f2, _, _ = _forces(p, q1 + h * v1, q2 + h * v2, u1, u2, m1, m2)
+                n = n11 * m22 - n12 * n12
+                r1 = (m22 * f1 - n12 * f2) / n - 2.0 * k1
+                r2 = (n11 * f2 - n12 * f1) / n - 2.0 * k2
+                f1 = m11 * r1 + m12 * r2
+                f2 = m12 * r1 + m22 * r2
+                a1 = 1.5 * k1 + 0.5 * (w22 * f1 - m12 * f2) / w
+                a2 = 1.5 * k2 + 0.5 * (w11 * f2 - m12 * f1) / w
+                q1 += 0.5 * h * (v1 + u1)
+                q2 += 0.5 * h * (v2 + u2)
+                v1 += h * a1
+                v2 += h * a2
+    state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
+    state[2, 0], state[2, 1] = t1, t2
+    state[3, 0], state[3, 1], state[4, 0], state[4, 1] = s1, s2, w1, w2
+
+
+_respond: Callable[..., None] = numba.njit(cache=True, nogil=True)(_loop)

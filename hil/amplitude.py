@@ -1,0 +1,102 @@
+"""The largest torque whose chance of touching a limit is small enough, per joint, by dry runs."""
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config import Config
+from hil.dry_run import GUARDED, Prediction, predict
+from hil.ensemble import Ensemble
+from hil.errors import ExperimentError
+from hil.plan import Plan, make_plan, scaled
+
+Array = NDArray[np.float64]
+
+SEARCH_ARMS = 48
+"""Arms during the search; the result is checked on all of them."""
+
+_ROUNDS = 14
+_CLOSE = (0.93, 1.0)
+"""Of the limits, at the wanted chance: where the search is content."""
+
+_LARGEST_STEP = 2.0
+_BACK_OFF = 0.93
+_TORQUE_SHARE = 0.97
+"""Of current_limit: a clamped wave is no longer the one that was designed."""
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """A safe amplitude: the plan, its peak torque (joints,) [N m], and what the dry run foresees of it."""
+
+    plan: Plan
+    peak_torque: Array
+    prediction: Prediction
+
+
+def largest_amplitude(config: Config, ensemble: Ensemble, share: float = 1.0, plan: Plan | None = None) -> Amplitude:
+    """Scale each joint's torque until its peaks reach `share` of the limits but for safety.limit_chance of the arms.
+
+    plan: its waves are scaled; by default low-crest multisines. Raises ExperimentError when not even a small torque is
+    safe.
+    """
+    torque = _most_torque(config) / 8
+    base = with_peaks(config, torque) if plan is None else plan
+    torque = base.segments[0].peak_torque
+    found = _search(config, base, torque, ensemble.first(SEARCH_ARMS), share)
+    for _ in range(_ROUNDS):
+        plan = scaled(config, base, found)
+        prediction = predict(config, plan, ensemble)
+        if _chance(prediction, share) <= config.safety.limit_chance:
+            return Amplitude(plan, found, prediction)
+        found = found * _BACK_OFF
+    raise ExperimentError(
+        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, say more in "
+        "[arm.prior], or raise safety.limit_chance."
+    )
+
+
+def with_peaks(config: Config, peak_torque: Array) -> Plan:
+    """The configuration's plan with these peaks [N m]."""
+    experiment = config.experiment.model_copy(update={"peak_torque": peak_torque.tolist()})
+    return make_plan(config.model_copy(update={"experiment": experiment}))
+
+
+def _search(config: Config, base: Plan, torque: Array, ensemble: Ensemble, share: float) -> Array:
+    """Joint by joint towards the limits; the joints pull at each other, so it takes some rounds."""
+    deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
+    most = _most_torque(config)
+    first = base.first_segment()
+    best = 0.25 * torque
+    torque = np.minimum(torque, most)
+    step = 1.0
+    for _ in range(_ROUNDS):
+        prediction = predict(config, scaled(config, first, torque), ensemble)
+        reached = prediction.share_at(deviations)[:GUARDED].max(axis=0) / share
+        counted = prediction.shares[:, :GUARDED].max(axis=(0, 1)) / share
+        reached = np.maximum(reached, counted)
+        if reached.max() <= 1.0 and torque.prod() > best.prod():
+            best = torque
+        wanted = np.where(reached > _CLOSE[1], 0.97 * _CLOSE[1], 1.0) / np.minimum(reached, 1e3)
+        content = (reached <= _CLOSE[1]) & ((reached >= _CLOSE[0]) | (torque >= 0.999 * most))
+        if content.all():
+            break
+        factor = np.clip(wanted**step, 1 / _LARGEST_STEP, _LARGEST_STEP)
+        torque = np.minimum(torque * factor, most)
+        step = max(0.4, 0.85 * step)
+    return best
+
+
+def _chance(prediction: Prediction, share: float) -> float:
+    if share >= 1.0:
+        return prediction.stop_chance
+    mean_shares = prediction.shares[:, :GUARDED] / share
+    return float(np.mean((mean_shares >= 1.0).any(axis=(1, 2))))
+
+
+def _most_torque(config: Config) -> Array:
+    """What the current limits and the slew allow (joints,) [N m]."""
+    limits = np.array([joint.current_limit * joint.torque_constant for joint in config.joints])
+    return np.asarray(_TORQUE_SHARE * limits)

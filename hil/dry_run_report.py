@@ -1,0 +1,128 @@
+"""A dry run in words and numbers: the verdict, a table, one JSON object."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hil.amplitude import Amplitude
+from hil.config import Config
+from hil.dry_run import QUANTITIES, UNITS, Prediction
+from hil.stopping import Stopping
+
+
+@dataclass(frozen=True)
+class DryRun:
+    """asked: of experiment.peak_torque, where given. largest: of the largest safe torque. servos: what they said."""
+
+    source: str
+    arms: int
+    asked: Prediction | None
+    largest: Amplitude
+    stopping: Stopping
+    servos: tuple[str, ...]
+
+    def is_safe(self, config: Config) -> bool:
+        """Whether the experiment as configured may be run; without a configured torque, the largest safe one is."""
+        return self.asked is None or self.asked.stop_chance <= config.safety.limit_chance
+
+
+def dry_run_json(config: Config, run: DryRun) -> dict[str, Any]:
+    """One object: verdict, largest safe torque, and per joint every predicted quantity."""
+    return {
+        "schema": 1,
+        "config": str(config.path),
+        "source": run.source,
+        "arms": run.arms,
+        "safe": run.is_safe(config),
+        "limit_chance": config.safety.limit_chance,
+        "largest_peak_torque": [round(float(value), 4) for value in run.largest.peak_torque],
+        "asked": None if run.asked is None else _prediction_json(config, run.asked),
+        "largest": _prediction_json(config, run.largest.prediction),
+        "stopping_distance_rad": {
+            kind: [round(float(value), 3) for value in getattr(run.stopping, kind)]
+            for kind in ("braked", "cut", "watchdog")
+        },
+        "servos": list(run.servos),
+    }
+
+
+def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
+    """Table and verdict for a person."""
+    shown = run.largest.prediction if run.asked is None else run.asked
+    console.print(_table(config, shown, run))
+    for line in (*run.servos, *_lines(config, shown, run)):
+        console.print(line, soft_wrap=True, markup=False)
+
+
+def settling_text(config: Config, prediction: Prediction) -> str:
+    """When the simulated arms were settled."""
+    settled = prediction.settled_after > 0
+    if not settled.any():
+        return "No simulated arm settled within the simulated periods."
+    seconds = config.experiment.ramp + config.experiment.period * float(
+        np.quantile(prediction.settled_after[settled], 0.99)
+    )
+    return (
+        f"{100 * settled.mean():.0f} % of the simulated arms settle, 99 % of those within {seconds:g} s of the start."
+    )
+
+
+def _prediction_json(config: Config, prediction: Prediction) -> dict[str, Any]:
+    median, quantile, chance = prediction.median, prediction.quantile, prediction.limit_chance
+    joints = {
+        joint.name: {
+            name: {
+                "unit": UNITS[row],
+                "median": float(median[row, index]),
+                "quantile_99": float(quantile[row, index]),
+                "limit": float(prediction.limits[row, index]),
+                "chance": float(chance[row, index]),
+            }
+            for row, name in enumerate(QUANTITIES)
+        }
+        for index, joint in enumerate(config.joints)
+    }
+    return {"guard_stop_chance": prediction.stop_chance, "joints": joints}
+
+
+def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
+    table = Table(
+        title=f"Dry run of {config.path.name}, {run.arms} arms drawn from the {run.source}", title_justify="left"
+    )
+    for heading in ("joint", "predicted peak", "unit"):
+        table.add_column(heading)
+    for heading in ("median", "99 %", "limit", "chance"):
+        table.add_column(heading, justify="right")
+    median, quantile, chance = prediction.median, prediction.quantile, prediction.limit_chance
+    for index, joint in enumerate(config.joints):
+        for row, name in enumerate(QUANTITIES):
+            numbers = (median[row, index], quantile[row, index], prediction.limits[row, index])
+            cells = [f"{value:.3g}" for value in numbers] + [f"{100 * chance[row, index]:.2g} %"]
+            table.add_row(joint.name if row == 0 else "", name, UNITS[row], *cells)
+        table.add_section()
+    return table
+
+
+def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
+    torque = ", ".join(f"{value:.2f}" for value in run.largest.peak_torque)
+    braked, watchdog = (
+        ", ".join(f"{value:.2f}" for value in ways) for ways in (run.stopping.braked, run.stopping.watchdog)
+    )
+    lines = [
+        "99 %: all peaks of an arm together stay within these in 99 of 100 arms.",
+        settling_text(config, shown),
+        f"Should a limit be passed at these speeds, the joints go on for up to {braked} rad when braked, {watchdog} rad "
+        "when the program is killed. Keep that much clear.",
+        f"Largest safe torque: peak_torque = [{torque}] N m.",
+    ]
+    allowed = f"safety.limit_chance allows {100 * config.safety.limit_chance:g} %"
+    if run.asked is None:
+        return [
+            *lines,
+            f"Safe at that torque: a guard stop has a chance of {100 * shown.stop_chance:.2g} %; {allowed}.",
+        ]
+    word = "SAFE" if run.is_safe(config) else "NOT SAFE as configured"
+    return [*lines, f"{word}: a guard stop has a chance of {100 * shown.stop_chance:.2g} %; {allowed}."]
