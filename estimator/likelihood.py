@@ -24,6 +24,7 @@ WIDTH_FLOOR = 3e-4  # rad/s: narrower cannot be told from friction that sticks
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
 COARSE = 1e-3  # relative gain in the sum of squares at which each try ends
 FINE = 1e-6
+EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02}
@@ -99,6 +100,8 @@ def fit_period(period: SettledPeriod, model: Model, linear: LinearEstimate) -> F
         value = _start(model, linear, width)
         x = np.concatenate((coordinates.coordinates(value), state))
         tries.append(minimise(problem.residual, x, COARSE))
+        if tries[-1].cost < EXPLAINED * period.valid.sum():
+            break
     best = min(tries, key=lambda found: found.cost)
     minimum = minimise(problem.residual, best.x, FINE)
     return Fit(
