@@ -127,15 +127,14 @@ def _start(model: Model, linear: LinearEstimate, width: float) -> Array:
 
 def _covariance(minimum: Minimum, coordinates: Coordinates, samples: int) -> Array:
     """Covariance of the parameters, the start's state taken as unknown with them."""
-    x, J = minimum.x, minimum.jacobian
+    x, normal = minimum.x, minimum.normal
     count = len(coordinates.names)
     variance = minimum.cost / max(1, samples - x.size)
-    norm = np.linalg.norm(J, axis=0)
+    norm = np.sqrt(np.diag(normal))
     seen = norm > 1e-12 * norm.max()
-    scaled = J[:, seen] / norm[seen]
+    lengths = np.outer(norm[seen], norm[seen])
     of_x = np.zeros((x.size, x.size))
-    inverse = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
-    of_x[np.ix_(seen, seen)] = inverse / np.outer(norm[seen], norm[seen])
+    of_x[np.ix_(seen, seen)] = np.linalg.pinv(normal[np.ix_(seen, seen)] / lengths, hermitian=True) / lengths
     slope = coordinates.slopes(x[:count])
     covariance: Array = variance * slope @ of_x[:count, :count] @ slope.T
     covariance[~seen[:count], ~seen[:count]] = np.inf
