@@ -33,9 +33,7 @@ Recorder = Callable[[Arm, Multisine], SettledPeriod]
 
 def servo_arm(joints: int, friction: dict[str, float]) -> Arm:
     drives = [{**SERVO, **drive, **friction} for drive in DRIVES[:joints]]
-    return Arm.model_validate(
-        {"start": (-math.pi / 2, 0.0)[:joints], "links": LINKS[:joints], "drives": drives}
-    )
+    return Arm.model_validate({"start": (-math.pi / 2, 0.0)[:joints], "links": LINKS[:joints], "drives": drives})
 
 
 def record(arm: Arm, multisine: Multisine) -> SettledPeriod:

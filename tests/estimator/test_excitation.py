@@ -12,9 +12,7 @@ from estimator.excitation import design_multisine, zippered_lines
 
 
 @given(st.floats(1.0, 50.0), st.floats(0.0, 2.0), st.floats(2.5, 20.0), st.integers(1, 4))
-def test_lines_are_shared_out_and_belong_to_one_joint(
-    period: float, low: float, high: float, joints: int
-) -> None:
+def test_lines_are_shared_out_and_belong_to_one_joint(period: float, low: float, high: float, joints: int) -> None:
     if int(high * period) - max(1, int(low * period) + 1) + 1 < joints:
         return
     lines = zippered_lines(period, (low, high), joints)
@@ -73,9 +71,7 @@ def test_a_seed_is_a_multisine() -> None:
         (((1,), (2,)), (1.0,), "1 peak torques for 2 joints"),
     ],
 )
-def test_what_cannot_be_built_is_said(
-    lines: tuple[tuple[int, ...], ...], peak: tuple[float, ...], said: str
-) -> None:
+def test_what_cannot_be_built_is_said(lines: tuple[tuple[int, ...], ...], peak: tuple[float, ...], said: str) -> None:
     with pytest.raises(ExcitationError, match=said):
         design_multisine(100.0, 1.0, lines, peak, 0)
 

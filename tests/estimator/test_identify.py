@@ -41,17 +41,13 @@ def offsets_in_std(estimate: Estimate, arm: Arm) -> list[float]:
 def held_out_error(estimate: Estimate, period: SettledPeriod) -> np.ndarray:
     """RMS of the free prediction's error over the RMS of the motion, each joint."""
     predicted = predict(estimate, period.torque, period.rate, period.command_to_sample)
-    return np.asarray(
-        np.sqrt(np.mean((predicted - period.position) ** 2, axis=1)) / period.position.std(axis=1)
-    )
+    return np.asarray(np.sqrt(np.mean((predicted - period.position) ** 2, axis=1)) / period.position.std(axis=1))
 
 
 RIGID = ("inertia", "coupling", "armature")
 
 
-@pytest.mark.parametrize(
-    ("seed", "peak"), [(1, (0.8, 0.42)), (2, (0.6, 0.35)), (3, (0.8, 0.42)), (16, (0.7, 0.4))]
-)
+@pytest.mark.parametrize(("seed", "peak"), [(1, (0.8, 0.42)), (2, (0.6, 0.35)), (3, (0.8, 0.42)), (16, (0.7, 0.4))])
 def test_ideal_arm_within_a_fifth_of_a_percent(
     ideal_arm: Arm, recorded: Recorder, wave: Wave, seed: int, peak: tuple[float, float]
 ) -> None:
