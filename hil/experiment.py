@@ -13,9 +13,10 @@ from hil.errors import ExperimentError, HilError, RunFolderError
 from hil.plan import Plan, make_plan
 from hil.realtime import real_time
 from hil.recording import Recorder
-from hil.run_folder import RunFacts, RunFolder
+from hil.run_folder import RunFacts, RunFolder, write_json
 from hil.stop import StopRequest
 from hil.stream import Note, Stream, Watch
+from hil.timing import lateness_histogram
 
 _LAST_SAMPLES = 100
 """How many samples an error carries with it."""
@@ -37,6 +38,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder:
             stop.check()
             _play(config, run, plan, bus, recorder, stop, watch)
+            write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
         torque = str(bus.torque_off_report)
         run.event(clock.now(), torque)
         return torque
