@@ -14,10 +14,10 @@ import math
 from typing import Any
 
 import numpy as np
-from estimator.identify import Estimate
-from estimator.period import SettledPeriod
 from numpy.typing import NDArray
 
+from estimator.identify import Estimate
+from estimator.period import SettledPeriod
 from fakes.arm import base_parameters
 from hil.config import Config
 

@@ -1,10 +1,10 @@
 """From a recording to what the estimator takes: the settled periods of one multisine."""
 
 import numpy as np
-from estimator.period import SettledPeriod
-from estimator.settling import period_difference
 from numpy.typing import NDArray
 
+from estimator.period import SettledPeriod
+from estimator.settling import period_difference
 from hil.config import Config
 from hil.errors import RecordingCutShort
 from hil.recording import Phase
