@@ -28,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
-from benchmarks.pty import machine, responder_binary, served_pty
+from benchmarks.machine import machine
+from benchmarks.pty import responder_binary, served_pty
 from drivers.control_table import load_control_table
 from drivers.exchange import Exchange
 from drivers.joint import Joint

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.pty import machine
+from benchmarks.machine import machine
 from drivers.clock import WallClock
 from drivers.rate import FixedRate
 from hil.realtime import real_time
@@ -123,9 +123,8 @@ def show(result: dict[str, Any]) -> None:
             numbers = [each[f"lateness_{key}_us"] for key in ("p50", "p99", "p99_9", "max")]
             print(f"  {name:<20}" + "".join(f"{n:>10.1f}" for n in numbers), end="")
             print(f"{each['drift_us']:>12.1f}{each['missed']:>8}")
-    print(
-        f"\nA stall of {STALL_PERIODS} periods: {result['stall']['counted']} counted as missed, {STALL_MISSES} expected."
-    )
+    counted = result["stall"]["counted"]
+    print(f"\nA stall of {STALL_PERIODS} periods: {counted} counted as missed, {STALL_MISSES} expected.")
 
 
 def main() -> None:

@@ -1,7 +1,6 @@
-"""A pty with responder.c at its far end, and what machine this is."""
+"""A pty with responder.c at its far end."""
 
 import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -9,7 +8,6 @@ import tempfile
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import date
 from pathlib import Path
 
 SOURCE = Path(__file__).with_name("responder.c")
@@ -41,8 +39,3 @@ def served_pty(binary: Path, byte_ns: int) -> Iterator[str]:
         os.close(slave)
         server.terminate()
         server.wait()
-
-
-def machine() -> str:
-    """Date and machine class, for beside the figures."""
-    return f"{date.today()}, {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"

@@ -70,5 +70,5 @@ def _servo_clock_ppm(sent: NDArray[np.void]) -> list[float | None]:
             continue
         ahead = np.unwrap(servo - np.mod(computer, SERVO_CLOCK_WRAP_S), period=SERVO_CLOCK_WRAP_S)
         slope = np.polyfit(computer - computer[0], ahead, 1)[0]
-        drifts.append(round(float(slope) * 1e6, 1))
+        drifts.append(round(float(slope) * 1e6, 1) + 0.0)
     return drifts
