@@ -21,16 +21,23 @@ def print_result(result: dict[str, Any], config: Config, run: Path, console: Con
 
 def _parameters(result: dict[str, Any]) -> Table:
     truth = result.get("truth")
-    table = Table(title=f"{result['joints']}-joint arm, {result['config']}", title_justify="left")
-    table.add_column("parameter")
-    table.add_column("unit")
-    for heading in ("value", "std. error", *(("truth", "error %", "in std. errors") if truth else ())):
-        table.add_column(heading, justify="right")
+    # Narrow enough for 80 columns, so that no figure is cut.
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    table.title, table.title_justify, table.title_style = (
+        f"{result['joints']}-joint arm, {result['config']}",
+        "left",
+        "",
+    )
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    for heading in ("value", "std", *(("truth", "error %", "in std.") if truth else ())):
+        table.add_column(heading, justify="right", no_wrap=True)
     for name, entry in result["parameters"].items():
         table.add_row(name, entry["unit"], *_numbers(entry, truth.get(name) if truth else None))
-    table.add_section()
+    table.add_row()
     for name, entry in result["extra"].items():
         table.add_row(name, entry["unit"], f"{entry['value']:.5g}", f"{entry['std']:.1e}")
+    table.add_row()
     return table
 
 
