@@ -82,10 +82,7 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
 
     joints = [Joint(f"joint{index}", index + 1, servo_model("XM430-W350")) for index in range(servos)]
     limits = [
-        SimpleNamespace(
-            joint=joint, position_limit=[-1e9, 1e9], velocity_limit=1e9, current_limit=1.2, torque_constant=1.8
-        )
-        for joint in joints
+        SimpleNamespace(joint=joint, position_limit=[-1e9, 1e9], velocity_limit=1e9, goal_limit=1.2) for joint in joints
     ]
     guard = Guard(SimpleNamespace(joints=limits, safety=SimpleNamespace(max_missing=5)))  # type: ignore[arg-type]
     port = open_port(name, BAUD)
