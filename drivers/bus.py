@@ -11,7 +11,7 @@ from drivers.joint import Joint
 from drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
 from drivers.port import Port, open_port
 from drivers.servo import Servo, describe_error
-from drivers.servo_model import VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
+from drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
 from drivers.state import NAN, Converter, State, spans
 
 _PROBES = 3
@@ -152,35 +152,36 @@ class ServoBus:
         self.port.lower_latency()
         for joint, servo in self._servos.items():
             _prepare_servo(joint, servo)
-        delay = max(2e-6 * servo.read("Return Delay Time") for servo in self._servos.values())
         supply = [VOLTAGE_UNIT * servo.read("Present Input Voltage") for servo in self._servos.values()]
         units = [joint.drive_unit(voltage) for joint, voltage in zip(self.joints, supply, strict=True)]
         self._converter = Converter(self.joints, units)
-        fast = self.config.fast_sync_read and all(map(_knows_fast_sync_read, self._servos, self._servos.values()))
-        self._exchange = self.make_exchange(delay, fast=fast, one_write=self.config.one_write)
-        if fast and not self._answers():
-            self._exchange = self.make_exchange(delay, fast=False, one_write=self.config.one_write)
+        one_write = self.config.one_write
+        fast = self.config.fast_sync_read and self.knows_fast_sync_read()
+        exchange = self.make_exchange(fast=fast, one_write=one_write)
+        nothing = [0] * len(self.joints)
+        if fast and all(None in exchange.cycle(nothing).servos for _ in range(_PROBES)):
+            exchange = self.make_exchange(fast=False, one_write=one_write)
+        self._exchange = exchange
 
-    def make_exchange(self, return_delay: float, *, fast: bool, one_write: bool) -> Exchange:
-        """An exchange with these servos, sent one way or the other. return_delay: s."""
-        tables = [servo.table for servo in self._servos.values()]
+    def knows_fast_sync_read(self) -> bool:
+        """Whether every servo's firmware has Fast Sync Read."""
+        return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
+
+    def make_exchange(self, *, fast: bool, one_write: bool, slow_every: int | None = None) -> Exchange:
+        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first."""
+        servos = self._servos.values()
+        tables = [servo.table for servo in servos]
         mode = self.joints[0].mode
-        goal = tables[0]["Goal Current" if mode is Mode.CURRENT else "Goal PWM"]
         return Exchange(
             self.port,
-            [joint.id for joint in self.joints],
-            goal,
+            [servo.id for servo in servos],
+            tables[0]["Goal Current" if mode is Mode.CURRENT else "Goal PWM"],
             spans(mode, tables),
-            return_delay,
+            max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos),
             fast=fast,
             one_write=one_write,
-            slow_every=self.config.slow_every,
+            slow_every=slow_every or self.config.slow_every,
         )
-
-    def _answers(self) -> bool:
-        """Whether the exchange works at all; tried with torque off."""
-        nothing = [0] * len(self.joints)
-        return any(None not in self.prepared.cycle(nothing).servos for _ in range(_PROBES))
 
     @property
     def prepared(self) -> Exchange:

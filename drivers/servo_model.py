@@ -19,6 +19,9 @@ VELOCITY_UNIT = 0.229 * 2 * math.pi / 60
 WATCHDOG_UNIT = 0.020
 """s per tick of Bus Watchdog."""
 
+RETURN_DELAY_UNIT = 2e-6
+"""s per tick of Return Delay Time."""
+
 VOLTAGE_UNIT = 0.1
 """V per tick of Present Input Voltage."""
 

@@ -98,5 +98,5 @@ def _chance(prediction: Prediction, share: float) -> float:
 
 def _most_torque(config: Config) -> Array:
     """What the current limits and the slew allow (joints,) [N m]."""
-    limits = np.array([joint.current_limit * joint.torque_constant for joint in config.joints])
+    limits = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
     return np.asarray(_TORQUE_SHARE * limits)

@@ -27,6 +27,10 @@ app = typer.Typer(
 
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file that describes the arm.")]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
+PortOrConfig = Annotated[
+    str | None,
+    typer.Argument(metavar="[PORT]", help="Serial port or pyserial URL, or a TOML file; without it: list the ports."),
+]
 OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default runs/TIME-ARM.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
 
@@ -52,6 +56,14 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
     checked = load_config(config)
     run = RunFolder.create(out or _default_folder(config), checked)
     terminal = Terminal(quiet=json_only)
+    if checked.experiment.pilot:
+        from hil.pilot import identify_in_steps
+
+        with terminal.streaming(checked) as watch:
+            torque, result = identify_in_steps(checked, run, config, watch, terminal.say)
+        terminal.say(torque)
+        _show(result, checked, run.path, json_only)
+        return
     with terminal.streaming(checked) as watch:
         torque = run_experiment(checked, run, config, watch)
     terminal.say(torque)
@@ -72,6 +84,127 @@ def estimate(run: RunPath, json_only: Json = False) -> None:
     with terminal.busy("Estimating"):
         result = estimate_run(folder)
     _show(result, folder.load_config(), folder.path, json_only)
+
+
+@app.command(epilog="Example: hil scan /dev/ttyUSB0")
+def scan(
+    port: PortOrConfig = None,
+    baud: Annotated[
+        list[int] | None, typer.Option("--baud", help="Only this baud; may be given more than once.")
+    ] = None,
+    json_only: Json = False,
+) -> None:
+    """Find servos: every baud, every ID, with model, firmware, voltage, temperature and errors."""
+    from drivers.port import open_port
+    from drivers.servo_model import BAUD_RATES
+    from hil import scan as scanning
+    from hil.setup_view import print_ports, print_scan, scanned
+    from hil.terminal import Terminal
+
+    if port is None:
+        print_ports(scanning.serial_ports(), json_only)
+        return
+    bauds = tuple(baud or BAUD_RATES)
+    terminal = Terminal(quiet=json_only)
+    opened = open_port(_port_url(port), bauds[0])
+    try:
+        with terminal.busy(f"Asking {len(bauds)} baud rates"):
+            heard = list(scanning.scan(opened, bauds))
+    finally:
+        opened.close()
+    print(json.dumps(scanned(heard))) if json_only else print_scan(heard, port)
+    if not any(each.servos for each in heard):
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: hil check configs/my_arm.toml")
+def check(config: ConfigPath, json_only: Json = False) -> None:
+    """Look for everything that would stop an experiment, with how to mend it. Torque stays off."""
+    import fakes
+    from hil.check import Level, check_arm
+    from hil.config import load_config
+    from hil.setup_view import found, print_findings
+    from hil.terminal import Terminal
+
+    checked = load_config(config)
+    fakes.register()
+    with Terminal(quiet=json_only).busy("Looking"):
+        findings = list(check_arm(checked))
+    print(json.dumps(found(findings))) if json_only else print_findings(findings, config)
+    if any(finding.level is Level.STOP for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command(
+    epilog="Example: hil setup /dev/ttyUSB0 --baud 57600 --id 1 --new-id 2 --new-baud 1000000 --return-delay-us 0"
+)
+def setup(
+    port: Annotated[str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, or a TOML file.")],
+    servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
+    baud: Annotated[int, typer.Option("--baud", help="Its present baud.")] = 1_000_000,
+    new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
+    new_baud: Annotated[int | None, typer.Option("--new-baud")] = None,
+    return_delay_us: Annotated[
+        int | None, typer.Option("--return-delay-us", min=0, max=508, help="0 is wanted.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Answer every question with yes.")] = False,
+    json_only: Json = False,
+) -> None:
+    """Set a servo's ID, baud or return delay: a question before each write to EEPROM, each write read back."""
+    from drivers.port import open_port
+    from drivers.servo_model import BAUD_RATES
+    from hil.setup import open_servo, set_up
+    from hil.setup_view import changed, print_changes
+
+    if new_baud is not None and new_baud not in BAUD_RATES:
+        raise typer.BadParameter(f"{new_baud}: a servo can do {', '.join(map(str, BAUD_RATES))}.")
+    if json_only and not yes:
+        raise typer.BadParameter("--json asks no questions: it needs --yes.")
+    opened = open_port(_port_url(port), baud)
+    try:
+        servo = open_servo(opened, servo_id)
+        confirm = (lambda _: True) if yes else (lambda question: typer.confirm(question))
+        changes = set_up(servo, confirm, new_id=new_id, new_baud=new_baud, return_delay_us=return_delay_us)
+    finally:
+        opened.close()
+    print(json.dumps(changed(changes))) if json_only else print_changes(changes)
+
+
+@app.command("dry-run", epilog="Example: hil dry-run configs/first_time.toml --picture dry_run.png")
+def dry_run(
+    config: ConfigPath,
+    result: Annotated[
+        Path | None, typer.Option("--result", metavar="RUN", help="Former run: its result in place of the prior.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
+    ] = None,
+    arms: Annotated[int, typer.Option("--arms", min=20, max=5000, help="Arms to simulate.")] = 128,
+    servos: Annotated[
+        bool, typer.Option("--servos", help="Also read the servos' limits and time the bus, with torque off.")
+    ] = False,
+    json_only: Json = False,
+) -> None:
+    """Simulate the experiment on arms like yours; exit code 1 if it might touch a limit."""
+    from rich.console import Console
+
+    from hil.config import load_config
+    from hil.dry_run_command import dry_run as simulate
+    from hil.dry_run_picture import draw
+    from hil.dry_run_report import dry_run_json, print_dry_run
+    from hil.terminal import Terminal
+
+    checked = load_config(config)
+    with Terminal(quiet=json_only).busy("Simulating"):
+        run = simulate(checked, result, arms, servos)
+    if picture is not None:
+        draw(checked, run.largest.prediction if run.asked is None else run.asked, picture)
+    if json_only:
+        print(json.dumps(dry_run_json(checked, run), ensure_ascii=False))
+    else:
+        print_dry_run(checked, run, Console(highlight=False))
+    if not run.is_safe(checked):
+        raise typer.Exit(1)
 
 
 def main() -> NoReturn:
@@ -96,6 +229,18 @@ def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool)
     from hil.result_table import print_result
 
     print_result(result, config, path, Console(highlight=False))
+
+
+def _port_url(port: str) -> str:
+    """The port's URL: as given, or what a configuration says."""
+    import fakes
+
+    fakes.register()
+    if port.endswith(".toml") and "://" not in port:
+        from hil.config import load_config
+
+        return load_config(Path(port)).url
+    return port
 
 
 def _default_folder(config: Path) -> Path:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 
 from drivers.bus import BusConfig
 from drivers.joint import Joint
-from drivers.servo_model import SERVO_MODELS, servo_model
+from drivers.servo_model import SERVO_MODELS, Mode, servo_model
 from fakes.description import FakeArm
 from fakes.table_errors import describe
 from hil.errors import ConfigError
@@ -47,11 +47,15 @@ class JointConfig(_Table):
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
     direction: Literal[-1, 1] = 1
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
-    torque_constant: PositiveFloat = Field(le=100, description="N m/A at the output shaft")
+    mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
+    torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
     torque_constant_std: float = Field(0.0, ge=0, description="N m/A")
+    torque_per_volt: PositiveFloat | None = Field(None, le=100, description="N m/V at the output shaft, pwm mode only")
+    torque_per_volt_std: float = Field(0.0, ge=0, description="N m/V")
     position_limit: Range = Field(description="rad")
     velocity_limit: PositiveFloat = Field(description="rad/s")
-    current_limit: PositiveFloat = Field(le=30, description="A")
+    current_limit: PositiveFloat | None = Field(None, le=30, description="A")
+    voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -60,9 +64,49 @@ class JointConfig(_Table):
             raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
         return self
 
+    @model_validator(mode="after")
+    def _driven(self) -> Self:
+        pwm = self.drive_mode is Mode.PWM
+        if not pwm and servo_model(self.model).current_unit is None:
+            raise ValueError(f'mode = "current": a {self.model} has no current mode; use "pwm"')
+        values = (self.torque_constant, self.current_limit), (self.torque_per_volt, self.voltage_limit)
+        names = ("torque_constant", "current_limit"), ("torque_per_volt", "voltage_limit")
+        mode = self.drive_mode.name.lower()
+        for name, value in zip(names[pwm], values[pwm], strict=True):
+            if value is None:
+                raise ValueError(f"{name} is missing; {mode} mode needs it")
+        for name, value in zip(names[not pwm], values[not pwm], strict=True):
+            if value is not None:
+                raise ValueError(f"{name} = {value:g}: it means nothing in {mode} mode; {' and '.join(names[pwm])} do")
+        return self
+
+    @property
+    def drive_mode(self) -> Mode:
+        if self.mode is None:
+            return servo_model(self.model).default_mode
+        return Mode[self.mode.upper()]
+
+    @property
+    def torque_per_goal(self) -> float:
+        """N m per A, or per V in pwm mode."""
+        value = self.torque_per_volt if self.drive_mode is Mode.PWM else self.torque_constant
+        assert value is not None  # checked above
+        return value
+
+    @property
+    def torque_per_goal_std(self) -> float:
+        return self.torque_per_volt_std if self.drive_mode is Mode.PWM else self.torque_constant_std
+
+    @property
+    def goal_limit(self) -> float:
+        """A, or V in pwm mode."""
+        value = self.voltage_limit if self.drive_mode is Mode.PWM else self.current_limit
+        assert value is not None  # checked above
+        return value
+
     @property
     def joint(self) -> Joint:
-        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks)
+        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks, self.drive_mode)
 
 
 class PriorConfig(_Table):
@@ -206,6 +250,8 @@ class Config(_Table):
             for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
                 _check_peak_torque(joint, peak)
         self._check_pilot()
+        if len({joint.drive_mode for joint in self.joints}) != 1:
+            raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
         return self
@@ -224,8 +270,8 @@ class Config(_Table):
         experiment = self.experiment
         if experiment.pilot and self.arm.link_lengths is None:
             raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
-        if experiment.peak_torque is None and not experiment.pilot:
-            raise ValueError("experiment.peak_torque is missing: give it in N m, or let pilot = true find it")
+        if experiment.peak_torque is None and self.arm.link_lengths is None:
+            raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
         if experiment.design == "optimal" and not experiment.pilot:
             raise ValueError('experiment.design = "optimal" needs pilot = true: it designs on the pilot\'s model')
 
@@ -290,9 +336,10 @@ def _check_rest_pose(joint: JointConfig, rest: float) -> None:
 
 
 def _check_peak_torque(joint: JointConfig, peak: float) -> None:
-    most = joint.current_limit * joint.torque_constant
+    most = joint.goal_limit * joint.torque_per_goal
+    product = "voltage_limit * torque_per_volt" if joint.drive_mode is Mode.PWM else "current_limit * torque_constant"
     if peak > most * (1 + 1e-9):
         raise ValueError(
-            f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than current_limit * "
-            f"torque_constant = {math.floor(most * 1000) / 1000:g} N m"
+            f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than "
+            f"{product} = {math.floor(most * 1000) / 1000:g} N m"
         )

@@ -21,7 +21,7 @@ def may_brake(config: Config, error: BaseException) -> bool:
 
 def braking_gains(config: Config) -> list[float]:
     """A per rad/s, per joint."""
-    return [joint.current_limit / (FULL_AT * joint.velocity_limit) for joint in config.joints]
+    return [joint.goal_limit / (FULL_AT * joint.velocity_limit) for joint in config.joints]
 
 
 class Brake:
@@ -29,7 +29,7 @@ class Brake:
 
     def __init__(self, config: Config) -> None:
         self._gains = braking_gains(config)
-        self._limits = [joint.current_limit for joint in config.joints]
+        self._limits = [joint.goal_limit for joint in config.joints]
         self._enough = config.safety.rest_velocity
 
     def goals(self, state: State) -> list[float] | None:

@@ -144,15 +144,15 @@ def limits_of(config: Config) -> Array:
     """(quantities, joints), in QUANTITIES and UNITS."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     velocity = np.array([joint.velocity_limit for joint in config.joints])
-    current = np.array([joint.current_limit for joint in config.joints])
-    constant = np.array([joint.torque_constant for joint in config.joints])
+    current = np.array([joint.goal_limit for joint in config.joints])
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
     torque = current * constant
     return np.stack((low, high, velocity, current, torque, torque * velocity))
 
 
 def feedback_of(config: Config) -> Feedback:
     """The stabiliser, or nothing, and the clamp [N m]."""
-    limit = np.array([joint.current_limit * joint.torque_constant for joint in config.joints])
+    limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
     pose = np.array(config.arm.rest_pose)
     if config.stabiliser is None:
         return Feedback(np.zeros_like(pose), np.zeros_like(pose), pose, limit)
@@ -161,7 +161,7 @@ def feedback_of(config: Config) -> Feedback:
 
 def peaks_of(config: Config, position: Array, velocity: Array, current: Array) -> Array:
     """Extreme values (quantities, joints) of a motion (joints, samples) [rad, rad/s, A]; NaN are left out."""
-    constant = np.array([joint.torque_constant for joint in config.joints])
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
     torque = current * constant[:, None]
     return np.stack(
         (
@@ -182,7 +182,7 @@ def scaled_feedback(feedback: Feedback, scale: Array) -> Feedback:
 
 def _command(config: Config, segment: Segment, periods: int) -> Array:
     """Torque of ramp in, settling and used periods, ramp out, in whole ticks of current (joints, samples) [N m]."""
-    constant = np.array([joint.torque_constant for joint in config.joints])
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
     tick = np.array(
         [abs(joint.joint.drive_unit(12.0 if joint.joint.mode is Mode.PWM else 0.0)) for joint in config.joints]
     )
@@ -211,7 +211,7 @@ def _simulate(
         parts.append(part)
     position = np.concatenate([part.position for part in parts], axis=1)
     velocity = np.concatenate([part.velocity for part in parts], axis=1)
-    constant = np.array([joint.torque_constant for joint in config.joints])
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
     current = np.concatenate([part.torque for part in parts], axis=1) / (scale * constant)[:, None]
     return Peaks(
         peaks_of(config, position, velocity, current),

@@ -51,7 +51,7 @@ def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
         Physics.of({name: float(values[arm]) for name, values in base.items()} | {"lag": lag}) for arm in range(count)
     )
     random = np.random.default_rng((seed, 6))
-    spread = np.array([joint.torque_constant_std / joint.torque_constant for joint in config.joints])
+    spread = np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
     scale = np.exp(np.sqrt(np.log1p(spread**2)) * random.standard_normal((count, len(config.joints))))
     return Ensemble(physics, scale, "prior")
 

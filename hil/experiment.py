@@ -13,22 +13,23 @@ from hil.errors import ExperimentError, HilError, RunFolderError
 from hil.plan import Plan, make_plan
 from hil.realtime import real_time
 from hil.recording import Recorder
-from hil.run_folder import RunFacts, RunFolder
+from hil.run_folder import RunFacts, RunFolder, write_json
 from hil.servo_limits import servo_limits
 from hil.stop import StopRequest
 from hil.stream import Note, Stream, Watch
+from hil.timing import lateness_histogram
 
 _LAST_SAMPLES = 100
 """How many samples an error carries with it."""
 
 
-def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch) -> str:
+def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch, plan: Plan | None = None) -> str:
     """Play the configuration's experiment and record it in `run`; the sentence about torque at the end.
 
-    shown_path: the configuration's path as the user wrote it. Raises HilError and DriverError; once torque was on, the
+    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`. Raises HilError and DriverError; once torque was on, the
     exception carries a note that says whether it is off.
     """
-    plan = make_plan(config)
+    plan = make_plan(config) if plan is None else plan
     fakes.register()
     with StopRequest() as stop, ServoBus.open(config.bus) as bus:
         clock = bus.port.clock
@@ -39,6 +40,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
             stop.check()
             with servo_limits(config, bus, lambda what: run.event(clock.now(), what)):
                 _play(config, run, plan, bus, recorder, stop, watch)
+            write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
         torque = str(bus.torque_off_report)
         run.event(clock.now(), torque)
         return torque

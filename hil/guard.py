@@ -54,10 +54,10 @@ class Guard:
                 joint.position_limit[1],
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit / rate,
-                joint.current_limit,
-                safety.follow_share * joint.current_limit,
-                joint.torque_constant / rate,
-                -WORK_TOLERANCE_RAD * joint.current_limit * joint.torque_constant,
+                joint.goal_limit,
+                safety.follow_share * joint.goal_limit,
+                joint.torque_per_goal / rate,
+                -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
             for joint in config.joints
         ]

@@ -96,8 +96,8 @@ def _scaled_segment(config: Config, segment: Segment, peak_torque: NDArray[np.fl
 
 def period_current(config: Config, multisine: Multisine) -> NDArray[np.float64]:
     """One period of goal currents within the limits, (samples, joints) [A]."""
-    constants = np.array([joint.torque_constant for joint in config.joints])
-    limits = np.array([joint.current_limit for joint in config.joints])
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    limits = np.array([joint.goal_limit for joint in config.joints])
     clipped: NDArray[np.float64] = np.clip(multisine.torque.T / constants, -limits, limits)
     return clipped
 

@@ -30,8 +30,8 @@ def _limits(config: Config, bus: ServoBus) -> list[str]:
         ]
         if joint.mode is Mode.CURRENT:
             own = servo.read("Current Limit") * abs(joint.drive_unit(0.0))
-            short = " : TOO LOW, goals would be refused" if own < described.current_limit else ""
-            parts.insert(0, f"own current limit {own:.2f} A, current_limit {described.current_limit:g} A{short}")
+            short = " : TOO LOW, goals would be refused" if own < described.goal_limit else ""
+            parts.insert(0, f"own current limit {own:.2f} A, current_limit {described.goal_limit:g} A{short}")
         lines.append(f"{joint.title}: {'; '.join(parts)}.")
     return lines
 

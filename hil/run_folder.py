@@ -1,9 +1,11 @@
 """The run folder: an exact copy of the configuration, what was run on what, events, samples, result.
 
 config.toml     copied byte for byte
+experiment.json the [experiment] that was really played, where the tool chose it (pilot, torque found by dry runs)
 run.json        versions, start time, and the few facts that the samples need to be read again
 events.jsonl    what happened when, one JSON object a line, written as it happens
 samples.npy     every sample (hil.recording)
+lateness.json   how many samples were how late (hil.timing)
 result.json     parameters with error bars, fit, validation, timing
 """
 
@@ -15,8 +17,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from hil import __version__
-from hil.config import Config, parse_config
+from hil.config import Config, ExperimentConfig, parse_config
 from hil.errors import RunFolderError
 from hil.plan import Plan
 
@@ -82,8 +86,30 @@ class RunFolder:
     def result_path(self) -> Path:
         return self.path / "result.json"
 
+    @property
+    def played_path(self) -> Path:
+        return self.path / "experiment.json"
+
     def load_config(self) -> Config:
-        return parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
+        """The configuration, with the experiment that was really played. Raises ConfigError, RunFolderError."""
+        config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
+        if not self.played_path.is_file():
+            return config
+        try:
+            played = ExperimentConfig(**_read_json(self.played_path))
+        except ValidationError as error:
+            raise RunFolderError(f"{self.played_path} is damaged: {error}.") from error
+        return config.model_copy(update={"experiment": played})
+
+    def below(self, name: str, played: Config) -> "RunFolder":
+        """A run of its own in a folder of this one, on the way to it; raises RunFolderError."""
+        folder = RunFolder.create(self.path / name, played)
+        folder.write_played(played)
+        return folder
+
+    def write_played(self, played: Config) -> None:
+        """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found."""
+        write_json(self.played_path, played.experiment.model_dump())
 
     def write_facts(self, facts: RunFacts, plan: Plan) -> None:
         """Write run.json: the facts, and what was run on what."""

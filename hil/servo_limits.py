@@ -25,7 +25,7 @@ def servo_limits(config: Config, bus: ServoBus, note: Callable[[str], None]) -> 
     try:
         for joint, described in zip(bus.joints, config.joints, strict=True):
             if joint.mode is Mode.CURRENT:
-                _lower(config, bus, joint, described.current_limit, former)
+                _lower(config, bus, joint, described.goal_limit, former)
         yield
     finally:
         for joint, ticks in former.items():

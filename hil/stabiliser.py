@@ -19,7 +19,7 @@ class Stabiliser:
     def __init__(self, config: Config) -> None:
         assert config.stabiliser is not None
         self._gains = [
-            (stiffness / joint.torque_constant, damping / joint.torque_constant, pose)
+            (stiffness / joint.torque_per_goal, damping / joint.torque_per_goal, pose)
             for joint, stiffness, damping, pose in zip(
                 config.joints,
                 config.stabiliser.stiffness,
@@ -60,7 +60,7 @@ class StabiliserShare:
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
     """From consecutive recorded rows of one multisine (hil.recording)."""
     torque = feedback_torque(config, samples)
-    constants = np.array([joint.torque_constant for joint in config.joints])
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
     commanded = samples["goal_current"][1:] * constants
     return StabiliserShare(
         np.sqrt(np.nanmean(torque**2, axis=0)),

@@ -38,7 +38,7 @@ class Stopping:
 
 def stopping_distance(config: Config, ensemble: Ensemble, velocity: Array, current: Array) -> Stopping:
     """From each limit, outwards at `velocity` (joints,) [rad/s] with at most `current` (joints,) [A] in force."""
-    constants = np.array([joint.torque_constant for joint in config.joints])
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
     joints = len(config.joints)
     ways = np.zeros((3, joints))
     few = ensemble.first(_ARMS)
@@ -69,7 +69,7 @@ def _ways(
     rate = config.experiment.rate
     samples = round(_LONGEST_S * rate)
     clamp = feedback_of(config).limit
-    constants = np.array([joint.torque_constant for joint in config.joints])
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
     brake = Feedback(np.zeros_like(clamp), np.array(braking_gains(config)) * constants, state[0], clamp)
     braking = max(1, round(config.safety.damp_time * rate))
     start = state.copy()

@@ -1,0 +1,189 @@
+"""Pilot, then full: small first, identify, narrow what is known, dry-run again, and raise the torque to the limits.
+
+Each step is a run of its own in a folder below the main one; the last is the main one. Every step says what it had
+predicted and what was seen.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.errors import EstimationError
+from hil.amplitude import Amplitude, largest_amplitude
+from hil.config import Config
+from hil.design import designed_plan
+from hil.dry_run import GUARDED, QUANTITIES, UNITS, peaks_of
+from hil.ensemble import Ensemble, nominal, prior_ensemble, result_ensemble
+from hil.errors import ExperimentError
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
+from hil.recording import load_samples
+from hil.run_folder import RunFolder
+from hil.stream import Watch
+
+Array = NDArray[np.float64]
+
+PRIOR_ARMS = 128
+RESULT_ARMS = 64
+PILOT_SHARES = (0.5, 0.75, 1.0)
+"""Of the limits: how far the pilot goes; more where the arm did not move enough to be identified."""
+
+MOST_STEPS = 4
+CERTAIN = 0.8
+"""A typical arm should come this far on its way to a limit; where it stays below, uncertainty costs too much range."""
+
+_PILOT_PERIOD_SHARE = 0.5
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One run on the way: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
+    (quantities, joints), in hil.dry_run.QUANTITIES.
+    """
+
+    name: str
+    peak_torque: Array
+    median: Array
+    quantile: Array
+    seen: Array
+
+    @property
+    def within(self) -> bool:
+        """Whether all seen peaks that have a limit stayed within the predicted 99 %."""
+        low, high, velocity = self.seen[:GUARDED]
+        bounds = self.quantile
+        return bool((low >= bounds[0]).all() and (high <= bounds[1]).all() and (velocity <= bounds[2]).all())
+
+    def __str__(self) -> str:
+        torque = ", ".join(f"{value:.2f}" for value in self.peak_torque)
+        each = "; ".join(
+            f"{QUANTITIES[row]} {_list(self.median[row])} predicted, at most {_list(self.quantile[row])}, "
+            f"{_list(self.seen[row])} {UNITS[row]} seen"
+            for row in range(GUARDED)
+        )
+        return f"{self.name}, peak torque {torque} N m: {each}."
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "peak_torque": self.peak_torque.tolist(),
+            "predicted_median": self.median.tolist(),
+            "predicted_quantile_99": self.quantile.tolist(),
+            "seen": self.seen.tolist(),
+            "within_quantile": self.within,
+        }
+
+
+def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> tuple[str, Any]:
+    """The whole way from link lengths to the result; the sentence about torque and the result.
+
+    Raises what a run raises, and ExperimentError when the pilot cannot be identified at any safe torque.
+    """
+    steps: list[Step] = []
+    result = _pilot(config, run, shown_path, watch, say, steps)
+    while True:
+        ensemble = result_ensemble(result, RESULT_ARMS)
+        full = _full_amplitude(config, ensemble, result)
+        certain = _typical_share(full) >= CERTAIN
+        if certain or len(steps) >= MOST_STEPS - 1:
+            break
+        say("What is known so far is too uncertain to go to the limits at once: one more run on the way.")
+        between = _without_held_out(config)
+        folder = run.below(f"step-{len(steps) + 1}", between)
+        _play(between, folder, shown_path, watch, say, f"Step {len(steps) + 1}", full, steps)
+        result = estimate_run(folder)
+    played = _with_torque(config, full.peak_torque)
+    run.write_played(played)
+    torque = _play(played, run, shown_path, watch, say, "Full run", full, steps)
+    result = estimate_run(run)
+    result["steps"] = [step.as_json() for step in steps]
+    run.write_result(result)
+    return torque, result
+
+
+def _pilot(
+    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, steps: list[Step]
+) -> dict[str, Any]:
+    """The first run, as small as can be identified."""
+    pilot = pilot_config(config)
+    ensemble = prior_ensemble(config, PRIOR_ARMS)
+    for share in PILOT_SHARES:
+        found = largest_amplitude(pilot, ensemble, share)
+        played = _with_torque(pilot, found.peak_torque)
+        folder = run.below(f"pilot-{len(steps) + 1}", played)
+        try:
+            _play(played, folder, shown_path, watch, say, "Pilot", found, steps)
+            return estimate_run(folder)
+        except EstimationError as error:
+            reason = error
+            say(f"The pilot did not move the arm enough: {error}")
+    raise ExperimentError(
+        f"No safe pilot could be identified ({reason}). Say more in [arm.prior], so that a larger one is safe, or give "
+        "peak_torque yourself with pilot = false."
+    )
+
+
+def pilot_config(config: Config) -> Config:
+    """Half the period where the band allows it, no held-out multisine."""
+    experiment = config.experiment
+    update: dict[str, Any] = {"held_out": False, "peak_torque": None}
+    if experiment.band is not None:
+        samples = round(experiment.samples * _PILOT_PERIOD_SHARE)
+        period = samples / experiment.rate
+        low, high = experiment.band
+        update |= {"period": period, "band": [max(low, 1 / period), high]}
+    return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
+
+
+def _full_amplitude(config: Config, ensemble: Ensemble, result: dict[str, Any]) -> Amplitude:
+    if config.experiment.design == "optimal":
+        return largest_amplitude(
+            config, ensemble, plan=designed_plan(config, nominal(result), list(result["parameters"]))
+        )
+    return largest_amplitude(config, ensemble)
+
+
+def _typical_share(found: Amplitude) -> float:
+    shares = np.median(found.prediction.shares, axis=0)[:GUARDED]
+    return float(shares.max(axis=0).min())
+
+
+def _play(
+    config: Config,
+    folder: RunFolder,
+    shown_path: Path,
+    watch: Watch,
+    say: Say,
+    name: str,
+    found: Amplitude,
+    steps: list[Step],
+) -> str:
+    """Run one step, compare, tell."""
+    torque = run_experiment(config, folder, shown_path, watch, found.plan)
+    samples = load_samples(folder.samples_path, len(config.joints))
+    seen = peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
+    step = Step(name, found.peak_torque, found.prediction.median, found.prediction.quantile, seen)
+    steps.append(step)
+    say(str(step))
+    if not step.within:
+        say(f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed.")
+    return torque
+
+
+def _with_torque(config: Config, peak_torque: Array) -> Config:
+    experiment = config.experiment.model_copy(update={"peak_torque": peak_torque.tolist()})
+    return config.model_copy(update={"experiment": experiment})
+
+
+def _without_held_out(config: Config) -> Config:
+    return config.model_copy(update={"experiment": config.experiment.model_copy(update={"held_out": False})})
+
+
+def _list(values: Array) -> str:
+    return ", ".join(f"{value:.2f}" for value in values)
