@@ -8,7 +8,6 @@ Source of the criterion: Pronzato and Pazman, "Design of experiments in nonlinea
 minimax criteria).
 """
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -17,7 +16,7 @@ import numpy as np
 from estimator.arrays import Array
 from estimator.closed_loop import Feedback, Response, respond, resting
 from estimator.excitation import Multisine
-from estimator.physics import CONSTANTS, Physics
+from estimator.physics import ABSENT, CONSTANTS, Physics
 
 KNOTS = 4  # of each joint's amplitude spectrum, over the logarithm of the line
 SHAPE_TRIALS = 90
@@ -79,9 +78,8 @@ class Problem:
             return np.full(len(self.names), np.inf)
         scaled = columns[:, seen] / norm[seen]
         inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14, hermitian=True)
-        deviations: Array = (
-            np.sqrt(np.maximum(np.diag(inverse), 0.0))[: len(self.names)] / norm[seen][: len(self.names)]
-        )
+        count = len(self.names)
+        deviations: Array = np.sqrt(np.maximum(np.diag(inverse), 0.0))[:count] / norm[seen][:count]
         return deviations
 
     def scale(self) -> Array:
@@ -152,35 +150,20 @@ class Problem:
     def _nuisances(self, joints: int) -> list[str]:
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
         terms = [f"{term}_{joint + 1}" for term in NUISANCES for joint in range(joints)]
-        present = [
-            name
-            for name in terms
-            if known[name] > 0.0 and not (name.startswith("coulomb_width") and known[name] == 1.0)
-        ]
+        present = [name for name in terms if known[name] not in {0.0, ABSENT[name]}]
         return [*present, "lag"]
 
 
-def design_optimal(
-    plain: Multisine,
-    physics: Physics,
-    names: Sequence[str],
-    limits: Limits,
-    pose: Array,
-    position_step: Array,
-    seed: int,
-    feedback: Feedback | None = None,
-) -> Design:
-    """Improve `plain`, whose lines and period are kept, on the model `physics` (of a pilot).
+def design_optimal(plain: Multisine, problem: Problem, seed: int) -> Design:
+    """Improve `plain`, whose lines and period are kept, by the standard errors that `problem` names.
 
-    names: parameters whose relative standard errors count; pose: at rest, and position_step (joints,) [rad]. The same seed gives the same wave.
+    The same seed gives the same wave.
     """
-    problem = Problem(physics, tuple(names), limits, pose, position_step, feedback or Feedback.none(plain.joints))
     random = np.random.default_rng((seed, 11))
     whole = np.ones(plain.joints)
     start = problem.scaled(plain, whole)
-    best = _Candidate(
-        np.zeros((plain.joints, KNOTS)), np.array([np.array(p) for p in plain.phases], dtype=object), whole
-    )
+    phases = tuple(np.asarray(each) for each in plain.phases)
+    best = _Candidate(np.zeros((plain.joints, KNOTS)), phases, whole)
     plain_worst = problem.worst(start)
     found, wave = plain_worst, start
     step = 0.5
@@ -203,13 +186,13 @@ class _Candidate:
     """Log amplitudes at the knots (joints, KNOTS), phases of each joint's lines, share of the limits (joints,)."""
 
     shape: Array
-    phases: Array
+    phases: tuple[Array, ...]
     share: Array
 
     def mutated(self, random: np.random.Generator, step: float, phase_step: float) -> "_Candidate":
         shape = self.shape + step * random.standard_normal(self.shape.shape)
         share = np.minimum(self.share * np.exp(0.2 * step * random.standard_normal(self.share.shape)), 1.0)
-        phases = np.array([each + phase_step * random.standard_normal(len(each)) for each in self.phases], dtype=object)
+        phases = tuple(each + phase_step * random.standard_normal(each.size) for each in self.phases)
         return _Candidate(np.clip(shape, -4.0, 4.0), phases, share)
 
     def wave(self, plain: Multisine) -> Multisine:
@@ -219,7 +202,7 @@ class _Candidate:
             order = np.log(np.asarray(lines, dtype=np.float64))
             knots = np.linspace(order.min(), order.max() + 1e-9, KNOTS)
             amplitude = np.exp(np.interp(order, knots, self.shape[joint]))
-            phase = np.asarray(self.phases[joint], dtype=np.float64)
+            phase = self.phases[joint]
             spectrum = np.zeros(plain.samples // 2 + 1, dtype=np.complex128)
             spectrum[list(lines)] = 0.5 * plain.samples * amplitude * np.exp(1j * phase)
             wave = np.fft.irfft(spectrum, plain.samples)

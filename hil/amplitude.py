@@ -53,8 +53,8 @@ def largest_amplitude(config: Config, ensemble: Ensemble, share: float = 1.0, pl
             return Amplitude(plan, found, prediction)
         found = found * _BACK_OFF
     raise ExperimentError(
-        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, say more in "
-        "[arm.prior], or raise safety.limit_chance."
+        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, say more "
+        "in [arm.prior], or raise safety.limit_chance."
     )
 
 

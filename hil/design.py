@@ -1,35 +1,69 @@
-"""Excitation by design as a plan: waves whose amplitudes and phases make the worst standard error small."""
+"""Which waves a full run plays: low-crest ones that use the room between the limits well, or designed ones."""
 
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from estimator.optimal_excitation import Limits, design_optimal
+from estimator.excitation import Multisine
+from estimator.optimal_excitation import Limits, Problem, design_optimal
 from estimator.physics import Physics
 from hil.amplitude import with_peaks
 from hil.config import Config
 from hil.dry_run import feedback_of
-from hil.plan import IDENTIFY, Plan, Segment, period_current
+from hil.plan import Plan, Segment, period_current
+
+WAVES = 6
+"""Seeds tried for each multisine: how evenly an arm swings to both sides depends on the phases."""
+
+
+def roomy_plan(config: Config, physics: Physics) -> Plan:
+    """The configuration's plan with those low-crest waves that use most of the position range on the arm `physics`."""
+    problem = design_problem(config, physics, ())
+    plan = with_peaks(config, _torque_limits(config))
+    candidates = []
+    for seed in range(config.experiment.seed, config.experiment.seed + WAVES):
+        segment = _plain(config, seed)
+        wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
+        candidates.append((_range_used(problem, wave), _with_wave(config, segment, wave)))
+    best = sorted(candidates, key=lambda each: -each[0])
+    chosen = tuple(replace(best[place][1], role=segment.role) for place, segment in enumerate(plan.segments))
+    return replace(plan, segments=chosen)
 
 
 def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
-    """The configuration's plan with its first multisine designed for `names` on the arm `physics`."""
-    most = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
-    plain = with_peaks(config, 0.25 * most)
+    """The same with the first multisine designed for small standard errors of `names`."""
+    plan = roomy_plan(config, physics)
+    first = plan.segments[0]
+    problem = design_problem(config, physics, tuple(names))
+    wave = design_optimal(first.multisine, problem, config.experiment.seed).multisine
+    return replace(plan, segments=(_with_wave(config, first, wave), *plan.segments[1:]))
+
+
+def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> Problem:
+    """Limits and arm as the estimator's design wants them."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
-    limits = Limits(low, high, np.array([joint.velocity_limit for joint in config.joints]), most)
+    velocity = np.array([joint.velocity_limit for joint in config.joints])
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])
-    segment = plain.segments[0]
-    assert segment.role == IDENTIFY
-    wave = design_optimal(
-        segment.multisine,
-        physics,
-        names,
-        limits,
-        np.array(config.arm.rest_pose),
-        step,
-        config.experiment.seed,
-        feedback_of(config),
-    ).multisine
-    designed = Segment(IDENTIFY, wave, period_current(config, wave), segment.ramp_samples)
-    return replace(plain, segments=(designed, *plain.segments[1:]))
+    limits = Limits(low, high, velocity, _torque_limits(config))
+    return Problem(physics, names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
+
+
+def _plain(config: Config, seed: int) -> Segment:
+    experiment = config.experiment.model_copy(update={"seed": seed, "held_out": False})
+    return with_peaks(config.model_copy(update={"experiment": experiment}), _torque_limits(config)).segments[0]
+
+
+def _with_wave(config: Config, segment: Segment, wave: Multisine) -> Segment:
+    return replace(segment, multisine=wave, period_current=period_current(config, wave))
+
+
+def _range_used(problem: Problem, wave: Multisine) -> float:
+    """Share of the allowed positions that the motion covers, the worst joint's."""
+    covered = np.ptp(problem.positions(wave), axis=1)
+    allowed = problem.limits.high - problem.limits.low
+    return float((covered / allowed).min())
+
+
+def _torque_limits(config: Config) -> NDArray[np.float64]:
+    return np.array([0.97 * joint.goal_limit * joint.torque_per_goal for joint in config.joints])

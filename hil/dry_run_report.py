@@ -114,8 +114,8 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     lines = [
         "99 %: all peaks of an arm together stay within these in 99 of 100 arms.",
         settling_text(config, shown),
-        f"Should a limit be passed at these speeds, the joints go on for up to {braked} rad when braked, {watchdog} rad "
-        "when the program is killed. Keep that much clear.",
+        f"Should a limit be passed at these speeds, the joints go on for up to {braked} rad when braked, {watchdog} "
+        "rad when the program is killed. Keep that much clear.",
         f"Largest safe torque: peak_torque = [{torque}] N m.",
     ]
     allowed = f"safety.limit_chance allows {100 * config.safety.limit_chance:g} %"

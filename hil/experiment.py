@@ -26,8 +26,8 @@ _LAST_SAMPLES = 100
 def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch, plan: Plan | None = None) -> str:
     """Play the configuration's experiment and record it in `run`; the sentence about torque at the end.
 
-    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`. Raises HilError and DriverError; once torque was on, the
-    exception carries a note that says whether it is off.
+    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`.
+    Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
     plan = make_plan(config) if plan is None else plan
     fakes.register()

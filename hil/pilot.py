@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from estimator.errors import EstimationError
 from hil.amplitude import Amplitude, largest_amplitude
 from hil.config import Config
-from hil.design import designed_plan
+from hil.design import designed_plan, roomy_plan
 from hil.dry_run import GUARDED, QUANTITIES, UNITS, peaks_of
 from hil.ensemble import Ensemble, nominal, prior_ensemble, result_ensemble
 from hil.errors import ExperimentError
@@ -142,11 +142,10 @@ def pilot_config(config: Config) -> Config:
 
 
 def _full_amplitude(config: Config, ensemble: Ensemble, result: dict[str, Any]) -> Amplitude:
-    if config.experiment.design == "optimal":
-        return largest_amplitude(
-            config, ensemble, plan=designed_plan(config, nominal(result), list(result["parameters"]))
-        )
-    return largest_amplitude(config, ensemble)
+    arm = nominal(result)
+    optimal = config.experiment.design == "optimal"
+    plan = designed_plan(config, arm, list(result["parameters"])) if optimal else roomy_plan(config, arm)
+    return largest_amplitude(config, ensemble, plan=plan)
 
 
 def _typical_share(found: Amplitude) -> float:

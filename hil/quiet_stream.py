@@ -22,9 +22,12 @@ def _limits(config: Config, bus: ServoBus) -> list[str]:
     lines = []
     for joint, described in zip(bus.joints, config.joints, strict=True):
         servo = bus.servo(joint)
+        supply, least, most = (
+            VOLTAGE_UNIT * servo.read(name)
+            for name in ("Present Input Voltage", "Min Voltage Limit", "Max Voltage Limit")
+        )
         parts = [
-            f"supply {VOLTAGE_UNIT * servo.read('Present Input Voltage'):.1f} V of "
-            f"{VOLTAGE_UNIT * servo.read('Min Voltage Limit'):.1f} to {VOLTAGE_UNIT * servo.read('Max Voltage Limit'):.1f}",
+            f"supply {supply:.1f} V of {least:.1f} to {most:.1f}",
             f"{servo.read('Present Temperature')} of {servo.read('Temperature Limit')} degrees C",
             f"velocity limit {VELOCITY_UNIT * servo.read('Velocity Limit'):.1f} rad/s (not enforced in current mode)",
         ]
