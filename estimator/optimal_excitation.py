@@ -117,6 +117,10 @@ class Problem:
             exponent = max(0.3, 0.85 * exponent)
         return best
 
+    def positions(self, wave: Multisine) -> Array:
+        """Transient and settled period (joints, samples) [rad]."""
+        return self._two_periods(wave).position
+
     def _two_periods(self, wave: Multisine) -> Response:
         command = np.tile(wave.torque, 2)
         return respond(self.physics, resting(self.pose), command, wave.rate, self.feedback)
