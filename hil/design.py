@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.excitation import Multisine
-from estimator.optimal_excitation import Limits, Problem, design_optimal
+from estimator.optimal_excitation import Limits, Problem, design_optimal, smoothed
 from estimator.physics import Physics
 from hil.amplitude import with_peaks
 from hil.config import Config
@@ -46,7 +46,7 @@ def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> 
     velocity = np.array([joint.velocity_limit for joint in config.joints])
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])
     limits = Limits(low, high, velocity, _torque_limits(config))
-    return Problem(physics, names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
+    return Problem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
 
 
 def _plain(config: Config, seed: int) -> Segment:

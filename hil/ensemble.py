@@ -18,6 +18,7 @@ MODEL_SPREAD = 0.01
 """Relative, on every parameter of a result: what a model leaves out and its covariance cannot know."""
 
 _LEAST_SHARE = 0.05  # of its value, below which no draw of a positive parameter may fall
+_LEAST_WIDTH = 0.01  # rad/s of friction's step: narrower ones move the arm alike and take longer to simulate
 _MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2)
 _EITHER_SIGN = ("offset", "gravity", "delay", "coupling")
 
@@ -90,7 +91,8 @@ def _physical(drawn: dict[str, float], known: dict[str, Any]) -> dict[str, float
     for name, value in drawn.items():
         if not name.startswith(_EITHER_SIGN):
             centre = abs(known[name]["value"])
-            drawn[name] = max(value, _LEAST_SHARE * centre, 1e-9)
+            least = _LEAST_WIDTH if name.startswith("coulomb_width") else 1e-9
+            drawn[name] = max(value, _LEAST_SHARE * centre, least)
     if "coupling" in drawn:
         most = _MOST_COUPLING * float(np.sqrt(drawn["inertia_1"] * drawn["inertia_2"]))
         drawn["coupling"] = min(max(drawn["coupling"], -most), most)
