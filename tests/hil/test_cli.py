@@ -18,6 +18,13 @@ from hil.recording import load_samples
 
 ArmFile = Callable[..., Path]
 
+LONG = (
+    ("period = 2.0", "period = 100.0"),
+    ("band = [0.5, 6.0]", "band = [0.1, 0.3]"),
+    ("peak_torque = [0.80, 0.42]", "peak_torque = [0.2, 0.1]"),  # so slow a motion would go over the top with more
+)
+"""Changes that make an experiment long enough to be interrupted."""
+
 
 def hil(*arguments: object) -> int:
     """Run the command in this process; its exit code."""
@@ -136,7 +143,7 @@ def test_a_recording_cut_short_is_said(arm_file: ArmFile, capsys: pytest.Capture
 
 
 def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path: Path) -> None:
-    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 0.3]"))
+    path = arm_file(*LONG)
     with subprocess.Popen([sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]) as process:
         samples = tmp_path / "run" / "samples.npy"
         for _ in range(600):
@@ -151,7 +158,7 @@ def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path
 
 
 def test_sigterm_ends_in_a_message_and_exit_code_1(arm_file: ArmFile, tmp_path: Path) -> None:
-    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 0.3]"))
+    path = arm_file(*LONG)
     command = [sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         for _ in range(600):
