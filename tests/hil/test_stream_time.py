@@ -25,7 +25,7 @@ def once_at(count: int, action: Callable[[], None]) -> Callable[[Progress], None
     done: list[bool] = []
 
     def watch(progress: Progress) -> None:
-        if progress.count >= count and not done:
+        if progress.taken >= count and not done:
             done.append(True)
             action()
 
