@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import serial
 
-from drivers.errors import PortLost
+from drivers.errors import PortLost, WrongSetting
 from hil.config import Config
 from hil.errors import SafetyStop
 from hil.experiment import run_experiment
@@ -87,3 +87,22 @@ def test_a_safety_stop_carries_the_sample_that_passed_the_limit(arm: Arm, tmp_pa
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None)
     last: Any = caught.value.last_samples
     assert abs(last["position"][-1, 1]) > 0.5
+
+
+def test_a_rate_that_the_wire_cannot_carry_is_refused_before_torque(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    config = arm(("rate = 400.0", "rate = 1200.0"))
+    with pytest.raises(WrongSetting, match=r"1200: the longest exchange takes 0\.9\d ms .* 10\d\d Hz at most"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None)
+    assert not any(servo.torque_enabled for servo in ports[0].bus.servos.values())
+
+
+def test_a_latency_timer_that_may_not_be_set_is_refused_with_the_command_to_type(
+    arm: Arm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timer = tmp_path / "latency_timer"
+    timer.write_text("16")
+    monkeypatch.setattr("hil.experiment.latency_timer", lambda _: timer)
+    monkeypatch.setattr("drivers.port.adapter_latency", lambda _: 0.016)
+    config = arm()
+    with pytest.raises(WrongSetting, match=rf"latency timer is 16 ms.*Type: echo 1 \| sudo tee {timer}"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None)
