@@ -133,6 +133,16 @@ def test_no_goal_that_is_no_number_is_sent(fake_config: Make, goals: list[float]
         assert bus.port.clock.now() == before
 
 
+def test_servos_that_do_not_confirm_writes_are_driven_and_let_go_all_the_same(fake_config: Make) -> None:
+    with ServoBus.connect(fake_config()) as bus:
+        for joint in bus.joints:
+            bus.servo(joint).write("Status Return Level", 1)
+        bus.prepare()
+        with bus.torque(watchdog=0.5):
+            assert all(servo.torque_enabled for servo in servos(bus).values())
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
 # PWM
 
 
