@@ -7,6 +7,7 @@ covariance   of parameters and extra together, rows in the order of `names`
 fit          residual of the settled period, in encoder steps, against the encoder's own rounding
 validation   free prediction of another multisine, as a fraction of the motion's RMS
 timing       how the stream kept its ticks, and how long the estimation took
+arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, torque constant, limits
 truth        only on a fake arm
 """
 
@@ -53,10 +54,21 @@ def make_result(
         },
         "validation": {} if held_out is None else {"held_out_rms": [float(value) for value in held_out]},
         "timing": timing,
+        "arm": _arm(config),
     }
     if config.is_fake and config.fake is not None:
         result["truth"] = base_parameters(config.fake.arm)
     return result
+
+
+def _arm(config: Config) -> dict[str, Any]:
+    kept = {"name", "model", "torque_constant", "torque_constant_std"}
+    limits = {"position_limit", "velocity_limit", "current_limit"}
+    return {
+        "gravity": config.arm.gravity,
+        "rest_pose": config.arm.rest_pose,
+        "joints": [joint.model_dump(include=kept | limits) for joint in config.joints],
+    }
 
 
 def _entries(estimate: Estimate, start: int, end: int) -> dict[str, Any]:

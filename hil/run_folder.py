@@ -5,6 +5,7 @@ run.json        versions, start time, and the few facts that the samples need to
 events.jsonl    what happened when, one JSON object a line, written as it happens
 samples.npy     every sample (hil.recording)
 result.json     parameters with error bars, fit, validation, timing
+period.npz      the settled periods as measured and as the model has them (hil.period_file)
 """
 
 import json
