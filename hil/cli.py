@@ -74,6 +74,29 @@ def estimate(run: RunPath, json_only: Json = False) -> None:
     _show(result, folder.load_config(), folder.path, json_only)
 
 
+@app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --format urdf --format mjcf")
+def export(
+    run: RunPath,
+    formats: Annotated[
+        list[str], typer.Option("--format", metavar="FORMAT", help="urdf, mjcf, toml, json, csv, parquet, mcap or mat.")
+    ],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The file; default within RUN.")] = None,
+    link_length: Annotated[
+        float | None, typer.Option(min=1e-3, metavar="METRES", help="Of link 1; needed for a horizontal arm only.")
+    ] = None,
+) -> None:
+    """Write the identified arm or its recording for other tools; says what a format has no place for."""
+    from hil.export.formats import export
+
+    if out is not None and len(formats) > 1:
+        raise typer.BadParameter("--out names one file: give one --format with it.")
+    for name in formats:
+        written = export(run, name, out, link_length)
+        print(f"{written.path}")
+        for missing in written.left_out:
+            print(f"  {name.upper()} has no place for {missing}")
+
+
 def main() -> NoReturn:
     """Run the command line; a foreseen error becomes its message on standard error and its exit code."""
     try:

@@ -57,6 +57,7 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
 
 def model_of(result: dict[str, Any], path: Path) -> ArmModel:
     """The model in a result that was read from `path`; raises ResultError."""
+    file = path / "result.json" if path.is_dir() else path
     try:
         joints = tuple(_joint(entry) for entry in result["arm"]["joints"])
         gravity = float(result["arm"]["gravity"])
@@ -67,8 +68,8 @@ def model_of(result: dict[str, Any], path: Path) -> ArmModel:
         stds = {name: math.inf if entry["std"] is None else float(entry["std"]) for name, entry in entries.items()}
     except (KeyError, TypeError, ValueError) as error:
         what = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ResultError(f"{path}: is damaged or from an older hil: it {what}. Run hil estimate again.") from error
-    _check_terms(values, len(joints), path)
+        raise ResultError(f"{file}: is damaged or from an older hil: it {what}. Run hil estimate again.") from error
+    _check_terms(values, len(joints), file)
     return ArmModel(values, stds, gravity, rest_pose, joints)
 
 
