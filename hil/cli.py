@@ -127,9 +127,8 @@ def _default_folder(config: Path) -> Path:
 
 def _exit_code(error: Exception) -> int | None:
     """The exit code of a foreseen error; None for one that is a fault of the program."""
-    from estimator.errors import EstimationError
-
     from drivers import errors as driver
+    from estimator.errors import EstimationError
     from hil.errors import HilError
 
     if isinstance(error, HilError):

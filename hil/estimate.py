@@ -4,10 +4,10 @@ import time
 from typing import Any
 
 import numpy as np
-from estimator.identify import Estimate, identify, predict
-from estimator.model import Model
 from numpy.typing import NDArray
 
+from estimator.identify import Estimate, identify, predict
+from estimator.model import Model
 from hil.config import Config
 from hil.period_file import PlayedPeriod, save_periods
 from hil.plan import HELD_OUT, IDENTIFY

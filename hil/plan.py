@@ -1,11 +1,12 @@
 """What will be played: the multisines of an experiment as goal currents, sample by sample, ramps included."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from estimator.excitation import Multisine, design_multisine, zippered_lines
 from numpy.typing import NDArray
 
+from estimator.excitation import Multisine, design_multisine, zippered_lines
 from hil.config import Config
 
 IDENTIFY, HELD_OUT = "identify", "held_out"
@@ -82,13 +83,18 @@ def make_plan(config: Config) -> Plan:
     )
 
 
+def _lines(config: Config) -> Sequence[Sequence[int]]:
+    """The harmonics of each joint; the configuration has either a band or the lines themselves."""
+    experiment = config.experiment
+    if experiment.band is None:
+        return experiment.lines or []
+    low, high = experiment.band
+    return zippered_lines(experiment.period, (low, high), len(config.joints))
+
+
 def _segment(config: Config, role: str, seed: int) -> Segment:
     experiment = config.experiment
-    lines = experiment.lines
-    if lines is None:
-        assert experiment.band is not None  # the configuration has one or the other
-        lines = zippered_lines(experiment.period, (experiment.band[0], experiment.band[1]), len(config.joints))
-    multisine = design_multisine(experiment.rate, experiment.period, lines, experiment.peak_torque, seed)
+    multisine = design_multisine(experiment.rate, experiment.period, _lines(config), experiment.peak_torque, seed)
     constants = np.array([joint.torque_constant for joint in config.joints])
     limits = np.array([joint.current_limit for joint in config.joints])
     current = np.clip(multisine.torque.T / constants, -limits, limits)

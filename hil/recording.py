@@ -64,7 +64,7 @@ class Recorder:
             _reserve(path)
         except OSError as error:
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
-        self._bytes = memoryview(self._samples.view(np.uint8))
+        self._bytes = memoryview(self._samples.view(np.uint8).data)
         self.count = 0
 
     def __enter__(self) -> "Recorder":

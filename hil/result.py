@@ -15,10 +15,10 @@ import math
 from typing import Any
 
 import numpy as np
-from estimator.identify import Estimate
-from estimator.period import SettledPeriod
 from numpy.typing import NDArray
 
+from estimator.identify import Estimate
+from estimator.period import SettledPeriod
 from fakes.arm import base_parameters
 from hil.config import Config
 
@@ -36,7 +36,6 @@ def make_result(
 ) -> dict[str, Any]:
     """The result of one run. held_out: RMS error of the free prediction per joint, as a fraction of the motion's."""
     base = len(estimate.model.base_names)
-    residual = np.sqrt(np.nanmean(estimate.residual**2, axis=1)) / period.position_step
     result: dict[str, Any] = {
         "schema": SCHEMA,
         "method": f"settled period, least squares on Fourier lines, then maximum likelihood; "
@@ -47,7 +46,7 @@ def make_result(
         "extra": _entries(estimate, base, len(estimate.names)),
         "covariance": {"names": list(estimate.names), "matrix": estimate.covariance.tolist()},
         "fit": {
-            "residual_rms_ticks": [float(value) for value in residual],
+            "residual_rms_ticks": estimate.residual_steps.tolist(),
             "quantisation_floor_ticks": round(QUANTISATION_FLOOR_TICKS, 4),
             "samples_per_period": period.position.shape[1],
             "periods": period.periods,

@@ -16,7 +16,7 @@ def print_result(result: dict[str, Any], config: Config, run: Path, console: Con
     """The table, the fit and what to do next."""
     console.print(_parameters(result))
     for line in (*_fit(result), *_torque_constants(config), *_next(result, run)):
-        console.print(line, soft_wrap=True)
+        console.print(line, soft_wrap=True, markup=False)
 
 
 def _parameters(result: dict[str, Any]) -> Table:

@@ -1,10 +1,10 @@
 """From a recording to what the estimator takes: the settled periods of one multisine."""
 
 import numpy as np
-from estimator.period import SettledPeriod
-from estimator.settling import period_difference
 from numpy.typing import NDArray
 
+from estimator.period import SettledPeriod
+from estimator.settling import period_difference
 from hil.config import Config
 from hil.errors import RecordingCutShort
 from hil.recording import Phase
@@ -29,13 +29,26 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         )
     used = periods[first : first + experiment.periods]
     constants = np.array([joint.torque_constant for joint in config.joints])
-    return SettledPeriod.from_periods(
+    torque = np.moveaxis(used["goal_current"] * constants, 2, 1).mean(axis=0)
+    angle = np.moveaxis(used["position"], 2, 1)
+    return SettledPeriod(
         rate=experiment.rate,
-        torque=np.moveaxis(used["goal_current"] * constants, 2, 1),
-        position=position[first : first + experiment.periods],
+        torque=torque,
+        position=np.nanmean(angle, axis=0),
         command_to_sample=facts.command_to_sample,
         position_step=np.array(facts.position_step),
+        periods=experiment.periods,
+        position_std=_scatter(angle),
     )
+
+
+def _scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Standard deviation of the mean over periods, (periods, joints, samples) [rad], per joint; None for one period."""
+    count = len(position)
+    if count < 2:
+        return None
+    scatter: NDArray[np.float64] = np.sqrt(np.nanmean(np.nanvar(position, axis=0, ddof=1), axis=1) / count)
+    return scatter
 
 
 def _first_settled(position: NDArray[np.float64], within: float) -> int | None:

@@ -25,7 +25,7 @@ _WATCH_EVERY_S = 0.05
 class Progress(NamedTuple):
     """What a person watches: samples taken, of how many expected, the phase, and the latest state."""
 
-    count: int
+    taken: int
     expected: int
     phase: Phase
     role: str

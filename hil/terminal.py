@@ -30,7 +30,7 @@ class Terminal:
         self.console = Console(stderr=True, quiet=quiet, highlight=False)
 
     def say(self, text: str) -> None:
-        self.console.print(text)
+        self.console.print(text, markup=False)
 
     @contextmanager
     def busy(self, text: str) -> Iterator[None]:
@@ -57,9 +57,9 @@ class Terminal:
         with Live(bar, console=self.console, refresh_per_second=10) as live:
 
             def watch(progress: StreamProgress) -> None:
-                total = max(progress.expected, progress.count) / rate
+                total = max(progress.expected, progress.taken) / rate
                 description = f"{progress.role.replace('_', ' ')}: {_PHASES[progress.phase]}"
-                bar.update(task, completed=progress.count / rate, total=total, description=description)
+                bar.update(task, completed=progress.taken / rate, total=total, description=description)
                 live.update(_view(config, bar, progress))
 
             yield watch

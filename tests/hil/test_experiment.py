@@ -42,7 +42,7 @@ def at_sample(count: int, action: Callable[[], Any]) -> Watch:
     done: list[bool] = []
 
     def watch(progress: Progress) -> None:
-        if progress.count >= count and not done:
+        if progress.taken >= count and not done:
             done.append(True)
             action()
 

@@ -1,0 +1,92 @@
+"""Unconstrained coordinates for the likelihood: no step of it can leave the physical parameters.
+
+Positive parameters are exponentials. Coupling is sqrt(inertia_1 inertia_2) tanh(z), which every arm of
+positive masses obeys and which keeps the mass matrix positive definite. The width of the Coulomb step stays
+above a floor. Gravity, offsets and delay may have either sign.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.arrays import Array
+
+LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
+MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2), at the start
+EITHER_SIGN = ("gravity", "offset", "delay")
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The map between parameters and coordinates of about the size of 1."""
+
+    names: tuple[str, ...]
+    """Parameters, as in `Model.names`."""
+    scales: Array
+    """Scale of each parameter (parameters,) [its unit], by `scales_of`."""
+    width_floor: float
+    """What the width of every Coulomb step stays above [rad/s]."""
+
+    def values(self, x: Array) -> Array:
+        """Parameters (parameters,) at the coordinates `x` (parameters,)."""
+        value = np.where(self._either_sign, x * self.scales, np.exp(np.where(self._either_sign, 0.0, x)))
+        value += self._floors
+        if "coupling" in self.names:
+            coupling, first, second = self._coupled
+            value[coupling] = np.sqrt(value[first] * value[second]) * np.tanh(x[coupling])
+        return value
+
+    def coordinates(self, value: Array) -> Array:
+        """Coordinates of the parameters `value` (parameters,), moved into the physical range."""
+        above = np.maximum(value - self._floors, LEAST_SHARE * self.scales)
+        x = np.where(self._either_sign, value / self.scales, np.log(above))
+        if "coupling" in self.names:
+            coupling, first, second = self._coupled
+            share = value[coupling] / np.sqrt(above[first] * above[second])
+            x[coupling] = np.arctanh(np.clip(share, -MOST_COUPLING, MOST_COUPLING))
+        return x
+
+    def slopes(self, x: Array) -> Array:
+        """Derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
+        value = self.values(x)
+        slope = np.diag(np.where(self._either_sign, self.scales, value - self._floors))
+        if "coupling" in self.names:
+            coupling, first, second = self._coupled
+            slope[coupling, coupling] = np.sqrt(value[first] * value[second]) / np.cosh(x[coupling]) ** 2
+            slope[coupling, first] = slope[coupling, second] = 0.5 * value[coupling]
+        return slope
+
+    @property
+    def _either_sign(self) -> Array:
+        return np.array([_kind(name) in EITHER_SIGN for name in self.names])
+
+    @property
+    def _floors(self) -> Array:
+        return np.array([self.width_floor if _kind(name) == "coulomb_width" else 0.0 for name in self.names])
+
+    @property
+    def _coupled(self) -> tuple[int, int, int]:
+        index = self.names.index
+        return index("coupling"), index("inertia_1"), index("inertia_2")
+
+
+def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: float) -> Array:
+    """Scale of each parameter (parameters,).
+
+    From RMS torque [N m], RMS velocity [rad/s] and an inertia [kg m^2] of the arm and its motion.
+    """
+    scale: Mapping[str, float] = {
+        **dict.fromkeys(("inertia", "coupling", "armature"), inertia),
+        **dict.fromkeys(("gravity", "coulomb", "offset"), torque),
+        "viscous": torque / velocity,
+        "stribeck_velocity": velocity,
+        "coulomb_width": 0.05,
+        **dict.fromkeys(("stribeck_rise", "load"), 1.0),
+        **dict.fromkeys(("delay", "lag"), 1e-3),
+    }
+    return np.array([scale[_kind(name)] for name in names])
+
+
+def _kind(name: str) -> str:
+    return name.rstrip("_12")

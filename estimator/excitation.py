@@ -1,0 +1,198 @@
+"""Multisines: sums of cosines on chosen harmonics of one period, with phases that keep the peaks low.
+
+Low crest factor by Levenberg-Marquardt on the L2p norm with p growing: Guillaume, Schoukens, Pintelon,
+Kollar, "Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40
+(1991) 982.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.arrays import Array
+from estimator.errors import ExcitationError
+
+NORMS = (2, 4, 8, 16, 32, 64)  # p of the L2p norms, one after the other
+STARTS = 2  # random phases besides Schroeder's
+ITERATIONS = 40  # per norm
+OVERSAMPLING = 8  # samples per cycle of the highest line while phases are sought
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """One period of torque for each joint: the sum of amplitude * cos(2 pi line t / period + phase)."""
+
+    rate: float
+    """Samples per second."""
+    period: float
+    """Length [s]; a whole number of samples."""
+    lines: tuple[tuple[int, ...], ...]
+    """Excited harmonics of each joint."""
+    amplitudes: tuple[tuple[float, ...], ...]
+    """Of each line [N m]."""
+    phases: tuple[tuple[float, ...], ...]
+    """Of each line [rad]."""
+    torque: Array
+    """One period (joints, samples) [N m], to be held from each sample to the next."""
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.lines)
+
+    @property
+    def samples(self) -> int:
+        """Samples in the period."""
+        return int(self.torque.shape[1])
+
+    @property
+    def crest_factor(self) -> Array:
+        """Peak over RMS of each joint's samples (joints,)."""
+        peak: Array = np.abs(self.torque).max(axis=1) / np.sqrt(np.mean(self.torque**2, axis=1))
+        return peak
+
+
+def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tuple[tuple[int, ...], ...]:
+    """Share the harmonics of 1/`period` [s] that lie in `band` [Hz] out between the joints in turn.
+
+    Raises ExcitationError when the band has fewer lines than joints.
+    """
+    first = max(1, math.ceil(band[0] * period - 1e-9))
+    last = math.floor(band[1] * period + 1e-9)
+    if last - first + 1 < joints:
+        raise ExcitationError(
+            f"the band {band[0]:g} to {band[1]:g} Hz holds {max(0, last - first + 1)} harmonics of a period "
+            f"of {period:g} s and {joints} joints need one each: widen the band or lengthen the period"
+        )
+    return tuple(tuple(range(first + joint, last + 1, joints)) for joint in range(joints))
+
+
+def design_multisine(
+    rate: float,
+    period: float,
+    lines: Sequence[Sequence[int]],
+    peak_torque: Sequence[float],
+    seed: int,
+) -> Multisine:
+    """A multisine of equal amplitudes with a low crest factor.
+
+    `rate` [1/s], `period` [s], `lines`: harmonics of each joint, `peak_torque`: largest sample of each
+    joint [N m]. The same seed gives the same phases to the last bit, another seed others. Raises
+    ExcitationError for a period that is not a whole number of samples, lines outside (0, samples / 2) or
+    given twice, a peak that is not positive.
+    """
+    samples = _whole_samples(rate, period)
+    _check_lines(lines, samples)
+    _check_peaks(peak_torque, len(lines))
+    phases = []
+    amplitudes = []
+    torque = np.empty((len(lines), samples))
+    for joint, (harmonics, peak) in enumerate(zip(lines, peak_torque, strict=True)):
+        order = np.asarray(harmonics, dtype=np.float64)
+        phase = _low_crest_phases(order, np.random.default_rng((seed, joint)))
+        wave = _wave(order, phase, samples)
+        amplitude = peak / float(np.abs(wave).max())
+        torque[joint] = amplitude * wave
+        phases.append(tuple(phase.tolist()))
+        amplitudes.append((amplitude,) * len(harmonics))
+    shared = tuple(tuple(int(line) for line in harmonics) for harmonics in lines)
+    return Multisine(rate, period, shared, tuple(amplitudes), tuple(phases), torque)
+
+
+def _whole_samples(rate: float, period: float) -> int:
+    samples = round(rate * period)
+    if samples < 1 or abs(samples - rate * period) > 1e-6:
+        raise ExcitationError(
+            f"a period of {period:g} s at {rate:g} samples/s is {rate * period:g} samples: "
+            "choose a period that is a whole number of them"
+        )
+    return samples
+
+
+def _check_lines(lines: Sequence[Sequence[int]], samples: int) -> None:
+    taken: dict[int, int] = {}
+    for joint, harmonics in enumerate(lines, start=1):
+        if not harmonics:
+            raise ExcitationError(f"joint {joint} has no lines: give it at least one")
+        for line in harmonics:
+            if not 0 < line < samples / 2:
+                raise ExcitationError(
+                    f"line {line} of joint {joint} is outside 1 to {(samples - 1) // 2}, "
+                    f"what {samples} samples can carry"
+                )
+            if line in taken:
+                raise ExcitationError(
+                    f"line {line} is given to joint {taken[line]} and joint {joint}: each must belong to one"
+                )
+            taken[line] = joint
+
+
+def _check_peaks(peak_torque: Sequence[float], joints: int) -> None:
+    if len(peak_torque) != joints:
+        raise ExcitationError(f"{len(peak_torque)} peak torques for {joints} joints: give one each")
+    for joint, peak in enumerate(peak_torque, start=1):
+        if not (peak > 0.0 and math.isfinite(peak)):
+            raise ExcitationError(f"peak torque of joint {joint} is {peak:g} N m: it must be positive")
+
+
+def _wave(order: Array, phase: Array, samples: int) -> Array:
+    """Sum of cosines of amplitude 1 over one period (samples,)."""
+    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
+    spectrum[order.astype(np.int64)] = 0.5 * samples * np.exp(1j * phase)
+    return np.fft.irfft(spectrum, samples)
+
+
+def _low_crest_phases(order: Array, random: np.random.Generator) -> Array:
+    """The best of several optimised starts: Schroeder's phases, turned at random, and random ones [rad]."""
+    count = order.size
+    grid = 2.0 * np.pi * np.arange(OVERSAMPLING * int(order.max())) / (OVERSAMPLING * order.max())
+    angle = order[:, None] * grid
+    schroeder = -np.pi * np.arange(count) * np.arange(1, count + 1) / count
+    # Schroeder's phases alone would give every seed the same wave: they are shifted in time and loosened.
+    starts = [schroeder + order * random.uniform(0.0, 2.0 * np.pi) + random.uniform(-1.0, 1.0, count)]
+    starts += [random.uniform(0.0, 2.0 * np.pi, count) for _ in range(STARTS)]
+    found = [_least_peak(angle, start) for start in starts]
+    return np.asarray(np.mod(min(found, key=lambda phase: _peak(angle, phase)), 2.0 * np.pi))
+
+
+def _peak(angle: Array, phase: Array) -> float:
+    return float(np.abs(np.cos(angle + phase[:, None]).sum(axis=0)).max())
+
+
+def _least_peak(angle: Array, phase: Array) -> Array:
+    """Phases that lower the wave's peak, by one L2p norm after the other, each start the last one's end."""
+    best = phase
+    for p in NORMS:
+        phase = _least_norm(angle, phase, p)
+        if _peak(angle, phase) < _peak(angle, best):
+            best = phase
+    return best
+
+
+def _least_norm(angle: Array, phase: Array, p: int) -> Array:
+    """Minimise the sum of wave^(2p) over the phases (lines,) by Levenberg-Marquardt."""
+    scale = _peak(angle, phase)
+    damping = 1e-2
+    cosines = np.cos(angle + phase[:, None])
+    wave = cosines.sum(axis=0) / scale
+    cost = float(np.sum(wave ** (2 * p)))
+    for _ in range(ITERATIONS):
+        jacobian = (p * wave ** (p - 1)) * (-np.sin(angle + phase[:, None]) / scale)
+        normal = jacobian @ jacobian.T
+        slope = jacobian @ wave**p
+        trial = phase - np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), slope)
+        wave_there = np.cos(angle + trial[:, None]).sum(axis=0) / scale
+        cost_there = float(np.sum(wave_there ** (2 * p)))
+        if cost_there < cost:
+            gained = cost - cost_there
+            phase, wave, cost = trial, wave_there, cost_there
+            damping = max(0.3 * damping, 1e-9)
+            if gained < 1e-4 * cost:
+                break
+        else:
+            damping *= 5.0
+            if damping > 1e6:
+                break
+    return phase

@@ -1,0 +1,66 @@
+"""Which friction and which drive the likelihood fits, and the names of all its parameters."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from estimator.arm_model import parameter_names, parameter_units
+from estimator.errors import ModelError
+
+Friction = Literal["coulomb", "stribeck", "stribeck_load"]
+Drive = Literal["delay", "lag"]
+
+FRICTION_TERMS: dict[str, tuple[str, ...]] = {
+    "coulomb": ("coulomb_width",),
+    "stribeck": ("coulomb_width", "stribeck_rise", "stribeck_velocity"),
+    "stribeck_load": ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
+}
+DRIVES = ("delay", "lag")
+UNITS = {
+    "coulomb_width": "rad/s",
+    "stribeck_rise": "1",
+    "stribeck_velocity": "rad/s",
+    "load": "1",
+    "delay": "s",
+    "lag": "s",
+}
+
+
+@dataclass(frozen=True)
+class Model:
+    """The arm's equations with these terms.
+
+    Friction: `coulomb` is viscous v + coulomb tanh(v / coulomb_width); `stribeck` multiplies coulomb by 1 +
+    stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level.
+    Drive: `delay` is a pure delay of the torque on top of what `SettledPeriod` knows, `lag` a first-order
+    lag.
+
+    Raises ModelError for other names and for other than one or two joints.
+    """
+
+    joints: int
+    friction: Friction = "coulomb"
+    drive: Drive = "delay"
+
+    def __post_init__(self) -> None:
+        parameter_names(self.joints)
+        if self.friction not in FRICTION_TERMS:
+            raise ModelError(f"friction model {self.friction!r}: choose one of {', '.join(FRICTION_TERMS)}")
+        if self.drive not in DRIVES:
+            raise ModelError(f"drive model {self.drive!r}: choose one of {', '.join(DRIVES)}")
+
+    @property
+    def base_names(self) -> tuple[str, ...]:
+        """The base parameters."""
+        return parameter_names(self.joints)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The base parameters, then the friction terms joint by joint, then the drive's."""
+        terms = (f"{term}_{joint + 1}" for term in FRICTION_TERMS[self.friction] for joint in range(self.joints))
+        return (*self.base_names, *terms, self.drive)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of `names`."""
+        more = (UNITS[name.rstrip("_12")] for name in self.names[len(self.base_names) :])
+        return (*parameter_units(self.joints), *more)

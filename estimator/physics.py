@@ -1,0 +1,55 @@
+"""The full set of physical constants one simulation needs, whatever the model leaves out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.arrays import Array
+
+# The order in which the compiled simulation takes them.
+CONSTANTS = (
+    *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
+    *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2"),
+    *("coulomb_width_1", "coulomb_width_2", "stribeck_rise_1", "stribeck_rise_2"),
+    *("stribeck_velocity_1", "stribeck_velocity_2", "load_1", "load_2"),
+)
+# What stands for a term the model lacks; a pendulum's second joint is a wheel that nothing turns.
+ABSENT = {
+    name: {"armature": 1.0, "coulomb_width": 1.0, "stribeck_velocity": 1.0}.get(name.rstrip("_12"), 0.0)
+    for name in CONSTANTS
+}
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Constants of one simulation."""
+
+    vector: Array
+    """In the order of CONSTANTS (20,) [SI]."""
+    delay: float
+    """Pure delay of the torque [s]."""
+    lag: float
+    """Time constant of the torque's first-order lag [s]; 0 for none."""
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, float]) -> "Physics":
+        """From parameters by name; what is not named is absent from the model."""
+        vector = np.array([parameters.get(name, ABSENT[name]) for name in CONSTANTS])
+        return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0))
+
+    def crossing_time(self) -> float:
+        """The shortest time in which friction turned round carries a joint across its step's width [s]."""
+        constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
+        shared = constant["inertia_2"] ** 2 / (constant["inertia_2"] + constant["armature_2"])
+        inertia = (
+            constant["inertia_1"] + constant["inertia_2"] - shared,
+            constant["inertia_2"] + constant["armature_2"],
+        )
+        times = [
+            constant[f"coulomb_width_{joint}"]
+            * inertia[joint - 1]
+            / (2.0 * constant[f"coulomb_{joint}"] * (1.0 + constant[f"stribeck_rise_{joint}"]) + 1e-12)
+            for joint in (1, 2)
+        ]
+        return float(min(times))

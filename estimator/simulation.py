@@ -1,0 +1,124 @@
+"""The arm's motion under given motor torques, compiled: the one hot loop of the estimator.
+
+The equations are those of `estimator.arm_model` with a friction law that is smooth:
+
+    friction(v) = viscous v + level(v) tanh(v / width)
+    level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
+
+Each step is the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999): L-stable for the
+slope of the friction, which its Jacobian holds, and of second order whatever else that Jacobian leaves out.
+While a joint is near standstill, where tanh is steep, a step is cut into finer ones. Against a hundred
+steps per sample, three at 400 Hz are within 0.003 encoder steps RMS for widths from 0.001 to 0.05 rad/s.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+from estimator.arrays import Array
+from estimator.physics import Physics
+
+LONGEST_STEP = 0.85e-3  # s
+MOST_PIECES = 16.0
+GAMMA = 1.0 - math.sqrt(0.5)
+
+
+def steps_per_sample(rate: float) -> int:
+    """Integration steps in one sample at `rate` [1/s]."""
+    return math.ceil(1.0 / (rate * LONGEST_STEP))
+
+
+def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tuple[Array, Array]:
+    """Simulate from one sample to as many as `torque` has.
+
+    `start` (2, joints): angles [rad] and velocities [rad/s] at the first sample; `torque` (joints, samples,
+    steps): mean motor torque over each step after each sample [N m]; `step` [s]: length of one. Returns the
+    angles at the samples (joints, samples) and the state after the last sample's steps, shaped as `start`.
+    """
+    joints, samples, _ = torque.shape
+    # A pendulum is a two-joint arm whose second joint has no torque and moves nothing.
+    state = np.zeros((2, 2))
+    state[:, :joints] = start
+    both = np.zeros((2, *torque.shape[1:]))
+    both[:joints] = torque
+    position = np.empty((2, samples))
+    _simulate(physics.vector, state, both, step, _pieces(physics, step), position)
+    return position[:joints], state[:, :joints]
+
+
+def _pieces(physics: Physics, step: float) -> int:
+    """Finer steps in place of one of `step` [s] near standstill.
+
+    Dry friction turned round must not carry a joint across the width of its step in one of them. A power of
+    two, so that small changes of the physics seldom change it, and with it the last digits of the motion.
+    """
+    needed = min(step / physics.crossing_time(), MOST_PIECES)
+    return int(2 ** math.ceil(math.log2(max(needed, 1.0))))
+
+
+# Compiled code takes its arguments by position; p is `Physics.vector`.
+def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:
+    """Mass matrix's first row, torques left for acceleration, and the slopes of friction."""
+    across = p[1] * math.cos(q2)
+    turning = p[1] * math.sin(q2)
+    weight = p[5] * math.cos(q1 + q2)
+    level_1 = p[8] * (1.0 + p[14] * math.exp(-((v1 / p[16]) ** 2))) + p[18] * abs(t1)
+    level_2 = p[9] * (1.0 + p[15] * math.exp(-((v2 / p[17]) ** 2))) + p[19] * abs(t2)
+    bend_1 = math.tanh(v1 / p[12])
+    bend_2 = math.tanh(v2 / p[13])
+    return (
+        p[0] + p[2] + 2.0 * across,
+        p[2] + across,
+        t1 - p[10] - p[4] * math.cos(q1) - weight + turning * (2.0 * v1 + v2) * v2 - p[6] * v1 - level_1 * bend_1,
+        t2 - p[11] - weight - turning * v1 * v1 - p[7] * v2 - level_2 * bend_2,
+        p[6] + level_1 / p[12] * (1.0 - bend_1 * bend_1),
+        p[7] + level_2 / p[13] * (1.0 - bend_2 * bend_2),
+    )
+
+
+def _loop(p: Any, state: Any, torque: Any, step: float, pieces: int, position: Any) -> None:
+    q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
+    a1 = a2 = 0.0
+    m22 = p[2] + p[3]
+    for k in range(position.shape[1]):
+        position[0, k] = q1
+        position[1, k] = q2
+        for s in range(torque.shape[2]):
+            t1 = torque[0, k, s]
+            t2 = torque[1, k, s]
+            near_1 = p[8] > 0.0 and abs(v1) < 6.0 * p[12] + 2.0 * step * abs(a1)
+            near_2 = p[9] > 0.0 and abs(v2) < 6.0 * p[13] + 2.0 * step * abs(a2)
+            cuts = pieces if near_1 or near_2 else 1
+            h = step / cuts
+            for _ in range(cuts):
+                m11, m12, f1, f2, slope_1, slope_2 = _forces(p, q1, q2, v1, v2, t1, t2)
+                # Stage 1: (M + gamma h S) k = f, with S the slopes of friction.
+                w11 = m11 + GAMMA * h * slope_1
+                w22 = m22 + GAMMA * h * slope_2
+                w = w11 * w22 - m12 * m12
+                k1 = (w22 * f1 - m12 * f2) / w
+                k2 = (w11 * f2 - m12 * f1) / w
+                u1 = v1 + h * k1
+                u2 = v2 + h * k2
+                # Stage 2: (M + gamma h S) l = M (M'^-1 f' - 2 k), with M' and f' at the end that stage 1
+                # foresees.
+                n11, n12, f1, f2, _, _ = _forces(p, q1 + h * v1, q2 + h * v2, u1, u2, t1, t2)
+                n = n11 * m22 - n12 * n12
+                r1 = (m22 * f1 - n12 * f2) / n - 2.0 * k1
+                r2 = (n11 * f2 - n12 * f1) / n - 2.0 * k2
+                f1 = m11 * r1 + m12 * r2
+                f2 = m12 * r1 + m22 * r2
+                a1 = 1.5 * k1 + 0.5 * (w22 * f1 - m12 * f2) / w
+                a2 = 1.5 * k2 + 0.5 * (w11 * f2 - m12 * f1) / w
+                q1 += 0.5 * h * (v1 + u1)
+                q2 += 0.5 * h * (v2 + u2)
+                v1 += h * a1
+                v2 += h * a2
+    state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
+
+
+_forces = numba.njit(cache=True, nogil=True)(_forces)
+_simulate: Callable[[Array, Array, Array, float, int, Array], None] = numba.njit(cache=True, nogil=True)(_loop)

@@ -1,0 +1,74 @@
+"""The whole way on real bytes: both fake arms come back out of their recordings as they were described.
+
+The limits are what the tool promises, not what it happens to reach; benchmarks/identify.py prints the latter.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.config import load_config
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
+from hil.recording import load_samples
+from hil.run_folder import RunFolder
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+INERTIAS = ("inertia_1", "coupling", "inertia_2", "armature_2")
+GRAVITY = ("gravity_1", "gravity_2")
+FRICTION = ("viscous_1", "viscous_2", "coulomb_1", "coulomb_2")
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    results: dict[str, dict[str, Any]] = {}
+
+    def identify(name: str) -> dict[str, Any]:
+        if name not in results:
+            config = load_config(CONFIGS / f"{name}.toml")
+            run = RunFolder.create(tmp_path_factory.mktemp("runs") / name, config)
+            run_experiment(config, run, config.path, lambda _: None)
+            results[name] = estimate_run(run)
+            positions = load_samples(run.samples_path, 2)["position"]
+            results[name]["swing"] = np.degrees(np.ptp(positions, axis=0)).tolist()
+        return results[name]
+
+    return identify
+
+
+def worst(result: dict[str, Any], names: tuple[str, ...]) -> float:
+    return max(abs(result["parameters"][name]["value"] / result["truth"][name] - 1) for name in names)
+
+
+def test_ideal_arm(identified: Any) -> None:
+    result = identified("fake_two_link_ideal")
+    assert worst(result, INERTIAS + GRAVITY + FRICTION) <= 0.002
+    for name in ("offset_1", "offset_2"):
+        entry = result["parameters"][name]
+        assert abs(entry["value"] - result["truth"][name]) <= 3 * entry["std"]
+    assert max(result["fit"]["residual_rms_ticks"]) <= 0.295
+    assert result["fit"]["periods"] == 1 and result["fit"]["samples_per_period"] == 4000
+
+
+def test_realistic_arm(identified: Any) -> None:
+    result = identified("fake_two_link")
+    assert min(result["swing"]) >= 100.0, "degrees"
+    assert worst(result, GRAVITY) <= 0.01
+    assert worst(result, INERTIAS) <= 0.05
+    assert max(result["validation"]["held_out_rms"]) <= 0.01
+
+
+def test_standard_errors_are_neither_boast_nor_excuse(identified: Any) -> None:
+    result = identified("fake_two_link_ideal")
+    in_std = [
+        abs(entry["value"] - result["truth"][name]) / entry["std"] for name, entry in result["parameters"].items()
+    ]
+    assert 0.2 < float(np.sqrt(np.mean(np.square(in_std)))) < 3.0
+
+
+def test_every_tick_was_kept(identified: Any) -> None:
+    timing = identified("fake_two_link")["timing"]
+    assert timing["missed_ticks"] == 0 and timing["lost_replies"] == 0
+    assert timing["rate_held"] == pytest.approx(400.0, rel=1e-6)
