@@ -74,6 +74,27 @@ def estimate(run: RunPath, json_only: Json = False) -> None:
     _show(result, folder.load_config(), folder.path, json_only)
 
 
+@app.command(epilog="Example: hil report runs/20261121-153000-fake_two_link --png pictures")
+def report(
+    run: RunPath,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default RUN/report.html.")] = None,
+    png: Annotated[Path | None, typer.Option("--png", metavar="DIR", help="Save the pictures there as PNG.")] = None,
+    svg: Annotated[Path | None, typer.Option("--svg", metavar="DIR", help="Save the pictures there as SVG.")] = None,
+) -> None:
+    """Write a run as one HTML page that needs no network: verdict, parameters, pictures."""
+    from hil.report.page import FILE_NAME, write_report
+    from hil.report.pictures import save_pictures
+    from hil.report.run_data import RunData
+
+    data = RunData.load(run)
+    page = out or run / FILE_NAME
+    write_report(data, page)
+    print(page)
+    for kind, folder in (("png", png), ("svg", svg)):
+        if folder is not None:
+            print(f"{len(save_pictures(data, folder, kind))} pictures in {folder}")
+
+
 @app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --format urdf --format mjcf")
 def export(
     run: RunPath,

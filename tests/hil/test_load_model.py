@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from estimator.arm_model import inverse_dynamics, parameter_names
 
+from estimator.arm_model import inverse_dynamics, parameter_names
 from hil import load_model
 from hil.dynamics import ArmModel
 from hil.errors import ResultError
