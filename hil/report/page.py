@@ -1,6 +1,7 @@
 """The page: its sections in their order, one template, one style sheet, one script, all in one file."""
 
 from collections.abc import Callable
+from datetime import datetime
 from importlib.resources import files
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def make_page(data: RunData) -> str:
     ).from_string(folder.joinpath("page.html.j2").read_text(encoding="utf-8"))
     return template.render(
         title=Path(str(data.facts["config"])).stem,
-        started=data.facts["started"],
+        started=datetime.fromisoformat(data.facts["started"]).strftime("%Y-%m-%d %H:%M"),
         version=__version__,
         sections=sections(data),
         style=Markup(folder.joinpath("page.css").read_text(encoding="utf-8")),

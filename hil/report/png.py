@@ -45,8 +45,12 @@ def _draw_series(axes: Any, series: Series) -> None:
         axes.stairs(series.y, series.x, fill=True, alpha=0.4, color=series.colour, label=name)
     elif series.low is not None:
         axes.fill_between(series.x, series.low, series.y, alpha=0.18, color=series.colour, label=name, linewidth=0)
-    elif series.kind == "points":
-        axes.plot(series.x, series.y, ".", markersize=4, color=series.colour, label=name)
+    elif series.kind in ("points", "dots"):
+        axes.plot(
+            series.x, series.y, ".", markersize=4 if series.kind == "points" else 1.5, color=series.colour, label=name
+        )
+    elif series.kind == "broad":
+        axes.plot(series.x, series.y, linewidth=4, alpha=0.35, color=series.colour, label=name)
     else:
         style = "--" if series.kind == "dashed" else "-"
         axes.plot(series.x, series.y, style, linewidth=1.1, color=series.colour, label=name)

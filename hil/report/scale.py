@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -16,6 +18,7 @@ class Scale:
     start: float
     end: float
     log: bool = False
+    spacing: float = 70  # px between ticks, about
 
     def pixels(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixel coordinates of data (n,)."""
@@ -29,7 +32,7 @@ class Scale:
         low, high = self._ends
         if self.log:
             return [10.0**power for power in range(math.ceil(low - 1e-9), math.floor(high + 1e-9) + 1)]
-        room = max(2.0, abs(self.end - self.start) / 70)
+        room = max(2.0, abs(self.end - self.start) / self.spacing)
         raw = (high - low) / room
         size = 10.0 ** math.floor(math.log10(raw))
         step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= raw * (1 - 1e-9))
@@ -58,6 +61,8 @@ def span(values: NDArray[np.float64], log: bool, margin: float) -> tuple[float, 
     return low - room, high + room
 
 
-def label(value: float) -> str:
-    """A tick's text."""
+def label(value: float, log: bool = False) -> str:
+    """A tick's text; a power of ten on a logarithmic axis."""
+    if log and not 0.01 <= value <= 100:
+        return "10" + f"{round(math.log10(value))}".translate(_RAISED)
     return f"{value:.6g}".replace("-", "\u2212")

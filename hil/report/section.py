@@ -7,12 +7,16 @@ from hil.report.chart import Figure
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under column heads. Columns after the first `left` ones hold numbers, set to the right."""
+    """Rows of text under column heads. Columns after the first `left` ones hold numbers, set to the right.
+
+    aside: a column that a phone has no room for.
+    """
 
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     left: int = 1
     caption: str = ""
+    aside: int | None = None
 
 
 @dataclass(frozen=True)

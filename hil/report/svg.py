@@ -37,7 +37,7 @@ def draw_svg(figure: Figure, size: Size) -> str:
     x_low, x_high = span(np.concatenate([series.x for series in figure.series]), False, 0.0)
     y_low, y_high = span(_heights(figure), figure.log_y, 0.06)
     x = Scale(x_low, x_high, left, size.width - right)
-    y = Scale(y_low, y_high, size.height - bottom, top, figure.log_y)
+    y = Scale(y_low, y_high, size.height - bottom, top, figure.log_y, 42)
     body = "".join(_series(series, x, y, size.points) for series in figure.series)
     clip = f"{figure.name}-{size.name}"
     box = f'x="{left}" y="{top}" width="{x.end - x.start:.2f}" height="{y.start - y.end:.2f}"'
@@ -60,8 +60,10 @@ def _heights(chart: Chart) -> Array:
 def _series(series: Series, x: Scale, y: Scale, points: int) -> str:
     shape = {
         "line": 'stroke-width="1.4"',
+        "broad": 'stroke-width="5" stroke-opacity="0.35"',
         "dashed": 'stroke-width="1.6" stroke-dasharray="6 4"',
         "points": 'stroke-width="4" stroke-linecap="round"',
+        "dots": 'stroke-width="2" stroke-linecap="round"',
         "area": 'stroke="none" fill-opacity="0.18"',
         "steps": 'stroke-width="1.2" fill-opacity="0.25"',
     }[series.kind]
@@ -85,7 +87,7 @@ def _path(series: Series, x: Scale, y: Scale, points: int) -> str:
     if series.low is not None:
         both = np.concatenate((series.y, series.low[::-1]))
         return _polyline(x.pixels(np.concatenate((series.x, series.x[::-1]))), y.pixels(both)) + "Z"
-    if series.kind == "points":
+    if series.kind in ("points", "dots"):
         places = zip(x.pixels(series.x).tolist(), y.pixels(series.y).tolist(), strict=True)
         return "".join(f"M{across:.2f},{up:.2f}h0" for across, up in places if np.isfinite(up))
     kept_x, kept_y = thin(series.x, series.y, points)
@@ -118,7 +120,7 @@ def _x_axis(chart: Chart, x: Scale, y: Scale, size: Size) -> str:
 def _y_axis(chart: Chart, x: Scale, y: Scale, size: Size) -> str:
     marks = "".join(
         f'<line x1="{x.start}" x2="{x.end}" y1="{at:.2f}" y2="{at:.2f}" stroke="{_GRID}"/>'
-        f'<text x="{x.start - 6}" y="{at + 4:.2f}" text-anchor="end">{label(tick)}</text>'
+        f'<text x="{x.start - 6}" y="{at + 4:.2f}" text-anchor="end">{label(tick, y.log)}</text>'
         for tick, at in zip(y.ticks, y.pixels(np.array(y.ticks)).tolist(), strict=True)
     )
     middle = (y.start + y.end) / 2
@@ -132,13 +134,13 @@ def _legend(series: tuple[Series, ...], width: float) -> tuple[str, int]:
     named = [one for one in series if one.name]
     across, row, parts = 58.0, 0, []
     for one in named:
-        needed = 32 + 6.6 * len(one.name)
+        needed = 40 + 6.8 * len(one.name)
         if across + needed > width and across > 58:
             across, row = 58.0, row + 1
         up = 11 + _ROW * row
         dash = ' stroke-dasharray="6 4"' if one.kind == "dashed" else ""
-        thick = {"area": 9, "steps": 9, "points": 5}.get(one.kind, 2.2)
-        faint = ' stroke-opacity="0.3"' if one.kind in ("area", "steps") else ""
+        thick = {"area": 9, "steps": 9, "points": 5, "dots": 4, "broad": 6}.get(one.kind, 2.2)
+        faint = ' stroke-opacity="0.3"' if one.kind in ("area", "steps", "broad") else ""
         parts.append(
             f'<line x1="{across:.1f}" x2="{across + 18:.1f}" y1="{up - 4}" y2="{up - 4}" stroke="{one.colour}" '
             f'stroke-width="{thick}"{dash}{faint}/><text x="{across + 23:.1f}" y="{up}">{escape(one.name)}</text>'

@@ -18,14 +18,14 @@ def correlation(data: RunData) -> Section | None:
     values = correlations(np.array(kept["matrix"], dtype=np.float64))
     strong = sorted(
         (
-            (abs(values[row, column]), names[row], names[column])
+            (float(values[row, column]), names[row], names[column])
             for row in range(len(names))
             for column in range(row)
             if abs(values[row, column]) >= STRONG
         ),
-        reverse=True,
+        key=lambda pair: -abs(pair[0]),
     )
-    pairs = "; ".join(f"{first} and {second} ({value:.2f})" for value, first, second in strong[:5])
+    pairs = "; ".join(f"{first} and {second} ({value:+.2f})" for value, first, second in strong[:5])
     said = (
         f"Strongly correlated: {pairs}. Only their combination is well known; another motion would part them."
         if strong

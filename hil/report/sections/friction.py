@@ -49,7 +49,7 @@ def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) ->
     curve = _torque(data.model, at)[:, joint]
     low, high = _interval(data, at, joint)
     series = (
-        Series("what the measured motion leaves", speed, torque, GREY, "points"),
+        Series("what the measured motion leaves", speed, torque, GREY, "dots"),
         Series("95 % interval", at, high, BLUE, "area", low),
         Series("model", at, curve, BLUE),
     )

@@ -28,9 +28,8 @@ _MEANING = {
 def parameters(data: RunData) -> Section:
     """Always there."""
     truth = data.result.get("truth", {})
-    head = ("parameter", "what it is", "value", "95 % interval", "unit", "rel. error", *(("truth",) if truth else ()))
     tables = [
-        Table(head, tuple(_row(name, entry, truth) for name, entry in data.result[key].items()), 2, caption)
+        _table(data.result[key], truth if key == "parameters" else {}, caption)
         for key, caption in (("parameters", "Base parameters"), ("extra", "What the model needed beside them"))
         if data.result[key]
     ]
@@ -41,14 +40,20 @@ def parameters(data: RunData) -> Section:
     return Section("parameters", "Parameters", words, tuple(tables))
 
 
+def _table(entries: dict[str, Any], truth: dict[str, float], caption: str) -> Table:
+    head = ("parameter", "what it is", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
+    return Table(head, tuple(_row(name, entry, truth) for name, entry in entries.items()), 3, caption, 1)
+
+
 def _row(name: str, entry: dict[str, Any], truth: dict[str, float]) -> tuple[str, ...]:
     value, std = entry["value"], entry["std"]
     known = (number(truth[name]) if name in truth else "",) if truth else ()
+    unit = "" if entry["unit"] == "1" else entry["unit"].replace("^2", "²")
     meaning = _MEANING.get(name.rstrip("0123456789").rstrip("_"), "")
     if not math.isfinite(std):
-        return (name, meaning, number(value), "not determined", entry["unit"], "", *known)
+        return (name, meaning, unit, number(value), "not determined", "", *known)
     relative = percent(std / abs(value)) if value else ""
-    return (name, meaning, *_interval(value, std), entry["unit"], relative, *known)
+    return (name, meaning, unit, *_interval(value, std), relative, *known)
 
 
 def _interval(value: float, std: float) -> tuple[str, str]:

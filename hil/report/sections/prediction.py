@@ -31,8 +31,8 @@ def prediction(data: RunData) -> Section | None:
 
 def _position(period: PlayedPeriod, joint: int, name: str, role: str, said: str) -> Picture:
     time = np.arange(period.position.shape[1]) / period.rate
-    measured = Series("measured", time, period.position[joint], BLUE)
-    predicted = Series("predicted", time, period.predicted[joint], ORANGE, "dashed")
+    measured = Series("measured", time, period.position[joint], BLUE, "broad")
+    predicted = Series("predicted", time, period.predicted[joint], ORANGE)
     key = f"position_{joint + 1}_{role.replace(' ', '_')}"
     chart = Chart(
         key, f"Position of {name}, {role} motion", "time in the period [s]", "position [rad]", (measured, predicted)
@@ -44,7 +44,7 @@ def _residual(data: RunData, joint: int, name: str) -> Picture:
     assert data.fitted is not None  # the caller looked
     left = data.fitted.error[joint] / abs(float(data.facts["position_step"][joint]))
     time = np.arange(len(left)) / data.fitted.rate
-    series = [Series("measured minus predicted", time, left, BLUE)]
+    series = [Series("measured minus predicted", time, left, BLUE, "dots")]
     for level in (-0.5, 0.5):
         ends = np.array([0.0, len(left) / data.fitted.rate])
         series.append(Series("rounding alone" if level > 0 else "", ends, np.full(2, level), GREEN, "dashed"))

@@ -83,7 +83,7 @@ def _torque_constants(data: RunData) -> str:
 
 
 def _hardware(data: RunData) -> str:
-    return "The servos were a fake bus, not hardware." if data.config.is_fake else ""
+    return "The servos were a fake bus: nothing here was measured on hardware." if data.config.is_fake else ""
 
 
 def _advice(data: RunData, tone: str) -> tuple[str, ...]:
