@@ -17,19 +17,24 @@ _CHUNK = 16384  # samples worked on together: their temporaries stay in the proc
 
 @dataclass(frozen=True)
 class JointFacts:
-    """What a model knows of a joint beside its dynamics; None where the result does not say.
+    """What a model knows of a joint beside its dynamics.
 
-    torque_constant [N m/A] at the output shaft and its std; position_limit [rad], velocity_limit [rad/s],
-    current_limit [A].
+    mode: "current", whose goals are A, or "pwm", whose goals are V. torque_per_goal: N m/A or N m/V at the output
+    shaft. goal_limit: A or V. position_limit: rad. velocity_limit: rad/s.
     """
 
     name: str
     servo: str
-    torque_constant: float
-    torque_constant_std: float
+    mode: str
+    torque_per_goal: float
+    torque_per_goal_std: float
+    goal_limit: float
     position_limit: tuple[float, float]
     velocity_limit: float
-    current_limit: float
+
+    @property
+    def goal_unit(self) -> str:
+        return "V" if self.mode == "pwm" else "A"
 
 
 @dataclass(frozen=True)
@@ -103,10 +108,10 @@ class ArmModel:
         free = torque - self.rigid_body_torque(q, dq, np.zeros_like(q)) - loaded
         return np.asarray(np.linalg.solve(self.mass_matrix(q), free[..., None])[..., 0])
 
-    def current(self, torque: ArrayLike) -> Array:
-        """Motor currents (..., joints) [A] that give motor torques (..., joints) [N m]."""
+    def goal(self, torque: ArrayLike) -> Array:
+        """Goals (..., joints) [A, or V in pwm mode] for motor torques (..., joints) [N m]; no limit is applied."""
         (torque,) = self._motion(torque=torque)
-        return np.asarray(torque / np.array([joint.torque_constant for joint in self.joints]))
+        return np.asarray(torque / np.array([joint.torque_per_goal for joint in self.joints]))
 
     def _motion(self, **arrays: ArrayLike) -> list[Array]:
         """The arguments as arrays of one shape; raises ValueError."""

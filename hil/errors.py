@@ -18,9 +18,13 @@ estimator.errors.EstimationError  1   the recording does not determine the param
 
 
 class HilError(Exception):
-    """Root of hil's own errors."""
+    """Root of hil's own errors.
+
+    last_samples: what had been recorded last before it (rows of hil.recording), where an experiment was running.
+    """
 
     exit_code = 1
+    last_samples: object = None
 
 
 class ConfigError(HilError):

@@ -78,11 +78,12 @@ def _joint(entry: dict[str, Any]) -> JointFacts:
     return JointFacts(
         name=str(entry["name"]),
         servo=str(entry["model"]),
-        torque_constant=float(entry["torque_constant"]),
-        torque_constant_std=float(entry["torque_constant_std"]),
+        mode=str(entry["mode"]),
+        torque_per_goal=float(entry["torque_per_goal"]),
+        torque_per_goal_std=float(entry["torque_per_goal_std"]),
+        goal_limit=float(entry["goal_limit"]),
         position_limit=(float(low), float(high)),
         velocity_limit=float(entry["velocity_limit"]),
-        current_limit=float(entry["current_limit"]),
     )
 
 

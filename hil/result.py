@@ -7,7 +7,8 @@ covariance   of parameters and extra together, rows in the order of `names`
 fit          residual of the settled period, in encoder steps, against the encoder's own rounding
 validation   free prediction of another multisine, as a fraction of the motion's RMS
 timing       how the stream kept its ticks, and how long the estimation took
-arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, torque constant, limits
+arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, mode, limits, torque per
+             goal [N m/A, or N m/V in pwm mode]
 truth        only on a fake arm
 """
 
@@ -61,12 +62,22 @@ def make_result(
 
 
 def _arm(config: Config) -> dict[str, Any]:
-    kept = {"name", "model", "torque_constant", "torque_constant_std"}
-    limits = {"position_limit", "velocity_limit", "current_limit"}
     return {
         "gravity": config.arm.gravity,
         "rest_pose": config.arm.rest_pose,
-        "joints": [joint.model_dump(include=kept | limits) for joint in config.joints],
+        "joints": [
+            {
+                "name": joint.name,
+                "model": joint.model,
+                "mode": joint.drive_mode.name.lower(),
+                "torque_per_goal": joint.torque_per_goal,
+                "torque_per_goal_std": joint.torque_per_goal_std,
+                "goal_limit": joint.goal_limit,
+                "position_limit": joint.position_limit,
+                "velocity_limit": joint.velocity_limit,
+            }
+            for joint in config.joints
+        ],
     }
 
 

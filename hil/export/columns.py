@@ -13,6 +13,9 @@ UNITS = {
     "current": "A",
     "velocity": "rad/s",
     "position": "rad",
+    "servo_clock": "s",
+    "supply_voltage": "V",
+    "temperature": "degrees C",
 }
 
 

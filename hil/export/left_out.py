@@ -37,4 +37,6 @@ def left_out(model: ArmModel, terms: tuple[str, ...]) -> list[str]:
 
 def torque_constants(model: ArmModel) -> list[str]:
     """One sentence per joint about its torque constant."""
-    return [f"torque constant of {joint.name} = {joint.torque_constant:.6g} N m/A" for joint in model.joints]
+    return [
+        f"torque per goal of {joint.name} = {joint.torque_per_goal:.6g} N m/{joint.goal_unit}" for joint in model.joints
+    ]

@@ -13,7 +13,10 @@ from hil.export.source import Source
 _WHOLE = ("phase", "segment", "period", "error", "missing")
 _TIMES = ("deadline", "time_before_write", "time_after_read")
 _SHARED = (*_TIMES, "phase", "segment", "period")
-_PER_JOINT = ("goal_current", "current", "velocity", "position", "error", "missing")
+_PER_JOINT = (
+    *("goal_current", "current", "velocity", "position", "error", "missing"),
+    *("servo_clock", "supply_voltage", "temperature"),
+)
 
 
 def export_mcap(source: Source, path: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""MJCF: bodies with masses, hinges with armature and friction, actuators commanded in ampere."""
+"""MJCF: bodies with masses, hinges with armature and friction, actuators commanded in the servo's own unit."""
 
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -55,9 +55,10 @@ def _add_body(parent: ET.Element, model: ArmModel, index: int, link: LinkMass, a
 
 
 def _add_actuators(root: ET.Element, model: ArmModel) -> None:
-    """Motors whose control is the current [A]: gain the torque constant, bias the offset, filter the current loop."""
+    """Motors controlled by a goal [A, or V in pwm mode]: gain its torque, bias the offset, filter the drive's lag."""
     actuators = ET.SubElement(root, "actuator")
-    comment(actuators, "control is the motor current [A]")
+    units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)
+    comment(actuators, f"control is the servo's goal: {units}")
     lag = model.values.get("lag", 0.0)
     drive = {"dyntype": "filterexact", "dynprm": numbers(lag)} if lag > 0 else {}
     for number, facts in enumerate(model.joints, start=1):
@@ -67,8 +68,8 @@ def _add_actuators(root: ET.Element, model: ArmModel) -> None:
             drive,
             name=facts.name,
             joint=facts.name,
-            gainprm=numbers(facts.torque_constant),
+            gainprm=numbers(facts.torque_per_goal),
             biastype="affine",
             biasprm=numbers(-model.values[f"offset_{number}"], 0, 0),
-            ctrlrange=numbers(-facts.current_limit, facts.current_limit),
+            ctrlrange=numbers(-facts.goal_limit, facts.goal_limit),
         )

@@ -33,11 +33,12 @@ def draw_svg(figure: Figure, size: Size) -> str:
     if not isinstance(figure, Chart):
         return draw_matrix(figure, size.width, FONT)
     legend, rows = _legend(figure.series, size.width)
-    left, right, top, bottom = 58.0, 10.0, 12.0 + _ROW * rows, 40.0
+    right, top, bottom = 10.0, 12.0 + _ROW * rows, 40.0
     x_low, x_high = span(np.concatenate([series.x for series in figure.series]), False, 0.0)
     y_low, y_high = span(_heights(figure), figure.log_y, 0.06)
-    x = Scale(x_low, x_high, left, size.width - right)
     y = Scale(y_low, y_high, size.height - bottom, top, figure.log_y, 42)
+    left = 34.0 + 7 * max(len(label(tick, y.log)) for tick in y.ticks)
+    x = Scale(x_low, x_high, left, size.width - right)
     body = "".join(_series(series, x, y, size.points) for series in figure.series)
     clip = f"{figure.name}-{size.name}"
     box = f'x="{left}" y="{top}" width="{x.end - x.start:.2f}" height="{y.start - y.end:.2f}"'

@@ -59,7 +59,7 @@ def test_any_shape_and_its_parts_add_up(identified: Path) -> None:
         model.rigid_body_torque(q, zero, ddq) - model.gravity_torque(q),
         atol=1e-12,
     )
-    np.testing.assert_allclose(model.current(torque), torque / 1.8)
+    np.testing.assert_allclose(model.goal(torque), torque / 1.8)
 
 
 def test_a_pendulum_is_an_arm_too(identified: Path) -> None:

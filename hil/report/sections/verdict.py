@@ -75,9 +75,9 @@ def _limits(data: RunData) -> str:
 
 def _torque_constants(data: RunData) -> str:
     unsure = [
-        f"{joint.name} {percent(joint.torque_constant_std / joint.torque_constant)}"
-        for joint in data.config.joints
-        if joint.torque_constant_std
+        f"{joint.name} {percent(joint.torque_per_goal_std / joint.torque_per_goal)}"
+        for joint in data.model.joints
+        if joint.torque_per_goal_std
     ]
     return f"All values scale with their joint's torque constant, known to: {listed(unsure)}." if unsure else ""
 

@@ -146,7 +146,7 @@ def test_what_has_no_place_is_said_and_written_down(identified: Path, name: str)
     for term in ("stribeck_rise_1 = 0.4", "load_2 = 0.05", "delay = 0.001 s", "coulomb_width_1"):
         assert term in said
     if name == "urdf":
-        assert "armature_2" in said and "offset_1" in said and "torque constant of elbow = 1.8 N m/A" in said
+        assert "armature_2" in said and "offset_1" in said and "torque per goal of elbow = 1.8 N m/A" in said
     text = path.read_text(encoding="utf-8")
     assert all(f"No place in this format for {sentence}" in text for sentence in left)
 

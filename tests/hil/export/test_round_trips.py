@@ -92,11 +92,12 @@ def test_mcap(run: Path) -> None:
             found[channel.topic].append(json.loads(message.data))
             stamps.append(message.log_time)
         (attached,) = opened.iter_attachments()
+    shared = ("deadline", "time_before_write", "time_after_read", "phase", "segment", "period")
     assert attached.data == json.dumps(json.loads((run / "result.json").read_text("utf-8")), indent=2).encode()
     for joint, topic in enumerate(("/shoulder", "/elbow")):
-        for name in ("goal_current", "current", "velocity", "position", "error", "missing"):
+        for name in set(samples.dtype.names) - set(shared):
             values = np.array([message[name] for message in found[topic]], dtype=np.float64)  # null becomes NaN
             np.testing.assert_array_equal(values, samples[name][:, joint].astype(np.float64))
-        for name in ("deadline", "time_before_write", "time_after_read", "phase", "segment", "period"):
+        for name in shared:
             np.testing.assert_array_equal([message[name] for message in found[topic]], samples[name])
     assert np.ptp(stamps) * 1e-9 == pytest.approx(np.ptp(samples["deadline"]), abs=1e-6)
