@@ -20,12 +20,14 @@ app = typer.Typer(
     name="hil",
     help="Identify the dynamics of Dynamixel servo arms, on the bus or on a fake one.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
-ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file that describes the arm.")]
+ConfigPath = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="TOML file of the arm, or the name of a bundled one.")
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
 PortOrConfig = Annotated[
     str | None,

@@ -15,6 +15,7 @@ from drivers.joint import Joint
 from drivers.servo_model import SERVO_MODELS, Mode, servo_model
 from fakes.description import FakeArm
 from fakes.table_errors import describe
+from hil.bundled import find_config
 from hil.errors import ConfigError
 
 FAKE_URL = "fake://"
@@ -229,7 +230,8 @@ class Config(_Table):
 
 
 def load_config(path: Path) -> Config:
-    """Read and check a TOML file; raises ConfigError."""
+    """Read and check a TOML file, or the bundled one of that bare name; raises ConfigError."""
+    path = find_config(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

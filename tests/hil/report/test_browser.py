@@ -28,7 +28,8 @@ addEventListener("securitypolicyviolation", (event) => seen.errors.push("policy:
 _AFTER = """<script>
 addEventListener("load", () => {
   seen.seconds = performance.now() / 1000;
-  seen.requests = performance.getEntriesByType("resource").map((entry) => entry.name).filter((n) => !n.startsWith("data:"));
+  const loaded = performance.getEntriesByType("resource").map((entry) => entry.name);
+  seen.requests = loaded.filter((name) => !name.startsWith("data:"));
   const visible = [...document.querySelectorAll("figure svg")].filter((svg) => svg.getBoundingClientRect().width > 0);
   seen.figures = visible.map((svg) => [svg.getAttribute("aria-label"), svg.getBoundingClientRect().width]);
   seen.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
@@ -58,17 +59,9 @@ def visit(page: Path, width: int) -> dict[str, Any]:
     watched = page.with_name("watched.html")
     watched.write_text(text.replace("<head>", f"<head>{_BEFORE}", 1).replace("</body>", f"{_AFTER}</body>", 1), "utf-8")
     assert CHROMIUM is not None
-    command = [
-        *(
-            CHROMIUM,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--hide-scrollbars",
-            "--disable-background-networking",
-        ),
-        *(f"--user-data-dir={page.parent / 'profile'}", f"--window-size={width},900", "--dump-dom", watched.as_uri()),
-    ]
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    command += [f"--user-data-dir={page.parent / 'profile'}", f"--window-size={width},900"]
+    command += ["--disable-background-networking", "--dump-dom", watched.as_uri()]
     dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
     found = re.search(r'<pre id="seen">(.*?)</pre>', dom, re.DOTALL)
     assert found, dom[-2000:]
