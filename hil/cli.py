@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from hil import __version__, cli_results
+from hil import __version__, cli_init, cli_results
 
 if TYPE_CHECKING:
     from hil.config import Config
@@ -94,6 +94,7 @@ def scan(
     from drivers.port import open_port
     from drivers.servo_model import BAUD_RATES
     from hil import scan as scanning
+    from hil.config import port_url
     from hil.setup_view import print_ports, print_scan, scanned
     from hil.terminal import Terminal
 
@@ -102,7 +103,7 @@ def scan(
         return
     bauds = tuple(baud or BAUD_RATES)
     terminal = Terminal(quiet=json_only)
-    opened = open_port(_port_url(port), bauds[0])
+    opened = open_port(port_url(port), bauds[0])
     try:
         with terminal.busy(f"Asking {len(bauds)} baud rates"):
             heard = list(scanning.scan(opened, bauds))
@@ -149,6 +150,7 @@ def setup(
     """Set a servo's ID, baud or return delay: a question before each write to EEPROM, each write read back."""
     from drivers.port import open_port
     from drivers.servo_model import BAUD_RATES
+    from hil.config import port_url
     from hil.setup import open_servo, set_up
     from hil.setup_view import changed, print_changes
 
@@ -156,7 +158,7 @@ def setup(
         raise typer.BadParameter(f"{new_baud}: a servo can do {', '.join(map(str, BAUD_RATES))}.")
     if json_only and not yes:
         raise typer.BadParameter("--json asks no questions: it needs --yes.")
-    opened = open_port(_port_url(port), baud)
+    opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)
         confirm = (lambda _: True) if yes else (lambda question: typer.confirm(question))
@@ -170,6 +172,7 @@ app.command(epilog="Example: hil report runs/20261121-153000-fake_two_link --png
 app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --format urdf --format mjcf")(
     cli_results.export
 )
+app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.init)
 
 
 def main() -> NoReturn:
@@ -194,18 +197,6 @@ def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool)
     from hil.result_table import print_result
 
     print_result(result, config, path, Console(highlight=False))
-
-
-def _port_url(port: str) -> str:
-    """The port's URL: as given, or what a configuration says."""
-    import fakes
-
-    fakes.register()
-    if port.endswith(".toml") and "://" not in port:
-        from hil.config import load_config
-
-        return load_config(Path(port)).url
-    return port
 
 
 def _default_folder(config: Path) -> Path:

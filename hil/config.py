@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+import fakes
 from drivers.bus import BusConfig
 from drivers.joint import Joint
 from drivers.servo_model import SERVO_MODELS, Mode, servo_model
@@ -275,3 +276,11 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
             f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than "
             f"{product} = {math.floor(most * 1000) / 1000:g} N m"
         )
+
+
+def port_url(port: str) -> str:
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
+    fakes.register()
+    if port.endswith(".toml") and "://" not in port:
+        return load_config(Path(port)).url
+    return port
