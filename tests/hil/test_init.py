@@ -38,10 +38,8 @@ def test_defaults_make_a_file_that_runs(arm_file: ArmFile, capsys: pytest.Captur
     assert "hil check mine.toml" in printed.out
     assert "shoulder did not move" in printed.err
     config = load_config(Path("mine.toml"))
-    assert [(joint.id, joint.model, joint.zero_ticks) for joint in config.joints] == [
-        (1, "XM430-W350", 3072),
-        (2, "XM430-W350", 2048),
-    ]
+    assert [(joint.id, joint.model) for joint in config.joints] == [(1, "XM430-W350"), (2, "XM430-W350")]
+    assert [joint.zero_ticks for joint in config.joints] == pytest.approx([3072, 2048], abs=2)
     assert "NOT yet run on this arm" in Path("mine.toml").read_text(encoding="utf-8")
     assert hil("check", "mine.toml") == 0
     assert hil("init", arm_file(), "--yes", "--out", "mine.toml") == 2
@@ -68,7 +66,8 @@ def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> Non
     finally:
         port.close()
     (joint,) = arm.joints
-    assert (joint.id, joint.name, joint.rest, joint.zero_ticks) == (2, "wrist", 0.0, 2048)
+    assert (joint.id, joint.name, joint.rest) == (2, "wrist", 0.0)
+    assert joint.zero_ticks == pytest.approx(2048, abs=2)
     assert joint.swing == pytest.approx(math.pi / 4)
     assert arm.gravity == 0.0
     assert [text.split(":")[0] for text in said] == [
