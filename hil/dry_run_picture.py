@@ -14,7 +14,7 @@ def draw(config: Config, prediction: Prediction, path: Path) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise RunFolderError('The picture needs matplotlib: install it with pip install "hil[report]".') from None
+        raise RunFolderError('The picture needs matplotlib: install it with pip install "hil[png]".') from None
     joints = len(config.joints)
     figure = Figure(figsize=(9, 2.6 * joints), layout="constrained")
     axes = figure.subplots(joints, 1, sharex=True, squeeze=False)[:, 0]
