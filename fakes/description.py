@@ -10,10 +10,10 @@ from drivers.clock import Clock
 from drivers.packet import MAX_ID
 from fakes.arm import Arm
 from fakes.bus import FakeBus
+from fakes.plant import make_plant
 from fakes.registers import BAUD_RATES, MODEL_NAMES, load_model
 from fakes.servo import Servo
 from fakes.table_errors import describe
-from fakes.two_link import make_plant
 
 
 class DescriptionError(ValueError):

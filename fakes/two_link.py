@@ -22,13 +22,6 @@ from math import ceil, cos, sin
 
 from fakes.arm import Arm, Link, armature
 from fakes.motor import SHORTEST_STEP, Motor
-from fakes.pendulum import Pendulum
-from fakes.plant import Plant
-
-
-def make_plant(arm: Arm) -> Plant:
-    """The plant of this arm, at rest in its starting pose at time 0."""
-    return Pendulum(arm) if len(arm.links) == 1 else TwoLink(arm)
 
 
 class TwoLink:
@@ -43,8 +36,8 @@ class TwoLink:
         self._swing = second.mass * first.length * second.centre
         self._armature_1 = armature(arm.drives[0])
         self._armature_2 = armature(arm.drives[1])
-        self._weight_first = (first.mass * first.centre + beyond * first.length) * arm.gravity
-        self._weight_second = second.mass * second.centre * arm.gravity
+        self._weight_first = (first.mass * first.centre + beyond * first.length) * arm.weight
+        self._weight_second = second.mass * second.centre * arm.weight
         self._longest_step = min(motor.longest_step for motor in self._motors)
         self._time = 0.0
         self._q1, self._q2 = arm.start
@@ -66,6 +59,10 @@ class TwoLink:
     @property
     def current(self) -> tuple[float, float]:
         return self._motors[0].current, self._motors[1].current
+
+    def jam(self, joint: int, jammed: bool) -> None:
+        """Hold a joint fast, or let it go."""
+        self._motors[joint].jammed = jammed
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
