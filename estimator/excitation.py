@@ -13,6 +13,7 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.errors import ExcitationError
+from estimator.normal_equations import normal_equations
 
 NORMS = (2, 4, 8, 16, 32, 64)  # p of the L2p norms, one after the other
 STARTS = 2  # random phases besides Schroeder's
@@ -180,8 +181,7 @@ def _least_norm(angle: Array, phase: Array, p: int) -> Array:
     cost = float(np.sum(wave ** (2 * p)))
     for _ in range(ITERATIONS):
         jacobian = (p * wave ** (p - 1)) * (-np.sin(angle + phase[:, None]) / scale)
-        normal = jacobian @ jacobian.T
-        slope = jacobian @ wave**p
+        normal, slope = normal_equations(jacobian.T, wave**p)
         trial = phase - np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), slope)
         wave_there = np.cos(angle + trial[:, None]).sum(axis=0) / scale
         cost_there = float(np.sum(wave_there ** (2 * p)))

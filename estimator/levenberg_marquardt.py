@@ -9,6 +9,7 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.errors import ConvergenceError
+from estimator.normal_equations import normal_equations, sum_of_squares
 
 Residual = Callable[[Array], Array]
 
@@ -26,9 +27,11 @@ class Minimum:
     """Where the sum of squares is least."""
 
     x: Array
-    residual: Array
-    jacobian: Array
-    """Of the residual by x (residuals, coordinates)."""
+    """Coordinates (coordinates,)."""
+    normal: Array
+    """J'J of the Jacobian J of the residual by x (coordinates, coordinates)."""
+    gradient: Array
+    """J'r (coordinates,)."""
     cost: float
     """Sum of squares."""
     iterations: int
@@ -43,24 +46,24 @@ def minimise(residual: Residual, start: Array, enough: float) -> Minimum:
     still falls by more than UNFINISHED of it after ITERATIONS.
     """
     x, r = start, residual(start)
-    cost = float(r @ r)
+    cost = sum_of_squares(r)
     if not np.isfinite(cost):
         raise ConvergenceError("the starting values give no finite motion: check the torque and the period's units")
     damping = FIRST_DAMPING
     gained = np.inf
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         for iteration in range(1, ITERATIONS + 1):
-            jacobian = _jacobian(residual, x, r, threads)
-            found = Minimum(x, r, jacobian, cost, iteration)
+            normal, gradient = normal_equations(_jacobian(residual, x, r, threads), r)
+            found = Minimum(x, normal, gradient, cost, iteration)
             trial, damping = _improve(residual, found, damping, enough)
             if trial is None:
                 return found
             x, r = trial
-            gained, cost = cost - float(r @ r), float(r @ r)
+            gained, cost = cost - sum_of_squares(r), sum_of_squares(r)
             if gained < enough * cost:
-                return Minimum(x, r, jacobian, cost, iteration)
+                return Minimum(x, normal, gradient, cost, iteration)
     if gained < UNFINISHED * cost:
-        return Minimum(x, r, jacobian, cost, ITERATIONS)
+        return Minimum(x, normal, gradient, cost, ITERATIONS)
     raise ConvergenceError(
         f"after {ITERATIONS} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} in each: "
         "try a simpler model or data with more motion"
@@ -71,15 +74,13 @@ def _improve(
     residual: Residual, at: Minimum, damping: float, enough: float
 ) -> tuple[tuple[Array, Array] | None, float]:
     """A better point and its residual, or None when there is none in sight; and the next step's damping."""
-    normal = at.jacobian.T @ at.jacobian
-    gradient = at.jacobian.T @ at.residual
     while damping < MOST_DAMPING:
-        step = _step(normal, gradient, damping)
-        foreseen = -float(step @ (2.0 * gradient + normal @ step))
+        step = _step(at.normal, at.gradient, damping)
+        foreseen = -float(step @ (2.0 * at.gradient + at.normal @ step))
         if foreseen < enough * at.cost:
             break
         there = residual(at.x + step)
-        gained = at.cost - float(there @ there)
+        gained = at.cost - sum_of_squares(there)
         if gained > 0.0:
             return (at.x + step, there), max(LEAST_DAMPING, damping * (0.1 if gained > 0.5 * foreseen else 1.0))
         damping = max(10.0 * damping, FIRST_DAMPING)

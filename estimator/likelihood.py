@@ -24,6 +24,7 @@ WIDTH_FLOOR = 3e-4  # rad/s: narrower cannot be told from friction that sticks
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
 COARSE = 1e-3  # relative gain in the sum of squares at which each try ends
 FINE = 1e-6
+EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02}
@@ -99,6 +100,8 @@ def fit_period(period: SettledPeriod, model: Model, linear: LinearEstimate) -> F
         value = _start(model, linear, width)
         x = np.concatenate((coordinates.coordinates(value), state))
         tries.append(minimise(problem.residual, x, COARSE))
+        if tries[-1].cost < EXPLAINED * period.valid.sum():
+            break
     best = min(tries, key=lambda found: found.cost)
     minimum = minimise(problem.residual, best.x, FINE)
     return Fit(
@@ -124,15 +127,14 @@ def _start(model: Model, linear: LinearEstimate, width: float) -> Array:
 
 def _covariance(minimum: Minimum, coordinates: Coordinates, samples: int) -> Array:
     """Covariance of the parameters, the start's state taken as unknown with them."""
-    x, J = minimum.x, minimum.jacobian
+    x, normal = minimum.x, minimum.normal
     count = len(coordinates.names)
     variance = minimum.cost / max(1, samples - x.size)
-    norm = np.linalg.norm(J, axis=0)
+    norm = np.sqrt(np.diag(normal))
     seen = norm > 1e-12 * norm.max()
-    scaled = J[:, seen] / norm[seen]
+    lengths = np.outer(norm[seen], norm[seen])
     of_x = np.zeros((x.size, x.size))
-    inverse = np.linalg.pinv(scaled.T @ scaled, hermitian=True)
-    of_x[np.ix_(seen, seen)] = inverse / np.outer(norm[seen], norm[seen])
+    of_x[np.ix_(seen, seen)] = np.linalg.pinv(normal[np.ix_(seen, seen)] / lengths, hermitian=True) / lengths
     slope = coordinates.slopes(x[:count])
     covariance: Array = variance * slope @ of_x[:count, :count] @ slope.T
     covariance[~seen[:count], ~seen[:count]] = np.inf

@@ -136,7 +136,7 @@ def test_a_recording_cut_short_is_said(arm_file: ArmFile, capsys: pytest.Capture
 
 
 def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path: Path) -> None:
-    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 1.0]"))
+    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 0.3]"))
     with subprocess.Popen([sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]) as process:
         samples = tmp_path / "run" / "samples.npy"
         for _ in range(600):
@@ -151,7 +151,7 @@ def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path
 
 
 def test_sigterm_ends_in_a_message_and_exit_code_1(arm_file: ArmFile, tmp_path: Path) -> None:
-    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 1.0]"))
+    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 0.3]"))
     command = [sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         for _ in range(600):
