@@ -17,7 +17,7 @@ from drivers.clock import Clock
 from drivers.packet import Packet
 from fakes.fault_effects import begin, end, put_with_faults
 from fakes.faults import Fault, FaultKind, Faults
-from fakes.instructions import Instructions
+from fakes.instructions import Instructions, Reply
 from fakes.plant import Plant
 from fakes.present import PRESENT_END, PRESENT_START
 from fakes.receiver import Receiver
@@ -118,8 +118,8 @@ class FakeBus:
             receiver.reset()
         byte_s = wire.byte_s
         end_s = self._sent_by = start + len(data) * byte_s
-        for packet in receiver.feed(data):
-            arrived = end_s - receiver.pending * byte_s
+        for packet, behind in receiver.feed(data):
+            arrived = end_s - behind * byte_s
             if start >= wire.reply_by or not wire.collide(start, arrived):
                 self._receive(packet, arrived)
             start = arrived
@@ -188,13 +188,17 @@ class FakeBus:
         """Move plant, servos and faults on to `until`; nothing when that is past."""
         if until <= self._now:
             return
-        if until >= self._next_tick or until - self._origin >= self.faults.next_change or self._trip_before(until):
+        commands = []
+        event = until >= self._next_tick or until - self._origin >= self.faults.next_change
+        for servo in self._servos:
+            commands.append(servo.motor_current_a)
+            if servo.watchdog_s and until > servo.heard_at + servo.watchdog_s:
+                event = True
+        if event:
             self._advance_by_events(until)
         else:
-            self._move_plant(until)
-
-    def _trip_before(self, until: float) -> bool:
-        return any(servo.watchdog_s and until > servo.heard_at + servo.watchdog_s for servo in self._servos)
+            self.plant.advance(until - self._origin, commands)
+            self._now = until
 
     def _advance_by_events(self, until: float) -> None:
         """Stop at each tick, fault and watchdog's trip, so that the plant sees its effect from that moment on."""
@@ -264,20 +268,35 @@ class FakeBus:
                 packet = packet._replace(damaged=True)
         self._instructions.receive(packet, now)
 
-    def send(self, servo_id: int, data: bytes, start: float) -> float:
-        """Put a servo's bytes on the wire from time `start`; the time at which the last one is over."""
-        if self.faults.on_replies:
-            return put_with_faults(self.faults, self._wire, servo_id, data, start, start - self._origin)
-        return self._wire.put(data, start)
+    def send(self, replies: Sequence[Reply], now: float) -> None:
+        """Put replies on the wire, each its delay after the end of the one before it; the first after `now`."""
+        wire, faults = self._wire, self.faults
+        if faults.on_replies:
+            for servo_id, delay_s, data in replies:
+                now = put_with_faults(faults, wire, servo_id, data, now + delay_s, now - self._origin)
+            return
+        joined = b""
+        for _, delay_s, data in replies:
+            if delay_s:
+                if joined:
+                    now = wire.put(joined, now)
+                joined = b""
+                now += delay_s
+            joined += data  # what follows without a pause is one stretch of bytes
+        if joined:
+            wire.put(joined, now)
 
     def measure(self, servo: Servo, address: int, length: int) -> None:
         """Bring the registers of a stretch up to date with the servo's joint."""
         end_address = address + length
         if (address < PRESENT_END and end_address > PRESENT_START) or servo.memory.is_indirect(address, length):
-            joint, plant = self._joint[servo], self.plant
-            servo.present.measure(
-                address, end_address, self._now, plant.position[joint], plant.velocity[joint], plant.current[joint]
-            )
+            joint = self._joint[servo]
+            position, velocity, current = self.joints()
+            servo.present.measure(address, end_address, self._now, position[joint], velocity[joint], current[joint])
+
+    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Positions [rad], velocities [rad/s] and motor currents [A] of all joints."""
+        return self.plant.position, self.plant.velocity, self.plant.current
 
     def is_moving(self, servo: Servo) -> bool:
         """Whether the servo's register Moving is 1."""

@@ -201,7 +201,7 @@ class Faults:
 
 
 def parse_fault(text: str) -> Fault:
-    """A fault as on the command line, `KIND` or `KIND:key=value,key=value`; raises ValueError that says what is allowed."""
+    """A fault as on the command line, `KIND` or `KIND:key=value,key=value`; raises ValueError."""
     kind, _, rest = text.partition(":")
     keys = [name for name in Fault.model_fields if name != "kind"]
     values: dict[str, object] = {"kind": kind}

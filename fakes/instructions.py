@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from drivers.packet import (
+    ALERT,
     BROADCAST_ID,
     HEADER,
     MAX_LENGTH,
@@ -26,10 +27,20 @@ from drivers.packet import (
     encode_status,
 )
 from fakes.maintenance import RESET_ALL
+from fakes.present import STATE_END, STATE_START
 from fakes.servo import Servo
+
+_STATE_SPAN = STATE_START.to_bytes(2, "little") + (STATE_END - STATE_START).to_bytes(2, "little")
+_FRONT_LENGTH = 8  # header, ID, LEN, INST of a status
+_STUFFED = b"\xff\xff\xfd"
+_ALERT = {0: b"\0", ALERT: bytes((ALERT,))}
 
 Part = tuple[int, int, int]
 """What a group read asks of one servo: ID, address, length."""
+
+
+Reply = tuple[int, float, bytes]
+"""Who speaks, how long it waits before it does [s], and its bytes."""
 
 
 class Line(Protocol):
@@ -38,12 +49,16 @@ class Line(Protocol):
     @property
     def baud(self) -> int: ...
 
-    def send(self, servo_id: int, data: bytes, start: float) -> float:
-        """Put a servo's bytes on the wire from time `start`; the time at which the last one is over."""
+    def send(self, replies: Sequence[Reply], now: float) -> None:
+        """Put replies on the wire, each its delay after the end of the one before it; the first after `now`."""
         ...
 
     def measure(self, servo: Servo, address: int, length: int) -> None:
         """Bring the registers of a stretch up to date with the servo's joint."""
+        ...
+
+    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Positions [rad], velocities [rad/s] and motor currents [A] of all joints, in the order of the servos."""
         ...
 
     def is_moving(self, servo: Servo) -> bool: ...
@@ -59,6 +74,8 @@ class Instructions:
         self._line = line
         self._by_id: dict[int, tuple[Servo, ...]] = {}
         self._shadows: dict[int, tuple[Servo, ...]] = {}
+        self._writers: dict[int, tuple[Servo, ...]] = {}
+        self._state_reads: dict[bytes, tuple[tuple[Servo, int, bytes], ...]] = {}
         self._broadcast: dict[int, Callable[[bytes, float], None]] = {
             Instruction.PING: self._broadcast_ping,
             Instruction.SYNC_READ: self._sync_read,
@@ -72,11 +89,14 @@ class Instructions:
 
     def route(self) -> None:
         """Find out who listens to which ID."""
-        self._by_id, self._shadows = {}, {}
+        self._by_id, self._shadows, self._writers = {}, {}, {}
+        self._state_reads.clear()
         for servo in self._servos:
             self._by_id[servo.id] = (*self._by_id.get(servo.id, ()), servo)
             if servo.shadow_id is not None:
                 self._shadows[servo.shadow_id] = (*self._shadows.get(servo.shadow_id, ()), servo)
+        for listener in self._by_id.keys() | self._shadows.keys():
+            self._writers[listener] = self._by_id.get(listener, ()) + self._shadows.get(listener, ())
 
     def receive(self, packet: Packet, now: float) -> None:
         """Let the servos act on a packet whose last byte arrives at `now` [s]."""
@@ -85,7 +105,7 @@ class Instructions:
             return
         baud = self._line.baud
         for servo in self._servos:
-            if servo.hears(now, baud):
+            if servo.baud == baud and servo.connected and now >= servo.ready_at:
                 servo.heard_at = now  # feeds its watchdog, and says below that it heard this packet
         if packet.id != BROADCAST_ID:
             self._single(packet, now)
@@ -129,7 +149,7 @@ class Instructions:
                     answers.append((sender, error | servo.alert, data, delay_s))
         if len(answers) == 1:
             sender, error, data, delay_s = answers[0]
-            self._line.send(sender, encode_status(sender, error, data), now + delay_s)
+            self._line.send([(sender, delay_s, encode_status(sender, error, data))], now)
         elif answers:
             self._line.count_collision()
 
@@ -143,19 +163,21 @@ class Instructions:
     # All of them, or several
 
     def _broadcast_ping(self, _body: bytes, now: float) -> None:
-        at = now
+        replies = []
         for servo in sorted(self._listening(now), key=lambda servo: servo.id):
             error, data = servo.execute(Instruction.PING, b"", now, False)
-            at = self._line.send(
-                servo.id, encode_status(servo.id, error | servo.alert, data), at + servo.return_delay_s
-            )
+            replies.append((servo.id, servo.return_delay_s, encode_status(servo.id, error | servo.alert, data)))
+        self._line.send(replies, now)
 
     def _sync_write(self, body: bytes, now: float) -> None:
         if len(body) < 4:
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
+        writers = self._writers
         for at in range(4, len(body) - length, length + 1):
-            self._write(body[at], address, body[at + 1 : at + 1 + length], now)
+            for servo in writers.get(body[at], ()):
+                if servo.heard_at == now:
+                    servo.write(address, body[at + 1 : at + 1 + length])
 
     def _bulk_write(self, body: bytes, now: float) -> None:
         at = 0
@@ -163,23 +185,50 @@ class Instructions:
             address, length = body[at + 1] | body[at + 2] << 8, body[at + 3] | body[at + 4] << 8
             data = body[at + 5 : at + 5 + length]
             if len(data) == length:
-                self._write(body[at], address, data, now)
+                for servo in self._writers.get(body[at], ()):
+                    if servo.heard_at == now:
+                        servo.write(address, data)
             at += 5 + length
-
-    def _write(self, servo_id: int, address: int, data: bytes, now: float) -> None:
-        for servo in self._by_id.get(servo_id, ()):
-            if servo.heard_at == now:
-                servo.write(address, data)
-        if servo_id in self._shadows:
-            for servo in self._shadows[servo_id]:
-                if servo.heard_at == now:
-                    servo.write(address, data)
 
     def _sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 4:
             return
+        if body.startswith(_STATE_SPAN) and self._state_read(body, now):
+            return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
         self._group_read([(servo_id, address, length) for servo_id in body[4:]], now)
+
+    def _state_read(self, body: bytes, now: float) -> bool:
+        """The group read of a control cycle, prepared once; False when it has to go the long way after all."""
+        prepared = self._state_reads.get(body)
+        if prepared is None:
+            prepared = self._state_reads[body] = self._prepare_state_read(body[4:])
+        positions, velocities, currents = self._line.joints()
+        replies = []
+        for servo, joint, front in prepared:
+            if servo.heard_at != now or not servo.status_return_level:
+                return False
+            state = servo.present.state(positions[joint], velocities[joint], currents[joint])
+            if _STUFFED in state:
+                reply = encode_status(servo.id, servo.alert, state)
+            else:
+                reply = front + _ALERT[servo.alert] + state
+                reply += crc(reply).to_bytes(2, "little")
+            replies.append((servo.id, servo.return_delay_s, reply))
+        if replies:
+            self._line.send(replies, now)
+        return bool(replies)
+
+    def _prepare_state_read(self, ids: bytes) -> tuple[tuple[Servo, int, bytes], ...]:
+        """Servos, their joints and the beginnings of their replies; empty when one of them is not as usual."""
+        prepared = []
+        for servo_id in ids:
+            servos = self._by_id.get(servo_id, ())
+            if len(servos) != 1 or not servos[0].model.operating_modes:
+                return ()
+            front = encode_status(servo_id, 0, bytes(STATE_END - STATE_START))[:_FRONT_LENGTH]
+            prepared.append((servos[0], self._servos.index(servos[0]), front))
+        return tuple(prepared)
 
     def _fast_sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 5:
@@ -194,15 +243,17 @@ class Instructions:
         self._fast_read(list(_bulk_parts(body)), now)
 
     def _group_read(self, parts: Sequence[Part], now: float) -> None:
-        at = now
+        measure = self._line.measure
+        replies = []
         for servo_id, address, length in parts:
             servo = self._answering(servo_id, now)
             if servo is None:
-                return
-            error, data = self._read(servo, address, length)
-            at = self._line.send(
-                servo_id, encode_status(servo_id, error | servo.alert, data), at + servo.return_delay_s
-            )
+                break
+            measure(servo, address, length)
+            error, data = servo.read(address, length)
+            replies.append((servo_id, servo.return_delay_s, encode_status(servo_id, error | servo.alert, data)))
+        if replies:
+            self._line.send(replies, now)
 
     def _fast_read(self, parts: Sequence[Part], now: float) -> None:
         """One packet from all servos; each appends its part and the CRC over everything up to there."""
@@ -210,17 +261,18 @@ class Instructions:
         if not parts or size > MAX_LENGTH:
             return
         whole = HEADER + bytes((BROADCAST_ID,)) + size.to_bytes(2, "little") + bytes((Instruction.STATUS,))
-        at = now
+        replies = []
         sent = 0
         for servo_id, address, length in parts:
             servo = self._answering(servo_id, now)
             if servo is None or servo.firmware < servo.model.fast_read_firmware:
-                return
+                break
             error, data = self._read(servo, address, length)
             whole += bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")
             whole += crc(whole).to_bytes(2, "little")
-            at = self._line.send(servo_id, whole[sent:], at + servo.return_delay_s)
+            replies.append((servo_id, servo.return_delay_s, whole[sent:]))
             sent = len(whole)
+        self._line.send(replies, now)
 
     def _answering(self, servo_id: int, now: float) -> Servo | None:
         """The servo that answers a group read under this ID; None when there is none or more than one."""

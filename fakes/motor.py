@@ -14,18 +14,14 @@ class Motor:
     """The laws of one drive. It holds no state of the arm; its current is the only thing that moves in it."""
 
     __slots__ = (
-        "_coulomb",
         "_drive",
         "_lag",
         "_left",
         "_mean_left",
-        "_offset",
-        "_rise",
         "_shaped",
         "_step",
-        "_torque_constant",
-        "_velocity_scale",
         "_width",
+        "constants",
         "current",
         "jammed",
         "longest_step",
@@ -35,19 +31,27 @@ class Motor:
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
         self._lag = drive.current_lag
-        self._torque_constant = drive.torque_constant
-        self._coulomb = drive.coulomb
         self._width = drive.coulomb_width
-        self._rise = drive.coulomb * drive.stribeck_rise
-        self._velocity_scale = drive.stribeck_velocity
-        self._offset = drive.offset
         self._shaped = bool(drive.ripple or drive.cogging or drive.load or drive.stops)
         self._step = self._left = self._mean_left = 0.0
+        self.constants = (
+            drive.torque_constant,
+            drive.offset,
+            drive.coulomb,
+            drive.coulomb * drive.stribeck_rise,
+            1.0 / drive.stribeck_velocity,
+        )
+        """Torque constant, offset, Coulomb level, Stribeck rise, 1 / Stribeck velocity."""
         self.viscous = drive.viscous
         self.jammed = False
         """True: something holds the joint fast."""
         self.current = 0.0  # A
         self.longest_step = min(LONGEST_STEP, STEP_PER_WIDTH * self._width) if self._width else LONGEST_STEP
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether lag, torque, offset and sticking Stribeck friction are all there is to it."""
+        return not (self._shaped or self._width or self.jammed)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """What the drive does during one step, its angle and velocity given at the step's middle.
@@ -55,26 +59,17 @@ class Motor:
         Returns the mean torque without dry friction that sticks [N m], the level of that friction [N m], the
         slope of smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
         """
-        mean = current = command
-        if self._lag:
-            # A first-order lag under a constant command, exactly: its end and its mean over the step.
-            if step != self._step:
-                self._step = step
-                fallen = -expm1(-step / self._lag)
-                self._left = 1.0 - fallen
-                self._mean_left = fallen * self._lag / step
-            away = self.current - command
-            current = command + away * self._left
-            mean = command + away * self._mean_left
-        torque = self._torque_constant * mean
-        level = self._coulomb
+        torque_constant, offset, level, rise, per_velocity = self.constants
+        left, mean_left = self.lag(step)
+        away = self.current - command
+        torque = torque_constant * (command + away * mean_left)
         slope = 0.0
-        if self._rise:
-            ratio = velocity / self._velocity_scale
-            level += self._rise * exp(-ratio * ratio)
+        if rise:
+            ratio = velocity * per_velocity
+            level += rise * exp(-ratio * ratio)
         if self._shaped:
             torque, level, slope = self._shape(step, torque, level, angle, velocity)
-        torque -= self._offset
+        torque -= offset
         if self._width:
             bend = tanh(velocity / self._width)
             torque -= level * bend
@@ -82,12 +77,22 @@ class Motor:
             level = 0.0
         if self.jammed:
             level += JAM
-        return torque, level, slope, current
+        return torque, level, slope, command + away * left
+
+    def lag(self, step: float) -> tuple[float, float]:
+        """How much of a current's distance from its command is left at the end of a step, and on its average."""
+        if self._lag and step != self._step:
+            # A first-order lag under a constant command, exactly.
+            self._step = step
+            fallen = -expm1(-step / self._lag)
+            self._left = 1.0 - fallen
+            self._mean_left = fallen * self._lag / step
+        return self._left, self._mean_left
 
     def _shape(
         self, step: float, torque: float, level: float, angle: float, velocity: float
     ) -> tuple[float, float, float]:
-        """What only some drives have: ripple, cogging, friction from load, stops; torque, level and slope as changed."""
+        """Ripple, cogging, friction from load and stops, which only some drives have."""
         drive = self._drive
         slope = 0.0
         if drive.ripple:

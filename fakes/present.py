@@ -13,6 +13,10 @@ PRESENT_START = 120
 PRESENT_END = 147
 """First address of the present registers, and the first behind them."""
 
+STATE_START = 126
+STATE_END = 136
+"""The same of Present Current, Velocity and Position, which a control cycle reads."""
+
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 _REALTIME_TICK_WRAP = 32_768
@@ -22,8 +26,6 @@ _CLEAR_TURNS = b"\x01DXL\x22"
 # Realtime Tick, Moving, Moving Status, Present PWM; Present Current (or Load), Velocity, Position; the trajectories.
 _BEFORE = Struct("<HBBh")
 _STATE = Struct("<hii")
-_STATE_START = 126
-_STATE_END = 136
 _TRAJECTORIES = Struct("<ii")
 
 Share = Callable[[float, float], float]
@@ -53,6 +55,8 @@ class Present:
         self._clock_rate = clock_rate
         self._noise_a = current_noise_a
         self._noise = noise
+        self._unit = model.current_unit_a
+        self._imperfect = noise is not None or model.senses_supply
         self._booted_at = 0.0
         self._turn_ticks = 0
         self._shift = 0
@@ -99,41 +103,47 @@ class Present:
         """Whether Moving is 1 at a joint velocity [rad/s]."""
         return abs(round(self.velocity_ticks(velocity))) > self._moving_threshold
 
-    def measure(self, address: int, end: int, now: float, position: float, velocity: float, current: float) -> None:
-        """Bring the present registers between two addresses up to date with the joint: angle [rad], velocity [rad/s],
-        motor current [A], at `now` [s]."""
-        if not self._is_x_series:
-            self._measure_other(now, position)
-            return
+    def state(self, position: float, velocity: float, current: float) -> bytes:
+        """Present Current, Velocity and Position (126 to 135) of a joint: angle [rad], velocity [rad/s], current [A]."""
         sign = self.sign
-        data = self._memory.data
-        unit = self._model.current_unit_a
+        unit = self._unit
         ticks = 0
         if unit:
-            if self._noise is not None:
-                current += self._noise.gauss(0.0, self._noise_a)
-            if self._model.senses_supply:
-                current *= abs(self._share(current, velocity))
+            if self._imperfect:
+                current = self._sensed(current, velocity)
             ticks = round(sign * current / unit)
-            ticks = -32_768 if ticks < -32_768 else 32_767 if ticks > 32_767 else ticks
+            if ticks > 32_767 or ticks < -32_768:
+                ticks = -32_768 if ticks < 0 else 32_767
         encoder = round(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
         if self._reversed:
             encoder = TICKS_PER_TURN - encoder
-        velocity_ticks = round(sign * velocity * _TICKS_PER_RAD_S)
-        _STATE.pack_into(data, _STATE_START, ticks, velocity_ticks, encoder + self._shift + self.jump_ticks)
-        if address < _STATE_START or end > _STATE_END:
-            self._measure_rest(data, now, velocity, current, abs(velocity_ticks) > self._moving_threshold)
+        return _STATE.pack(ticks, round(sign * velocity * _TICKS_PER_RAD_S), encoder + self._shift + self.jump_ticks)
+
+    def measure(self, address: int, end: int, now: float, position: float, velocity: float, current: float) -> None:
+        """Bring the present registers between two addresses up to date with the joint, at `now` [s]."""
+        if not self._is_x_series:
+            self._measure_other(now, position)
+            return
+        data = self._memory.data
+        data[STATE_START:STATE_END] = self.state(position, velocity, current)
+        if address < STATE_START or end > STATE_END:
+            tick = int((now - self._booted_at) * self._clock_rate * 1000) % _REALTIME_TICK_WRAP
+            pwm = round(885 * self._share(self.sign * current, self.sign * velocity))
+            _BEFORE.pack_into(data, PRESENT_START, tick, self.moves(velocity), data[123], pwm)
 
     def tell_trajectory(self, status: int, velocity_ticks: float, position_ticks: float) -> None:
         """Moving Status and the two trajectory registers."""
         data = self._memory.data
         data[123] = status
-        _TRAJECTORIES.pack_into(data, _STATE_END, round(velocity_ticks), round(position_ticks))
+        _TRAJECTORIES.pack_into(data, STATE_END, round(velocity_ticks), round(position_ticks))
 
-    def _measure_rest(self, data: bytearray, now: float, velocity: float, current: float, moving: bool) -> None:
-        tick = int((now - self._booted_at) * self._clock_rate * 1000) % _REALTIME_TICK_WRAP
-        pwm = round(885 * self._share(self.sign * current, self.sign * velocity))
-        _BEFORE.pack_into(data, PRESENT_START, tick, moving, data[123], pwm)
+    def _sensed(self, current: float, velocity: float) -> float:
+        """What the current sensor makes of the motor's current [A]."""
+        if self._noise is not None:
+            current += self._noise.gauss(0.0, self._noise_a)
+        if self._model.senses_supply:
+            current *= abs(self._share(current, velocity))
+        return current
 
     def _measure_other(self, now: float, position: float) -> None:
         """A model of another series: its position, in ticks of an X-series encoder, if it has the register."""

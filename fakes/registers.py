@@ -85,7 +85,7 @@ def load_model(name: str) -> Model:
 
 
 def _x_series(name: str, facts: ModelFacts) -> Model:
-    table = X_SERIES | dict(facts.differs)
+    table = {**X_SERIES, **facts.differs}
     addresses = load_control_table(name)
     registers = [
         _register(entry.name, entry.address, entry.size, entry.signed, table.get(entry.name, RegisterFacts()))

@@ -1,4 +1,4 @@
-"""The half-duplex wire from the servos to the host: which bytes arrive when, and what is lost when two speak at once."""
+"""The half-duplex wire from the servos to the host: which bytes arrive when, and what a collision destroys."""
 
 from collections import deque
 from typing import NamedTuple
@@ -79,8 +79,14 @@ class Wire:
 
     def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
         """Up to `size` bytes that are there by `deadline`, and when the last of them came, at least `now`."""
-        taken = b""
         arriving = self._arriving
+        if arriving and len(arriving[0].data) == size:  # the usual case: what one write brought, in one read
+            segment = arriving[0]
+            last = segment.first + (size - 1) * segment.byte_s
+            if last <= deadline:
+                del arriving[0]
+                return segment.data, last if last > now else now
+        taken = b""
         while size and arriving:
             segment = arriving[0]
             count = segment.count_by(deadline)
