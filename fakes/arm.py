@@ -97,12 +97,16 @@ class Arm(BaseModel):
         return self.gravity * math.cos(self.tilt)
 
 
-def base_parameters(arm: Arm) -> dict[str, float]:
+def base_parameters(arm: Arm | None) -> dict[str, float]:
     """The truth an identification of this arm should find, by the estimator's names and in its order [SI].
+
+    Empty when there is no `Arm`: of another plant nothing is known here.
 
     What no base parameter stands for is left out: dry friction above Coulomb (Stribeck rise, load), the current's lag,
     ripple, cogging, backlash, stops. `gravity` values are those of the tilted plane.
     """
+    if arm is None:
+        return {}
     parameters = _rigid_body(arm)
     for quantity in ("viscous", "coulomb", "offset"):
         for joint, drive in enumerate(arm.drives, start=1):

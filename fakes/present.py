@@ -104,7 +104,7 @@ class Present:
         return abs(round(self.velocity_ticks(velocity))) > self._moving_threshold
 
     def state(self, position: float, velocity: float, current: float) -> bytes:
-        """Present Current, Velocity and Position (126 to 135) of a joint: angle [rad], velocity [rad/s], current [A]."""
+        """Registers 126 to 135 of a joint: angle [rad], velocity [rad/s], motor current [A]."""
         sign = self.sign
         unit = self._unit
         ticks = 0
