@@ -1,5 +1,6 @@
 """The fake arm's physics: links, drives, and what the estimator should find in them."""
 
+import math
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -42,6 +43,14 @@ class Drive(BaseModel):
     offset: Finite = Field(0.0, description="constant torque on the side of the load [N m]")
     ripple: NotNegative = Field(0.0, description="torque ripple over the angle, as a fraction of torque")
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
+    cogging: NotNegative = Field(0.0, description="amplitude of the cogging torque at the output shaft [N m]")
+    cogging_cycles: Positive = Field(1.0, description="cycles of cogging per turn of the joint")
+    backlash: NotNegative = Field(0.0, description="free play of the gears, from flank to flank [rad]")
+    gear_stiffness: Positive = Field(1500.0, description="of the gears in contact; only with backlash [N m/rad]")
+    gear_damping: NotNegative = Field(2.0, description="of the gears in contact; only with backlash [N m s/rad]")
+    stops: tuple[Finite, Finite] | None = Field(None, strict=False, description="joint angles of the hard stops [rad]")
+    stop_stiffness: Positive = Field(200.0, description="of a hard stop [N m/rad]")
+    stop_damping: NotNegative = Field(1.0, description="of a hard stop [N m s/rad]")
 
     @model_validator(mode="after")
     def _width_is_resolved(self) -> Self:
@@ -50,6 +59,10 @@ class Drive(BaseModel):
                 f"coulomb_width is {self.coulomb_width:g} rad/s: give 0 for friction that sticks, "
                 "or at least 0.001 rad/s for a smooth step"
             )
+        if self.stops is not None and self.stops[0] >= self.stops[1]:
+            raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be the smaller")
+        if self.backlash and not self.rotor_inertia:
+            raise ValueError("backlash needs a rotor_inertia greater than 0: the rotor moves by itself inside the play")
         return self
 
 
@@ -59,6 +72,9 @@ class Arm(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     gravity: NotNegative = Field(9.81, description="0 for an arm in a horizontal plane [m/s^2]")
+    tilt: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)] = Field(
+        0.0, description="of the arm's plane against the vertical; pi/2 is horizontal [rad]"
+    )
     start: tuple[Finite, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
     links: tuple[Link, ...] = Field(strict=False, min_length=1, max_length=2, description="from the base outwards")
     drives: tuple[Drive, ...] = Field(strict=False, description="one for each link, at its joint")
@@ -70,14 +86,27 @@ class Arm(BaseModel):
                 f"{len(self.links)} links, {len(self.drives)} drives and {len(self.start)} angles in start: "
                 "give one of each per joint"
             )
+        for joint, (angle, drive) in enumerate(zip(self.start, self.drives, strict=True), start=1):
+            if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
+                raise ValueError(f"start: {angle:g} rad for joint {joint} is beyond its stops {list(drive.stops)}")
         return self
 
+    @property
+    def weight(self) -> float:
+        """Gravity along the arm's plane [m/s^2]."""
+        return self.gravity * math.cos(self.tilt)
 
-def base_parameters(arm: Arm) -> dict[str, float]:
+
+def base_parameters(arm: Arm | None) -> dict[str, float]:
     """The truth an identification of this arm should find, by the estimator's names and in its order [SI].
 
-    Dry friction above Coulomb (Stribeck rise, load) and the current lag are no base parameters: left out.
+    Empty when there is no `Arm`: of another plant nothing is known here.
+
+    What no base parameter stands for is left out: dry friction above Coulomb (Stribeck rise, load), the current's lag,
+    ripple, cogging, backlash, stops. `gravity` values are those of the tilted plane.
     """
+    if arm is None:
+        return {}
     parameters = _rigid_body(arm)
     for quantity in ("viscous", "coulomb", "offset"):
         for joint, drive in enumerate(arm.drives, start=1):
@@ -95,7 +124,7 @@ def _rigid_body(arm: Arm) -> dict[str, float]:
     inertia_1 = first.inertia + first.mass * first.centre**2 + armature(arm.drives[0])
     moment_1 = first.mass * first.centre
     if len(arm.links) == 1:
-        return {"inertia_1": inertia_1, "gravity_1": moment_1 * arm.gravity}
+        return {"inertia_1": inertia_1, "gravity_1": moment_1 * arm.weight}
     second = arm.links[1]
     beyond_elbow = second.mass + arm.drives[1].mass
     return {
@@ -103,6 +132,6 @@ def _rigid_body(arm: Arm) -> dict[str, float]:
         "coupling": second.mass * first.length * second.centre,
         "inertia_2": second.inertia + second.mass * second.centre**2,
         "armature_2": armature(arm.drives[1]),
-        "gravity_1": (moment_1 + beyond_elbow * first.length) * arm.gravity,
-        "gravity_2": second.mass * second.centre * arm.gravity,
+        "gravity_1": (moment_1 + beyond_elbow * first.length) * arm.weight,
+        "gravity_2": second.mass * second.centre * arm.weight,
     }

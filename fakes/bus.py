@@ -3,82 +3,40 @@
 Bytes take wire time (ten bits each). A packet acts when its last byte arrives: the plant is advanced to that moment
 with the motor currents in force before, then the addressed servos act. Replies go onto the wire after the servo's
 return delay and reach the host `adapter_latency_us` later. Everything is worked out when the host writes, up to the
-last packet of that write, even where that lies ahead of the clock; between two packets only a Bus Watchdog can act, and
-the plant's advance is split at the moment it does.
+last packet of that write, even where that lies ahead of the clock; between two packets only Bus Watchdogs, the servos'
+own loops and faults can act, and the plant's advance is split at the moment they do.
 
-Where the manual is silent:
-
-- The registers of a Sync Read are sampled when its instruction's last byte arrives, in all servos alike.
-- In a Sync Read or Fast Sync Read each servo waits for the one listed before it. Behind one that does not answer all
-  stay silent, and a Fast Sync Read then breaks off in the middle (source: ROBOTIS in DynamixelSDK issue 364).
-- To a broadcast Ping the servos answer one directly after the other by rising ID.
-- When two speak at once, host and servo or two servos, both are lost: the later packet, and the former's bytes from
-  there on.
-- Two servos with one ID that answer at once are heard as nothing; both act on what they are told.
-- The status of a write to ID or Baud Rate still comes from the old ID at the old baud.
-
-Instructions of the next stage (Factory Reset, Clear, Control Table Backup, the Bulk group) get Instruction errors.
+When two speak at once, host and servo or two servos, both are lost: the later packet, and the former's bytes from there
+on. Which servos act and answer is the affair of `fakes.instructions`.
 """
 
 import math
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 from drivers.clock import Clock
-from drivers.packet import (
-    BROADCAST_ID,
-    HEADER,
-    MAX_LENGTH,
-    Framer,
-    Instruction,
-    Packet,
-    StatusError,
-    crc,
-    encode_status,
-)
+from drivers.packet import Packet
+from fakes.fault_effects import begin, end, put_with_faults
+from fakes.faults import Fault, FaultKind, Faults
+from fakes.instructions import Instructions, Reply
 from fakes.plant import Plant
-from fakes.servo import PRESENT_END, PRESENT_START, Servo
+from fakes.present import PRESENT_END, PRESENT_START
+from fakes.receiver import Receiver
+from fakes.servo import Servo
+from fakes.supply import Supply
+from fakes.wire import Wire
 
 GAP_S = 1.5e-3
 """A pause between two bytes of a packet after which a servo forgets its beginning [s]."""
 
-BITS_PER_BYTE = 10
-
-ROUNDING_S = 1e-9
-"""Less than this two bytes on the wire do not overlap, they follow each other [s]."""
-
-_ID_ADDRESS = 7
-
-
-class _Arriving(NamedTuple):
-    """Bytes on their way to the host: when the first is there, and how far apart they come [s]."""
-
-    data: bytes
-    first: float
-    byte_s: float
-
-    @property
-    def last(self) -> float:
-        return self.first + (len(self.data) - 1) * self.byte_s
-
-    def count_by(self, deadline: float) -> int:
-        """How many of the bytes are there by `deadline`."""
-        if self.last <= deadline:
-            return len(self.data)
-        if self.first > deadline:
-            return 0
-        return min(int((deadline - self.first) / self.byte_s) + 1, len(self.data))
-
-    def after(self, count: int) -> "_Arriving":
-        """What is left when the first `count` bytes are gone."""
-        return _Arriving(self.data[count:], self.first + count * self.byte_s, self.byte_s)
+TICK_S = 1e-3
+"""Period of the servos' own loops [s]."""
 
 
 class FakeBus:
     """The wire, the adapter and everything behind it. Servo `i` of the sequence moves joint `i` of the plant.
 
-    The plant's time is 0 when the bus is made. Times in this class are seconds on `clock`.
+    The plant's time is 0 when the bus is made. Times in this class are seconds on `clock`, but for `time` and those of
+    faults, which count from when the bus was made.
     """
 
     def __init__(
@@ -89,41 +47,41 @@ class FakeBus:
         *,
         baud: int = 1_000_000,
         adapter_latency_us: float = 0.0,
+        supply: Supply | None = None,
+        seed: int = 0,
     ) -> None:
         if len(servos) != plant.joints:
             raise ValueError(f"{len(servos)} servos for a plant of {plant.joints} joints: one servo per joint")
         self.plant = plant
         self.clock = clock
-        self.collisions = 0
-        """How often host and servos spoke at once."""
+        self.packets = 0
+        """Good packets that the host has sent."""
+        self.pulls = 0
+        """How often the adapter's cable was pulled. What was open then stays lost."""
+        self.cable_is_out = False
         self._servos = tuple(servos)
-        self._latency_s = adapter_latency_us * 1e-6
-        self._framer = Framer(damaged=True)
-        self._arriving: deque[_Arriving] = deque()
+        self._supply = supply
+        self._wire = Wire(baud, adapter_latency_us * 1e-6)
+        self._receiver = Receiver()
         self._origin = self._now = clock.now()
         self._sent_by = self._now
-        self._reply_by = -math.inf  # when the last servo will have spoken
-        for joint, servo in enumerate(self._servos):
-            servo.power_up(self._now, plant.position[joint])
-        self._broadcast: dict[int, Callable[[bytes, float], None]] = {
-            Instruction.PING: self._broadcast_ping,
-            Instruction.SYNC_READ: self._sync_read,
-            Instruction.FAST_SYNC_READ: self._fast_sync_read,
-            Instruction.SYNC_WRITE: self._sync_write,
-        }
+        self._next_tick = math.inf
         self._joint = {servo: joint for joint, servo in enumerate(self._servos)}
-        self.baud = baud
-        self._route()
+        self.faults = Faults(seed, self._begin_fault, self._end_fault)
+        self._instructions = Instructions(self._servos, self)
+        for joint, servo in enumerate(self._servos):
+            servo.power_up(self._now, lambda joint=joint: self.plant.position[joint])  # type: ignore[misc]
+            servo.changed = self._servo_changed
+        self._servo_changed()
 
     @property
     def baud(self) -> int:
         """The host's baud. Servos set to another one hear nothing and are not heard."""
-        return self._baud
+        return self._wire.baud
 
     @baud.setter
     def baud(self, baud: int) -> None:
-        self._baud = baud
-        self._byte_s = BITS_PER_BYTE / baud
+        self._wire.baud = baud
 
     @property
     def servos(self) -> dict[int, Servo]:
@@ -131,18 +89,38 @@ class FakeBus:
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
+    @property
+    def time(self) -> float:
+        """Seconds since the bus was made, by its clock."""
+        return self.clock.now() - self._origin
+
+    @property
+    def collisions(self) -> int:
+        """How often host and servos, or two servos, spoke at once."""
+        return self._wire.collisions
+
+    @property
+    def damaged_packets(self) -> int:
+        """Packets of the host whose CRC was wrong."""
+        return self._receiver.damaged
+
     # The host's side
 
     def write(self, data: bytes) -> None:
-        """Put bytes on the wire, behind those still being sent."""
-        start = max(self.clock.now(), self._sent_by)
-        if self._framer.pending and start - self._sent_by > GAP_S:
-            self._framer.reset()
-        byte_s = self._byte_s
-        end = self._sent_by = start + len(data) * byte_s
-        for packet in self._framer.feed(data):
-            arrived = end - self._framer.pending * byte_s
-            if start >= self._reply_by or not self._collide(start, arrived):
+        """Put bytes on the wire, behind those still being sent. With the cable out they are lost."""
+        wire, receiver = self._wire, self._receiver
+        now = self.clock.now()
+        self.notice_faults()
+        if self.cable_is_out:
+            return
+        start = now if now > self._sent_by else self._sent_by
+        if receiver.pending and start - self._sent_by > GAP_S:
+            receiver.reset()
+        byte_s = wire.byte_s
+        end_s = self._sent_by = start + len(data) * byte_s
+        for packet, behind in receiver.feed(data):
+            arrived = end_s - behind * byte_s
+            if start >= wire.reply_by or not wire.collide(start, arrived):
                 self._receive(packet, arrived)
             start = arrived
 
@@ -150,7 +128,7 @@ class FakeBus:
         """Up to `size` bytes, waiting on the clock until they are there, at most `timeout_s` (0: take what is there).
 
         Nothing but the host's own writing brings new bytes, so a wait without end (`math.inf`) is over when all bytes
-        on their way have come.
+        on their way have come. The wait is over too when the cable is pulled.
         """
         now = self.clock.now()
         deadline = now + timeout_s
@@ -159,228 +137,171 @@ class FakeBus:
             # end of its timeout gets there.
             deadline = max(deadline, math.nextafter(now, math.inf))
         taken = b""
-        arriving = self._arriving
-        while size and arriving:
-            segment = arriving[0]
-            count = min(size, segment.count_by(deadline))
-            if not count:
+        while True:
+            change = self._origin + self.faults.next_change
+            part, came = self._wire.take(size - len(taken), min(deadline, change), now)
+            taken += part
+            if len(taken) == size or deadline < change or self.cable_is_out or change == math.inf:
                 break
-            taken += segment.data[:count]
-            size -= count
-            now = segment.first + (count - 1) * segment.byte_s
-            if count == len(segment.data):
-                arriving.popleft()
-            else:
-                arriving[0] = segment.after(count)
-        self.clock.wait_until(deadline if size and deadline < math.inf else now)
+            self.clock.wait_until(change)
+            self.notice_faults()
+            now = self.clock.now()
+        if not self.cable_is_out:
+            self.clock.wait_until(deadline if len(taken) < size and deadline < math.inf else came)
         return taken
 
     @property
     def in_waiting(self) -> int:
         """Bytes that have reached the host and were not read."""
-        now = self.clock.now()
-        return sum(segment.count_by(now) for segment in self._arriving)
+        return self._wire.count_by(self.clock.now())
 
     @property
     def on_the_way(self) -> int:
         """Bytes that have reached the host or will do so without further writing."""
-        return sum(len(segment.data) for segment in self._arriving)
+        return self._wire.on_the_way
 
     @property
     def sent_by(self) -> float:
         """When the last byte that the host wrote has left it."""
         return self._sent_by
 
+    @property
+    def next_reply_by(self) -> float:
+        """When the replies that are next to come, one directly after the other, will all be there; infinite if none."""
+        return self._wire.next_reply_by
+
     def discard_input(self) -> None:
         """Drop the bytes that have reached the host. Those still on their way come later, as they do on a real port."""
-        self.read(self.in_waiting, 0.0)
+        now = self.clock.now()
+        self._wire.take(self.in_waiting, now, now)
 
     # Time
 
+    def notice_faults(self) -> None:
+        """Let the faults happen whose time has come by the clock."""
+        now = self.clock.now()
+        if now - self._origin >= self.faults.next_change:
+            self.advance(now)
+            self._change_faults(now)
+
     def advance(self, until: float) -> None:
-        """Move plant and watchdogs on to `until`; nothing when that is past."""
+        """Move plant, servos and faults on to `until`; nothing when that is past."""
         if until <= self._now:
             return
+        commands = []
+        event = until >= self._next_tick or until - self._origin >= self.faults.next_change
         for servo in self._servos:
+            commands.append(servo.motor_current_a)
             if servo.watchdog_s and until > servo.heard_at + servo.watchdog_s:
-                self._trip_watchdogs(until)
-                break
-        self._move_plant(until)
+                event = True
+        if event:
+            self._advance_by_events(until)
+        else:
+            self.plant.advance(until - self._origin, commands)
+            self._now = until
 
-    def _trip_watchdogs(self, until: float) -> None:
-        """Stop at the moment of each watchdog's trip before `until`, so that the plant sees the current drop there."""
-        counting = [servo for servo in self._servos if servo.watchdog_s]
-        for servo in sorted(counting, key=lambda servo: servo.heard_at + servo.watchdog_s):
-            trip = servo.heard_at + servo.watchdog_s
-            if trip < until:
-                self._move_plant(max(trip, self._now))
-                servo.trip_watchdog()
+    def _advance_by_events(self, until: float) -> None:
+        """Stop at each tick, fault and watchdog's trip, so that the plant sees its effect from that moment on."""
+        while self._now < until:
+            counting = [servo for servo in self._servos if servo.watchdog_s]
+            trip = min((servo.heard_at + servo.watchdog_s for servo in counting), default=math.inf)
+            change = self._origin + self.faults.next_change
+            moment = max(min(until, trip, change, self._next_tick), self._now)
+            self._move_plant(moment)
+            for servo in counting:
+                if moment >= servo.heard_at + servo.watchdog_s and until > moment:
+                    servo.trip_watchdog()
+            if moment >= change:
+                self._change_faults(moment)
+            if moment >= self._next_tick:
+                self._next_tick = moment + TICK_S
+                self._tick(moment)
+
+    def _change_faults(self, now: float) -> None:
+        # A sum of times may fall short of them by a rounding; what is due must not be due again and again.
+        self.faults.change(max(now - self._origin, self.faults.next_change))
+
+    def _tick(self, now: float) -> None:
+        plant = self.plant
+        state = list(zip(self._servos, plant.position, plant.velocity, plant.current, strict=True))
+        if self._supply is not None:
+            self._supply.load(self._servos, plant.current, now)
+        for servo, position, velocity, current in state:
+            if servo.needs_ticks:
+                servo.tick(TICK_S, position, velocity, current)
 
     def _move_plant(self, until: float) -> None:
         self.plant.advance(until - self._origin, [servo.motor_current_a for servo in self._servos])
         self._now = until
 
+    def _servo_changed(self) -> None:
+        """A servo has another ID, or needs ticks, or needs none any more."""
+        self._instructions.route()
+        if self._supply is None and not any(servo.needs_ticks for servo in self._servos):
+            self._next_tick = math.inf
+        elif self._next_tick == math.inf:
+            self._next_tick = self._now + TICK_S
+
+    def _begin_fault(self, fault: Fault) -> None:
+        if fault.kind == FaultKind.CABLE_PULLED:
+            self.cable_is_out = True
+            self.pulls += 1
+            self._wire.cut(self._origin + fault.at)
+        else:
+            begin(fault, self._servos, self.plant, self._now)
+
+    def _end_fault(self, fault: Fault) -> None:
+        if fault.kind == FaultKind.CABLE_PULLED:
+            self.cable_is_out = False
+        else:
+            end(fault, self._servos, self.plant)
+
     # The servos' side
 
     def _receive(self, packet: Packet, now: float) -> None:
         self.advance(now)
-        if packet.damaged:
-            self._address(packet.id, lambda _: (StatusError.CRC, b""), now)
+        self.packets += not packet.damaged
+        for fault in self.faults.on_instructions:
+            if self.faults.strikes(fault, packet.id, now - self._origin):
+                if fault.kind == FaultKind.LOST_INSTRUCTION:
+                    return
+                packet = packet._replace(damaged=True)
+        self._instructions.receive(packet, now)
+
+    def send(self, replies: Sequence[Reply], now: float) -> None:
+        """Put replies on the wire, each its delay after the end of the one before it; the first after `now`."""
+        wire, faults = self._wire, self.faults
+        if faults.on_replies:
+            for servo_id, delay_s, data in replies:
+                now = put_with_faults(faults, wire, servo_id, data, now + delay_s, now - self._origin)
             return
-        for servo in self._servos:
-            if servo.hears(now, self._baud):
-                servo.heard_at = now  # feeds its watchdog, and says below that it heard this packet
-        if packet.id != BROADCAST_ID:
-            self._single(packet, now)
-        elif packet.instruction in self._broadcast:
-            self._broadcast[packet.instruction](packet.body, now)
-        else:
-            for servo in self._listening(now):
-                self._execute(servo, packet.instruction, packet.body, now)
+        joined = b""
+        for _, delay_s, data in replies:
+            if delay_s:
+                if joined:
+                    now = wire.put(joined, now)
+                joined = b""
+                now += delay_s
+            joined += data  # what follows without a pause is one stretch of bytes
+        if joined:
+            wire.put(joined, now)
 
-    def _single(self, packet: Packet, now: float) -> None:
-        """An instruction to one ID."""
-        instruction, body = packet.instruction, packet.body
-        if instruction == Instruction.STATUS:
-            return
-        if instruction == Instruction.READ:
-            if len(body) != 4:
-                self._address(packet.id, lambda _: (StatusError.DATA_LENGTH, b""), now, least_level=1)
-                return
-            address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
-            self._address(packet.id, lambda servo: self._read(servo, address, length), now, least_level=1)
-            return
-        least_level = 0 if instruction == Instruction.PING else 2
-        self._address(packet.id, lambda servo: self._execute(servo, instruction, body, now), now, least_level)
+    def measure(self, servo: Servo, address: int, length: int) -> None:
+        """Bring the registers of a stretch up to date with the servo's joint."""
+        end_address = address + length
+        if (address < PRESENT_END and end_address > PRESENT_START) or servo.memory.is_indirect(address, length):
+            joint = self._joint[servo]
+            position, velocity, current = self.joints()
+            servo.present.measure(address, end_address, self._now, position[joint], velocity[joint], current[joint])
 
-    def _address(
-        self, servo_id: int, act: Callable[[Servo], tuple[int, bytes]], now: float, least_level: int = 2
-    ) -> None:
-        """Let the servo of this ID act, and answer if its Status Return Level is at least `least_level`."""
-        answers = []
-        for servo in self._by_id.get(servo_id, ()):
-            if servo.hears(now, self._baud):
-                wanted = servo.status_return_level >= least_level
-                delay_s, sender = servo.return_delay_s, servo.id
-                error, data = act(servo)
-                if wanted:
-                    answers.append((sender, error | servo.alert, data, delay_s))
-        if len(answers) == 1:
-            sender, error, data, delay_s = answers[0]
-            self._send(encode_status(sender, error, data), now + delay_s)
-        elif answers:
-            self.collisions += 1
+    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Positions [rad], velocities [rad/s] and motor currents [A] of all joints."""
+        return self.plant.position, self.plant.velocity, self.plant.current
 
-    def _execute(self, servo: Servo, instruction: int, body: bytes, now: float) -> tuple[int, bytes]:
-        outcome = servo.execute(instruction, body, now, self.plant.position[self._joint[servo]])
-        self._route()
-        return outcome
+    def is_moving(self, servo: Servo) -> bool:
+        """Whether the servo's register Moving is 1."""
+        return servo.present.moves(self.plant.velocity[self._joint[servo]])
 
-    def _read(self, servo: Servo, address: int, length: int) -> tuple[int, bytes]:
-        if address < PRESENT_END and address + length > PRESENT_START:
-            joint, plant = self._joint[servo], self.plant
-            servo.measure(self._now, plant.position[joint], plant.velocity[joint], plant.current[joint])
-        return servo.read(address, length)
-
-    def _broadcast_ping(self, _body: bytes, now: float) -> None:
-        at = now
-        for servo in sorted(self._listening(now), key=lambda servo: servo.id):
-            error, data = servo.execute(Instruction.PING, b"", now, 0.0)
-            at = self._send(encode_status(servo.id, error | servo.alert, data), at + servo.return_delay_s)
-
-    def _sync_write(self, body: bytes, now: float) -> None:
-        if len(body) < 4:
-            return
-        address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
-        for at in range(4, len(body) - length, length + 1):
-            for servo in self._by_id.get(body[at], ()):
-                if servo.heard_at == now:
-                    servo.write(address, body[at + 1 : at + 1 + length])
-        if address <= _ID_ADDRESS:
-            self._route()
-
-    def _sync_read(self, body: bytes, now: float) -> None:
-        if len(body) < 4:
-            return
-        address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
-        at = now
-        for servo_id in body[4:]:
-            servo = self._answering(servo_id, now)
-            if servo is None:
-                return
-            error, data = self._read(servo, address, length)
-            at = self._send(encode_status(servo_id, error | servo.alert, data), at + servo.return_delay_s)
-
-    def _fast_sync_read(self, body: bytes, now: float) -> None:
-        """One packet from all servos; each appends its part and the CRC over everything up to there."""
-        if len(body) < 5:
-            return
-        address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
-        ids = body[4:]
-        size = 1 + len(ids) * (length + 4)
-        if size > MAX_LENGTH:
-            return
-        whole = HEADER + bytes((BROADCAST_ID,)) + size.to_bytes(2, "little") + bytes((Instruction.STATUS,))
-        at = now
-        sent = 0
-        for servo_id in ids:
-            servo = self._answering(servo_id, now)
-            if servo is None or servo.firmware < servo.model.fast_read_firmware:
-                return
-            error, data = self._read(servo, address, length)
-            whole += bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")
-            whole += crc(whole).to_bytes(2, "little")
-            at = self._send(whole[sent:], at + servo.return_delay_s)
-            sent = len(whole)
-
-    def _answering(self, servo_id: int, now: float) -> Servo | None:
-        """The servo that answers a group read under this ID; None when there is none or more than one."""
-        servos = self._by_id.get(servo_id, ())
-        if len(servos) != 1 or servos[0].heard_at != now or servos[0].status_return_level == 0:
-            return None
-        return servos[0]
-
-    def _listening(self, now: float) -> list[Servo]:
-        return [servo for servo in self._servos if servo.hears(now, self._baud)]
-
-    def _route(self) -> None:
-        routes: dict[int, tuple[Servo, ...]] = {}
-        for servo in self._servos:
-            routes[servo.id] = (*routes.get(servo.id, ()), servo)
-        self._by_id = routes
-
-    # The wire
-
-    def _send(self, data: bytes, start: float) -> float:
-        """Put a servo's bytes on the wire from time `start`; the time at which the last one is over."""
-        byte_s = self._byte_s
-        end = start + len(data) * byte_s
-        waiting = start < self._reply_by
-        if waiting and self._collide(start, end):
-            return end
-        self._arriving.append(_Arriving(data, start + byte_s + self._latency_s, byte_s))
-        if waiting:  # behind an earlier instruction's reply that is still to come
-            self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
-        self._reply_by = max(self._reply_by, end)
-        return end
-
-    def _collide(self, start: float, end: float) -> bool:
-        """Whether a servo speaks while someone else does, from `start` to `end`.
-
-        Then its bytes from `start` on are lost; who began at `start` is lost by not being heard.
-        """
-        kept: deque[_Arriving] = deque()
-        collided = False
-        for segment in self._arriving:
-            begins = segment.first - segment.byte_s - self._latency_s
-            ends = segment.last - self._latency_s
-            if begins < end - ROUNDING_S and ends > start + ROUNDING_S:
-                collided = True
-                count = segment.count_by(start + self._latency_s)
-                if count:
-                    kept.append(segment._replace(data=segment.data[:count]))
-            else:
-                kept.append(segment)
-        self._arriving = kept
-        self.collisions += collided
-        return collided
+    def count_collision(self) -> None:
+        """Two servos with one ID have answered at once."""
+        self._wire.collisions += 1

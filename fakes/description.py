@@ -2,7 +2,7 @@
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -10,10 +10,13 @@ from drivers.clock import Clock
 from drivers.packet import MAX_ID
 from fakes.arm import Arm
 from fakes.bus import FakeBus
-from fakes.registers import BAUD_RATES, MODEL_NAMES, load_model
+from fakes.faults import Fault
+from fakes.health import Overload, Thermal
+from fakes.plant import Plant, PlantError, load_plant, make_plant
+from fakes.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from fakes.servo import Servo
+from fakes.supply import Supply
 from fakes.table_errors import describe
-from fakes.two_link import make_plant
 
 
 class DescriptionError(ValueError):
@@ -38,6 +41,13 @@ class FakeServo(BaseModel):
         float | None, Field(gt=0, le=100, description="supply [V]; the model's nominal voltage unless given")
     ] = None
     temperature_c: Annotated[float, Field(ge=0, le=255, description="inside the servo [C]")] = 35.0
+    current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
+    clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="how much too fast its clock runs")] = 0.0
+    voltage_limited: Annotated[
+        bool, Field(description="whether supply voltage and back-EMF limit the current in current mode too")
+    ] = False
+    thermal: Annotated[Thermal | None, Field(description="warmth from the motor's current; none unless given")] = None
+    overload: Annotated[Overload | None, Field(description="when it shuts down by overload; never unless given")] = None
     registers: Annotated[
         dict[str, int], Field(description="other EEPROM registers that are not at their factory value")
     ] = {}
@@ -45,8 +55,9 @@ class FakeServo(BaseModel):
     @field_validator("model")
     @classmethod
     def _known_model(cls, model: str) -> str:
-        if model not in MODEL_NAMES:
-            raise ValueError(f"the fake bus knows {', '.join(MODEL_NAMES)}")
+        if model not in all_model_names():
+            others = ", ".join(all_model_names()[len(MODEL_NAMES) :])
+            raise ValueError(f"the fake bus knows {', '.join(MODEL_NAMES)}; of {others} addresses and sizes at least")
         return model
 
     @field_validator("direction")
@@ -80,23 +91,44 @@ class FakeArm(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    seed: Annotated[int, Field(ge=0, description="of everything random here; nothing is, so far")] = 0
+    seed: Annotated[int, Field(ge=0, description="of noise and faults")] = 0
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="from the wire to the host's read, for every byte [us]")
     ] = 0.0
     servos: Annotated[
         tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")
     ]
-    arm: Annotated[Arm, Field(description="links and drives")]
+    arm: Annotated[Arm | None, Field(description="links and drives")] = None
+    plant: Annotated[
+        str | None, Field(description='"module:factory" of another mechanism instead of arm; see fakes.plant')
+    ] = None
+    plant_options: Annotated[dict[str, Any], Field(description="what the factory is called with")] = {}
+    supply: Annotated[Supply | None, Field(description="resistance of the supply; none unless given")] = None
+    faults: Annotated[tuple[Fault, ...], Field(strict=False, description="what goes wrong, and when")] = ()
 
     @model_validator(mode="after")
     def _one_servo_per_joint(self) -> Self:
         ids = [servo.id for servo in self.servos]
         if len(set(ids)) < len(ids):
             raise ValueError(f"servos: IDs {', '.join(map(str, ids))}: each servo on a bus needs an ID of its own")
-        if len(ids) != len(self.arm.drives):
+        if (self.arm is None) == (self.plant is None):
+            raise ValueError('give either the table arm or plant = "module:factory"')
+        if self.arm is not None and len(ids) != len(self.arm.drives):
             raise ValueError(f"{len(ids)} servos for {len(self.arm.drives)} drives of the arm: one servo per drive")
+        for fault in self.faults:
+            if fault.servo is not None and fault.servo not in ids:
+                raise ValueError(f"faults: {fault.kind} of servo {fault.servo}: the IDs are {', '.join(map(str, ids))}")
         return self
+
+    def make_plant(self) -> Plant:
+        """The mechanism, at its start at time 0; raises PlantError."""
+        if self.arm is not None:
+            return make_plant(self.arm)
+        name = self.plant or ""
+        plant = load_plant(name, self.plant_options)
+        if plant.joints != len(self.servos):
+            raise PlantError(f'plant = "{name}" has {plant.joints} joints for {len(self.servos)} servos')
+        return plant
 
 
 def load_fake(path: Path | str) -> FakeArm:
@@ -119,7 +151,10 @@ def load_fake(path: Path | str) -> FakeArm:
 
 
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
-    """The described servos, switched on at the clock's present time with the arm at rest in its starting pose."""
+    """The described servos, switched on at the clock's present time with the arm at rest in its starting pose.
+
+    Raises PlantError when another plant than an arm is described and cannot be made.
+    """
     servos = [
         Servo(
             load_model(servo.model),
@@ -132,7 +167,22 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
             input_voltage_v=servo.input_voltage_v,
             temperature_c=servo.temperature_c,
             registers=servo.registers,
+            current_noise_a=servo.current_noise_a,
+            clock_error_ppm=servo.clock_error_ppm,
+            voltage_limited=servo.voltage_limited,
+            thermal=servo.thermal,
+            overload=servo.overload,
+            seed=fake.seed,
         )
         for servo in fake.servos
     ]
-    return FakeBus(servos, make_plant(fake.arm), clock, adapter_latency_us=fake.adapter_latency_us)
+    bus = FakeBus(
+        servos,
+        fake.make_plant(),
+        clock,
+        adapter_latency_us=fake.adapter_latency_us,
+        supply=fake.supply,
+        seed=fake.seed,
+    )
+    bus.faults.add(*fake.faults)
+    return bus

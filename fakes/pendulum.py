@@ -14,7 +14,7 @@ class Pendulum:
         (link,) = arm.links
         self._motor = Motor(arm.drives[0])
         self._inertia = link.inertia + link.mass * link.centre**2 + armature(arm.drives[0])
-        self._weight = link.mass * link.centre * arm.gravity
+        self._weight = link.mass * link.centre * arm.weight
         self._time = 0.0
         (self._q,) = arm.start
         (self._v,) = velocity
@@ -35,6 +35,10 @@ class Pendulum:
     @property
     def current(self) -> tuple[float]:
         return (self._motor.current,)
+
+    def jam(self, joint: int, jammed: bool) -> None:
+        """Hold the joint fast, or let it go."""
+        self._motor.jammed = jammed
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time

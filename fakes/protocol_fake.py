@@ -1,4 +1,4 @@
-"""The pyserial URL `fake://PATH/TO/ARM.toml`: a serial port behind which a fake arm hangs, in virtual time.
+"""The pyserial URL `fake://PATH/TO/ARM.toml`: a serial port with a fake arm behind it, in virtual or real time.
 
 After `fakes.register()`, `serial.serial_for_url("fake://configs/fake_two_link.toml")` opens the arm of that file's
 [fake] table; a path without a leading slash is relative to the working directory. `open_fake` does the same from Python
@@ -6,21 +6,36 @@ without a file. pyserial finds this module by its name.
 
 Everything happens on `port.clock`: a program that waits must wait on that clock (or in `read`), because wall-clock time
 does not move the arm. In particular dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
-sees no answers.
+sees no answers. With `fake://PATH/TO/ARM.toml?time=real` the arm lives in real time and any program will do.
+
+A pulled cable (see `fakes.faults`) fails as on Linux: writing and reading raise `serial.SerialException`,
+`reset_input_buffer` raises `termios.error`. The port then has to be closed and, once the cable is back, opened again.
 """
 
+import errno
 import math
+import os
+import termios
 from pathlib import Path
 
 import serial
 from serial.serialutil import SerialBase
 
-from drivers.clock import Clock
+from drivers.clock import Clock, WallClock
 from fakes.bus import FakeBus
 from fakes.clock import VirtualClock
 from fakes.description import DescriptionError, FakeArm, load_fake, make_bus
+from fakes.plant import PlantError
 
 SCHEME = "fake://"
+REAL_TIME = "?time=real"
+
+
+class _Unplugged(serial.SerialException):
+    """The cable was pulled since the port was opened."""
+
+    def __init__(self) -> None:
+        super().__init__(f"[Errno {errno.EIO}] {os.strerror(errno.EIO)}: the fake adapter was unplugged")
 
 
 class FakeSerial(SerialBase):
@@ -41,8 +56,10 @@ class FakeSerial(SerialBase):
         **kwargs: object,
     ) -> None:
         self._description = description
-        self.clock: Clock = clock or VirtualClock()
+        real = isinstance(port, str) and port.endswith(REAL_TIME)
+        self.clock: Clock = clock or (WallClock() if real else VirtualClock())
         self._bus: FakeBus | None = None
+        self._pulls = 0
         super().__init__(port, *args, **kwargs)  # type: ignore[arg-type]  # pyserial's long list of settings
 
     @property
@@ -58,15 +75,18 @@ class FakeSerial(SerialBase):
             raise serial.SerialException(f"{self.name or SCHEME} is already open")
         if self._bus is None:
             self._bus = self._build()
+        self._bus.notice_faults()
+        if self._bus.cable_is_out:
+            raise serial.SerialException(f"could not open port {self.name or SCHEME}: the cable is pulled")
+        self._pulls = self._bus.pulls
         self._reconfigure_port()
         self.is_open = True
 
     def _build(self) -> FakeBus:
         try:
-            description = self._description or load_fake(_path(self.port))
-        except (DescriptionError, OSError) as error:
+            return make_bus(self._description or load_fake(_path(self.port)), self.clock)
+        except (DescriptionError, PlantError, OSError) as error:
             raise serial.SerialException(str(error)) from error
-        return make_bus(description, self.clock)
 
     def close(self) -> None:
         self.is_open = False
@@ -91,7 +111,10 @@ class FakeSerial(SerialBase):
                 f"reading {size} bytes without a timeout would wait for ever: "
                 f"{bus.on_the_way} are there or on their way; set a timeout"
             )
-        return bus.read(size, math.inf if timeout is None else timeout)
+        taken = bus.read(size, math.inf if timeout is None else timeout)
+        if len(taken) < size and self._pulls != bus.pulls:
+            raise _Unplugged
+        return taken
 
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
         """Put bytes on the wire; returns at once, as a driver with a buffer does."""
@@ -109,7 +132,11 @@ class FakeSerial(SerialBase):
 
     def reset_input_buffer(self) -> None:
         """Drop what has arrived. Bytes still on the wire are not dropped: they arrive later."""
-        self._open_bus().discard_input()
+        try:
+            bus = self._open_bus()
+        except _Unplugged as error:
+            raise termios.error(errno.EIO, os.strerror(errno.EIO)) from error  # as a real port does
+        bus.discard_input()
 
     def reset_output_buffer(self) -> None:
         """Do nothing but check that the port is open: what was written is already on its way."""
@@ -118,6 +145,9 @@ class FakeSerial(SerialBase):
     def _open_bus(self) -> FakeBus:
         if not self.is_open or self._bus is None:
             raise serial.PortNotOpenError
+        self._bus.notice_faults()
+        if self._pulls != self._bus.pulls:
+            raise _Unplugged
         return self._bus
 
     def _update_rts_state(self) -> None:
@@ -145,7 +175,9 @@ def serial_class_for_url(url: str) -> tuple[str, type[FakeSerial]]:
 
 
 def _path(url: str | None) -> Path:
-    path = (url or "").removeprefix(SCHEME)
+    path = (url or "").removeprefix(SCHEME).removesuffix(REAL_TIME)
     if not path:
         raise DescriptionError(f'"{url or ""}" names no file: write {SCHEME}PATH/TO/ARM.toml')
+    if "?" in path:
+        raise DescriptionError(f'"{url}": behind the path only "{REAL_TIME}" is allowed')
     return Path(path)

@@ -1,31 +1,29 @@
 """Control tables of the fake servos: what each register is, where it lies, what may be written to it.
 
-Addresses, sizes and signs come from `drivers.control_table`. Area, access, factory values and ranges are not known
-there; they are written down here, from the control tables of the ROBOTIS e-Manual (pages x/<model>). Two
-entries differ from what some revisions of those pages print: the Min Voltage Limit's range, given there as 110 to 300
-around a factory value of 95, is 95 to 160 as on the sister models; and Protocol Type accepts 2 alone, because a fake
-servo speaks nothing else.
+Addresses, sizes and signs come from `drivers.control_table`; area, access, factory values and ranges from
+`fakes.model_facts`. Indirect addresses and data, Startup Configuration and Backup Ready, which the SDK's tables leave
+out, are added here from the e-Manual (pages x/<model>). On the 330 series the indirect data begin at 208, as that
+manual and the SDK's file for firmware 52 say; the SDK's file for older firmware says 224: unsure.
 
-Indirect addresses and data (168 and up) are not part of these tables yet: reading them is an Access error.
+A model outside the X series answers with what its table in the SDK says: its registers hold what is written to them,
+within their size, and its motor does not move.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 
-from drivers.control_table import load_control_table
-
-EEPROM_END = 64
-"""First address of the RAM area on every X-series servo."""
-
-INDIRECT_START = 168
-"""First address that is not modelled: the indirect addresses."""
+from drivers.control_table import load_control_table, model_names
+from fakes.model_facts import FACTS, NEVER, STANDS_FOR, X_SERIES, ModelFacts, RegisterFacts
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud by the value of the register Baud Rate. The 330 models end at 4 M."""
 
 TICKS_PER_TURN = 4096
 VELOCITY_UNIT_RPM = 0.229
+
+_ADDED = (("Startup Configuration", 60, 1), ("Backup Ready", 147, 1))
+_NOT_WRITABLE = ("Present", "Model", "Firmware", "Moving Status", "Hardware Error", "Realtime", "Registered")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,182 +50,51 @@ class Model:
     current_unit_a: float
     """Ampere per tick of Goal Current and Present Current; 0 where the model senses no current."""
     operating_modes: frozenset[int]
+    """Empty where nothing is known of the motor: it then never moves."""
     fast_read_firmware: int
-    """First firmware that knows Fast Sync Read."""
+    """First firmware that knows Fast Sync Read, Fast Bulk Read and Control Table Backup."""
     nominal_voltage_v: float
+    resistance_ohm: float
+    back_emf_v_s: float
+    """Voltage per velocity of the output shaft [V s/rad]."""
+    senses_supply: bool
+    indirect: tuple[tuple[int, int, int], ...]
+    """Blocks of indirect addressing: first address register, first data register, how many."""
     registers: Mapping[str, Register]
 
 
-@dataclass(frozen=True, slots=True)
-class _Facts:
-    """What `drivers.control_table` does not say about one register. `limits` None: everything its bytes can hold."""
-
-    initial: int = 0
-    limits: tuple[int, int] | None = None
-    writable: bool = True
+MODEL_NAMES = tuple(FACTS)
+"""Servo models whose factory values and ranges are known."""
 
 
-_GAIN = (0, 16_383)
-_READ_ONLY = _Facts(writable=False)
-
-_X_SERIES: dict[str, _Facts] = {
-    "Model Number": _READ_ONLY,
-    "Model Information": _READ_ONLY,
-    "Firmware Version": _READ_ONLY,
-    "ID": _Facts(1, (0, 252)),
-    "Baud Rate": _Facts(1, (0, 7)),
-    "Return Delay Time": _Facts(250, (0, 254)),
-    "Drive Mode": _Facts(0, (0, 13)),
-    "Operating Mode": _Facts(3, (0, 16)),
-    "Secondary(Shadow) ID": _Facts(255),
-    "Protocol Type": _Facts(2, (2, 2)),
-    "Homing Offset": _Facts(0, (-1_044_479, 1_044_479)),
-    "Moving Threshold": _Facts(10, (0, 1023)),
-    "Temperature Limit": _Facts(80, (0, 100)),
-    "Max Voltage Limit": _Facts(160, (95, 160)),
-    "Min Voltage Limit": _Facts(95, (95, 160)),
-    "PWM Limit": _Facts(885, (0, 885)),
-    "Current Limit": _Facts(1193, (0, 1193)),
-    "Velocity Limit": _Facts(200, (0, 1023)),
-    "Max Position Limit": _Facts(4095, (0, 4095)),
-    "Min Position Limit": _Facts(0, (0, 4095)),
-    "External Port Mode 1": _Facts(3, (0, 3)),
-    "External Port Mode 2": _Facts(3, (0, 3)),
-    "External Port Mode 3": _Facts(3, (0, 3)),
-    "PWM Slope": _Facts(140, (1, 255)),
-    "Shutdown": _Facts(52),
-    "Torque Enable": _Facts(0, (0, 1)),
-    "LED": _Facts(0, (0, 1)),
-    "Status Return Level": _Facts(2, (0, 2)),
-    "Registered Instruction": _READ_ONLY,
-    "Hardware Error Status": _READ_ONLY,
-    "Velocity I Gain": _Facts(1920, _GAIN),
-    "Velocity P Gain": _Facts(100, _GAIN),
-    "Position D Gain": _Facts(0, _GAIN),
-    "Position I Gain": _Facts(0, _GAIN),
-    "Position P Gain": _Facts(800, _GAIN),
-    "Feedforward 2nd Gain": _Facts(0, _GAIN),
-    "Feedforward 1st Gain": _Facts(0, _GAIN),
-    "Bus Watchdog": _Facts(0, (0, 127)),
-    "Goal PWM": _Facts(),
-    "Goal Current": _Facts(),
-    "Goal Velocity": _Facts(),
-    "Profile Acceleration": _Facts(0, (0, 32_767)),
-    "Profile Velocity": _Facts(0, (0, 32_767)),
-    "Goal Position": _Facts(),
-    "Realtime Tick": _READ_ONLY,
-    "Moving": _READ_ONLY,
-    "Moving Status": _READ_ONLY,
-    "Present PWM": _READ_ONLY,
-    "Present Current": _READ_ONLY,
-    "Present Load": _READ_ONLY,
-    "Present Velocity": _READ_ONLY,
-    "Present Position": _READ_ONLY,
-    "Velocity Trajectory": _READ_ONLY,
-    "Position Trajectory": _READ_ONLY,
-    "Present Input Voltage": _READ_ONLY,
-    "Present Temperature": _READ_ONLY,
-    "External Port Data 1": _Facts(0),
-    "External Port Data 2": _Facts(0),
-    "External Port Data 3": _Facts(0),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class _ModelFacts:
-    current_unit_a: float
-    fast_read_firmware: int
-    differs: Mapping[str, _Facts] = field(default_factory=dict)
-    operating_modes: frozenset[int] = frozenset({0, 1, 3, 4, 5, 16})
-    nominal_voltage_v: float = 12.0
-
-
-_MODELS: dict[str, _ModelFacts] = {
-    "XM430-W350": _ModelFacts(2.69e-3, 45),
-    "XM430-W210": _ModelFacts(2.69e-3, 45, {"Velocity Limit": _Facts(330, (0, 1023))}),
-    "XH430-W350": _ModelFacts(
-        2.69e-3,
-        45,
-        {
-            "Current Limit": _Facts(648, (0, 648)),
-            "Velocity Limit": _Facts(130, (0, 1023)),
-            "Position P Gain": _Facts(900, _GAIN),
-        },
-    ),
-    "XM540-W270": _ModelFacts(
-        2.69e-3,
-        45,
-        {"Current Limit": _Facts(2047, (0, 2047)), "Velocity Limit": _Facts(128, (0, 1023))},
-    ),
-    "XL330-M288": _ModelFacts(
-        1.0e-3,
-        46,
-        {
-            "Baud Rate": _Facts(1, (0, 6)),
-            "Temperature Limit": _Facts(70, (0, 100)),
-            "Max Voltage Limit": _Facts(70, (31, 70)),
-            "Min Voltage Limit": _Facts(35, (31, 70)),
-            "Current Limit": _Facts(1750, (0, 1750)),
-            "Velocity Limit": _Facts(445, (0, 2047)),
-            "Shutdown": _Facts(53),
-            "Velocity I Gain": _Facts(1600, _GAIN),
-            "Velocity P Gain": _Facts(180, _GAIN),
-            "Position P Gain": _Facts(400, _GAIN),
-        },
-        nominal_voltage_v=5.0,
-    ),
-    "XC330-T288": _ModelFacts(
-        1.0e-3,
-        46,
-        {
-            "Baud Rate": _Facts(1, (0, 6)),
-            "Temperature Limit": _Facts(70, (0, 100)),
-            "Max Voltage Limit": _Facts(140, (55, 140)),
-            "Min Voltage Limit": _Facts(55, (55, 140)),
-            "Current Limit": _Facts(910, (0, 910)),
-            "Velocity Limit": _Facts(320, (0, 2047)),
-            "PWM Slope": _Facts(255, (1, 255)),
-            "Velocity I Gain": _Facts(1200, _GAIN),
-            "Velocity P Gain": _Facts(40, _GAIN),
-            "Position P Gain": _Facts(900, _GAIN),
-        },
-        nominal_voltage_v=11.1,
-    ),
-    "XL430-W250": _ModelFacts(
-        0.0,
-        45,
-        {
-            "Temperature Limit": _Facts(72, (0, 100)),
-            "Max Voltage Limit": _Facts(140, (60, 140)),
-            "Min Voltage Limit": _Facts(60, (60, 140)),
-            "Velocity Limit": _Facts(265, (0, 1023)),
-            "Velocity I Gain": _Facts(1000, _GAIN),
-            "Position D Gain": _Facts(4000, _GAIN),
-            "Position P Gain": _Facts(640, _GAIN),
-        },
-        operating_modes=frozenset({1, 3, 4, 16}),
-        nominal_voltage_v=11.1,
-    ),
-}
-
-MODEL_NAMES = tuple(_MODELS)
-"""Servo models that the fake knows."""
+def all_model_names() -> tuple[str, ...]:
+    """Every model that a fake servo can be: those of `MODEL_NAMES` first, then the others of the SDK's tables."""
+    return (*MODEL_NAMES, *sorted(name for name in model_names().values() if name not in FACTS))
 
 
 @cache
 def load_model(name: str) -> Model:
     """The control table of one model, e.g. "XM430-W350".
 
-    Raises KeyError when the fake does not know the model; `MODEL_NAMES` lists those it knows.
+    Raises KeyError when no table describes the model; `all_model_names` lists those that are.
     """
-    facts = _MODELS[name]
-    table = _X_SERIES | dict(facts.differs)
+    if name not in model_names().values():
+        raise KeyError(name)
+    facts = FACTS.get(STANDS_FOR.get(name, name))
+    return _x_series(name, facts) if facts is not None else _unknown(name)
+
+
+def _x_series(name: str, facts: ModelFacts) -> Model:
+    table = {**X_SERIES, **facts.differs}
     addresses = load_control_table(name)
-    registers = {
-        entry.name: _register(entry.name, entry.address, entry.size, entry.signed, table[entry.name])
+    registers = [
+        _register(entry.name, entry.address, entry.size, entry.signed, table.get(entry.name, RegisterFacts()))
         for entry in addresses.registers.values()
-        if entry.address < INDIRECT_START
-    }
+        if not entry.name.startswith("Indirect")
+    ]
+    known = {register.name for register in registers}
+    registers += [_register(*added, False, table[added[0]]) for added in _ADDED if added[0] not in known]
+    registers += _indirect_registers(facts.indirect)
     return Model(
         name=name,
         number=addresses.number,
@@ -235,11 +102,60 @@ def load_model(name: str) -> Model:
         operating_modes=facts.operating_modes,
         fast_read_firmware=facts.fast_read_firmware,
         nominal_voltage_v=facts.nominal_voltage_v,
+        resistance_ohm=facts.resistance_ohm,
+        back_emf_v_s=facts.back_emf_v_s,
+        senses_supply=facts.senses_supply,
+        indirect=facts.indirect,
+        registers={register.name: register for register in sorted(registers, key=lambda r: r.address)},
+    )
+
+
+def _indirect_registers(blocks: tuple[tuple[int, int, int], ...]) -> Iterator[Register]:
+    last = max(data + count - 1 for _, data, count in blocks)
+    number = 0
+    for first_address, first_data, count in blocks:
+        for index in range(count):
+            number += 1
+            data = first_data + index
+            points = RegisterFacts(data, (64, last))  # at its own data register, until it is set
+            yield _register(f"Indirect Address {number}", first_address + 2 * index, 2, False, points)
+            yield _register(f"Indirect Data {number}", data, 1, False, RegisterFacts())
+
+
+def _unknown(name: str) -> Model:
+    """A model of which only addresses and sizes are known."""
+    addresses = load_control_table(name)
+    torque = addresses.registers.get("Torque Enable")
+    ram = torque.address if torque is not None else 64
+    taken: set[int] = set()
+    registers = {}
+    for entry in addresses.registers.values():
+        span = set(range(entry.address, entry.address + entry.size))
+        if span & taken:
+            continue  # the SDK's second name for the same bytes
+        taken |= span
+        facts = RegisterFacts(
+            initial={"ID": 1, "Baud Rate": 1, "Status Return Level": 2}.get(entry.name, 0),
+            limits=(0, 252) if entry.name == "ID" else None,
+            writable=not entry.name.startswith(_NOT_WRITABLE),
+        )
+        registers[entry.name] = _register(entry.name, entry.address, entry.size, entry.signed, facts, ram)
+    return Model(
+        name=name,
+        number=addresses.number,
+        current_unit_a=0.0,
+        operating_modes=frozenset(),
+        fast_read_firmware=NEVER,
+        nominal_voltage_v=12.0,
+        resistance_ohm=1.0,
+        back_emf_v_s=1.0,
+        senses_supply=False,
+        indirect=(),
         registers=registers,
     )
 
 
-def _register(name: str, address: int, size: int, signed: bool, facts: _Facts) -> Register:
+def _register(name: str, address: int, size: int, signed: bool, facts: RegisterFacts, ram: int = 64) -> Register:
     bits = 8 * size
     everything = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     minimum, maximum = facts.limits or everything
@@ -248,7 +164,7 @@ def _register(name: str, address: int, size: int, signed: bool, facts: _Facts) -
         address=address,
         size=size,
         signed=signed,
-        eeprom=address < EEPROM_END,
+        eeprom=address < ram,
         writable=facts.writable,
         initial=facts.initial,
         minimum=minimum,

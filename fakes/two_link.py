@@ -18,17 +18,10 @@ joint's velocity changes sign is cut at the crossing.
 """
 
 from collections.abc import Sequence
-from math import ceil, cos, sin
+from math import ceil, cos, exp, sin
 
 from fakes.arm import Arm, Link, armature
 from fakes.motor import SHORTEST_STEP, Motor
-from fakes.pendulum import Pendulum
-from fakes.plant import Plant
-
-
-def make_plant(arm: Arm) -> Plant:
-    """The plant of this arm, at rest in its starting pose at time 0."""
-    return Pendulum(arm) if len(arm.links) == 1 else TwoLink(arm)
 
 
 class TwoLink:
@@ -41,10 +34,10 @@ class TwoLink:
         self._inertia_first = _about_joint(first) + beyond * first.length**2
         self._inertia_second = _about_joint(second)
         self._swing = second.mass * first.length * second.centre
-        self._armature_1 = armature(arm.drives[0])
-        self._armature_2 = armature(arm.drives[1])
-        self._weight_first = (first.mass * first.centre + beyond * first.length) * arm.gravity
-        self._weight_second = second.mass * second.centre * arm.gravity
+        self._turned_first = self._inertia_first + armature(arm.drives[0])
+        self._turned_second = self._inertia_second + armature(arm.drives[1])
+        self._weight_first = (first.mass * first.centre + beyond * first.length) * arm.weight
+        self._weight_second = second.mass * second.centre * arm.weight
         self._longest_step = min(motor.longest_step for motor in self._motors)
         self._time = 0.0
         self._q1, self._q2 = arm.start
@@ -67,78 +60,105 @@ class TwoLink:
     def current(self) -> tuple[float, float]:
         return self._motors[0].current, self._motors[1].current
 
+    def jam(self, joint: int, jammed: bool) -> None:
+        """Hold a joint fast, or let it go."""
+        self._motors[joint].jammed = jammed
+
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
         if remaining <= 0.0:
             return
         self._time = until
-        i1, i2 = current
-        longest = remaining / ceil(remaining / self._longest_step)
-        while remaining > SHORTEST_STEP:
-            step = longest if longest < remaining else remaining
-            taken = self._step(step, i1, i2, True)
-            if taken < step:
-                self._step(step - taken, i1, i2, False)
-            remaining -= step
+        self._run(remaining, remaining / ceil(remaining / self._longest_step), *current)
 
-    def _step(self, step: float, i1: float, i2: float, cut: bool) -> float:
-        """Take one step and return its length.
+    def _run(self, remaining: float, longest: float, i1: float, i2: float) -> None:  # noqa: PLR0915
+        """Take steps of at most `longest` [s] through `remaining` [s] under commanded currents [A].
 
-        With `cut`, a step in which a joint's velocity changes sign is taken only up to there.
+        One long loop on plain local floats, because this is where a fake arm spends its time: as a function per step it
+        takes half as long again. A step in which a joint's velocity changes sign is first taken up to there (`cut`).
         """
         motor_1, motor_2 = self._motors
-        half = 0.5 * step
-        v1 = self._v1
-        v2 = self._v2
-        middle_v1 = v1 + half * self._a1 if v1 else 0.0
-        middle_v2 = v2 + half * self._a2 if v2 else 0.0
-        q1 = self._q1 + half * v1
-        q2 = self._q2 + half * v2
-        push_1, level_1, slope_1, current_1 = motor_1.push(step, i1, q1, middle_v1)
-        push_2, level_2, slope_2, current_2 = motor_2.push(step, i2, q2, middle_v2)
+        plain = motor_1.is_plain and motor_2.is_plain
+        kt_1, offset_1, coulomb_1, rise_1, per_v1 = motor_1.constants
+        kt_2, offset_2, coulomb_2, rise_2, per_v2 = motor_2.constants
+        amp_1, amp_2 = motor_1.current, motor_2.current
+        slope_1 = slope_2 = prepared = 0.0
+        viscous_1, viscous_2 = motor_1.viscous, motor_2.viscous
+        swing, inertia_second = self._swing, self._inertia_second
+        turned_first, turned_second = self._turned_first, self._turned_second
+        weight_first, weight_second = self._weight_first, self._weight_second
+        q1, q2, v1, v2, a1, a2 = self._q1, self._q2, self._v1, self._v2, self._a1, self._a2
+        cut = rest = 0.0
+        while remaining > SHORTEST_STEP:
+            step = cut or rest or (longest if longest < remaining else remaining)
+            half = 0.5 * step
+            middle_v1 = v1 + half * a1 if v1 else 0.0
+            middle_v2 = v2 + half * a2 if v2 else 0.0
+            middle_q1 = q1 + half * v1
+            middle_q2 = q2 + half * v2
+            if plain:  # as Motor.push has it
+                if step != prepared:
+                    prepared = step
+                    left_1, mean_1 = motor_1.lag(step)
+                    left_2, mean_2 = motor_2.lag(step)
+                away_1, away_2 = amp_1 - i1, amp_2 - i2
+                ratio_1, ratio_2 = middle_v1 * per_v1, middle_v2 * per_v2
+                push_1 = kt_1 * (i1 + away_1 * mean_1) - offset_1
+                push_2 = kt_2 * (i2 + away_2 * mean_2) - offset_2
+                level_1 = coulomb_1 + rise_1 * exp(-ratio_1 * ratio_1)
+                level_2 = coulomb_2 + rise_2 * exp(-ratio_2 * ratio_2)
+                next_amp_1, next_amp_2 = i1 + away_1 * left_1, i2 + away_2 * left_2
+            else:
+                push_1, level_1, slope_1, next_amp_1 = motor_1.push(step, i1, middle_q1, middle_v1)
+                push_2, level_2, slope_2, next_amp_2 = motor_2.push(step, i2, middle_q2, middle_v2)
 
-        across = self._swing * cos(q2)
-        m12 = self._inertia_second + across
-        m11 = self._inertia_first + self._armature_1 + across + m12
-        m22 = self._inertia_second + self._armature_2
-        turning = self._swing * sin(q2)
-        w1 = middle_v1
-        w2 = middle_v1 + middle_v2
-        weight_2 = self._weight_second * cos(q1 + q2)
-        force_1 = push_1 + turning * (w2 * w2 - w1 * w1) - self._weight_first * cos(q1) - weight_2
-        force_2 = push_2 - turning * w1 * w1 - weight_2
+            across = swing * cos(middle_q2)
+            turning = swing * sin(middle_q2)
+            weight_2 = weight_second * cos(middle_q1 + middle_q2)
+            w2 = middle_v1 + middle_v2
+            force_1 = push_1 + turning * (w2 * w2 - middle_v1 * middle_v1) - weight_first * cos(middle_q1) - weight_2
+            force_2 = push_2 - turning * middle_v1 * middle_v1 - weight_2
 
-        # Viscous friction at the mean of old and new velocity, smooth friction linearised about the middle:
-        # (M + D) new = (M - D) v + step (force + slope middle_v) - dry, with D = step / 2 (viscous + slope).
-        damp_1 = half * (motor_1.viscous + slope_1)
-        damp_2 = half * (motor_2.viscous + slope_2)
-        b1 = (m11 - damp_1) * v1 + m12 * v2 + step * (force_1 + slope_1 * middle_v1)
-        b2 = m12 * v1 + (m22 - damp_2) * v2 + step * (force_2 + slope_2 * middle_v2)
-        m11 += damp_1
-        m22 += damp_2
-        dry_1 = step * level_1
-        dry_2 = step * level_2
-        # First as if both joints went on sliding the way they do.
-        slid_1 = b1 - dry_1 if v1 > 0.0 else b1 + dry_1
-        slid_2 = b2 - dry_2 if v2 > 0.0 else b2 + dry_2
-        determinant = m11 * m22 - m12 * m12
-        new_1 = (m22 * slid_1 - m12 * slid_2) / determinant
-        new_2 = (m11 * slid_2 - m12 * slid_1) / determinant
-        if (level_1 or level_2) and (new_1 * v1 <= 0.0 or new_2 * v2 <= 0.0):
+            # Viscous friction at the mean of old and new velocity, smooth friction linearised about the middle:
+            # (M + D) new = (M - D) v + step (force + slope middle_v) - dry, with D = step / 2 (viscous + slope).
+            m12 = inertia_second + across
+            m11 = turned_first + across + m12
+            damp_1 = half * (viscous_1 + slope_1)
+            damp_2 = half * (viscous_2 + slope_2)
+            b1 = (m11 - damp_1) * v1 + m12 * v2 + step * (force_1 + slope_1 * middle_v1)
+            b2 = m12 * v1 + (turned_second - damp_2) * v2 + step * (force_2 + slope_2 * middle_v2)
+            m11 += damp_1
+            m22 = turned_second + damp_2
+            dry_1 = step * level_1
+            dry_2 = step * level_2
+            # First as if both joints went on sliding the way they do.
+            slid_1 = b1 - dry_1 if v1 > 0.0 else b1 + dry_1
+            slid_2 = b2 - dry_2 if v2 > 0.0 else b2 + dry_2
+            determinant = m11 * m22 - m12 * m12
+            new_1 = (m22 * slid_1 - m12 * slid_2) / determinant
+            new_2 = (m11 * slid_2 - m12 * slid_1) / determinant
+            if (new_1 * v1 <= 0.0 or new_2 * v2 <= 0.0) and (level_1 or level_2):
+                if not cut and not rest:
+                    cut = step * min(_until_zero(v1, new_1), _until_zero(v2, new_2))
+                    if SHORTEST_STEP < cut < step - SHORTEST_STEP:
+                        rest = step - cut
+                        continue
+                    cut = 0.0
+                new_1, new_2 = _sticking((m11, m12, m22), (b1, b2), (dry_1, dry_2), (new_1, new_2))
+            a1 = (new_1 - v1) / step
+            a2 = (new_2 - v2) / step
+            v1 = new_1
+            v2 = new_2
+            q1 = middle_q1 + half * new_1
+            q2 = middle_q2 + half * new_2
+            motor_1.current = amp_1 = next_amp_1
+            motor_2.current = amp_2 = next_amp_2
+            remaining -= step
             if cut:
-                shorter = step * min(_until_zero(v1, new_1), _until_zero(v2, new_2))
-                if SHORTEST_STEP < shorter < step - SHORTEST_STEP:
-                    return self._step(shorter, i1, i2, False)
-            new_1, new_2 = _sticking((m11, m12, m22), (b1, b2), (dry_1, dry_2), (new_1, new_2))
-        self._a1 = (new_1 - v1) / step
-        self._a2 = (new_2 - v2) / step
-        self._v1 = new_1
-        self._v2 = new_2
-        self._q1 = q1 + half * new_1
-        self._q2 = q2 + half * new_2
-        motor_1.current = current_1
-        motor_2.current = current_2
-        return step
+                cut = 0.0
+            elif rest:
+                rest = 0.0
+        self._q1, self._q2, self._v1, self._v2, self._a1, self._a2 = q1, q2, v1, v2, a1, a2
 
 
 def _about_joint(link: Link) -> float:

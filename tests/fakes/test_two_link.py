@@ -12,7 +12,8 @@ from pydantic import ValidationError
 from estimator.arm_model import inverse_dynamics, parameter_names
 from fakes.arm import Arm, armature, base_parameters
 from fakes.pendulum import Pendulum
-from fakes.two_link import TwoLink, make_plant
+from fakes.plant import make_plant
+from fakes.two_link import TwoLink
 
 LINKS = (
     {"length": 0.147, "mass": 0.180, "centre": 0.081, "inertia": 7.0e-4},

@@ -1,0 +1,215 @@
+"""What the SDK's control tables leave out: access, factory values and ranges of registers, and the motors' electrics.
+
+Source: ROBOTIS e-Manual, pages x/<model> (revisions of 2020 to 2024). Three entries differ from what some revisions
+print: the Min Voltage Limit's range, given there as 110 to 300 around a factory value of 95, is 95 to 160 as on the
+sister models; Protocol Type accepts 2 alone, because a fake servo speaks nothing else; and Drive Mode accepts bit 3
+(Torque On by Goal Update), which the XL430-W250's page has and the others' older revisions do not.
+
+Resistance and back-EMF follow from stall current and no-load speed at the nominal voltage: good to some ten percent,
+enough to make a position move look right. The XC330-T288's stall current is unsure.
+
+A model without facts of its own is given a sister's, named in `STANDS_FOR`: its factory values and ranges are unsure.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterFacts:
+    """What the control table does not say about one register. `limits` None: everything its bytes can hold."""
+
+    initial: int = 0
+    limits: tuple[int, int] | None = None
+    writable: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class ModelFacts:
+    """What distinguishes one model. Units: A per tick, V, ohm, V s/rad at the output shaft."""
+
+    current_unit_a: float
+    fast_read_firmware: int
+    resistance_ohm: float
+    back_emf_v_s: float
+    differs: Mapping[str, RegisterFacts] = field(default_factory=dict)
+    operating_modes: frozenset[int] = frozenset({0, 1, 3, 4, 5, 16})
+    nominal_voltage_v: float = 12.0
+    senses_supply: bool = False
+    """Whether Present Current is the supply's current and not the motor's (330 series)."""
+    indirect: tuple[tuple[int, int, int], ...] = ((168, 224, 28), (578, 634, 28))
+    """Blocks of indirect addressing: first address register, first data register, how many."""
+
+
+_Facts = RegisterFacts
+_GAIN = (0, 16_383)
+_READ_ONLY = _Facts(writable=False)
+NEVER = 256
+"""A firmware that no servo has."""
+
+X_SERIES: Mapping[str, RegisterFacts] = {
+    "Model Number": _READ_ONLY,
+    "Model Information": _READ_ONLY,
+    "Firmware Version": _READ_ONLY,
+    "ID": _Facts(1, (0, 252)),
+    "Baud Rate": _Facts(1, (0, 7)),
+    "Return Delay Time": _Facts(250, (0, 254)),
+    "Drive Mode": _Facts(0, (0, 13)),
+    "Operating Mode": _Facts(3, (0, 16)),
+    "Secondary(Shadow) ID": _Facts(255),
+    "Protocol Type": _Facts(2, (2, 2)),
+    "Homing Offset": _Facts(0, (-1_044_479, 1_044_479)),
+    "Moving Threshold": _Facts(10, (0, 1023)),
+    "Temperature Limit": _Facts(80, (0, 100)),
+    "Max Voltage Limit": _Facts(160, (95, 160)),
+    "Min Voltage Limit": _Facts(95, (95, 160)),
+    "PWM Limit": _Facts(885, (0, 885)),
+    "Current Limit": _Facts(1193, (0, 1193)),
+    "Velocity Limit": _Facts(200, (0, 1023)),
+    "Max Position Limit": _Facts(4095, (0, 4095)),
+    "Min Position Limit": _Facts(0, (0, 4095)),
+    "External Port Mode 1": _Facts(3, (0, 3)),
+    "External Port Mode 2": _Facts(3, (0, 3)),
+    "External Port Mode 3": _Facts(3, (0, 3)),
+    "Startup Configuration": _Facts(0, (0, 3)),
+    "PWM Slope": _Facts(140, (1, 255)),
+    "Shutdown": _Facts(52),
+    "Torque Enable": _Facts(0, (0, 1)),
+    "LED": _Facts(0, (0, 1)),
+    "Status Return Level": _Facts(2, (0, 2)),
+    "Registered Instruction": _READ_ONLY,
+    "Hardware Error Status": _READ_ONLY,
+    "Velocity I Gain": _Facts(1920, _GAIN),
+    "Velocity P Gain": _Facts(100, _GAIN),
+    "Position D Gain": _Facts(0, _GAIN),
+    "Position I Gain": _Facts(0, _GAIN),
+    "Position P Gain": _Facts(800, _GAIN),
+    "Feedforward 2nd Gain": _Facts(0, _GAIN),
+    "Feedforward 1st Gain": _Facts(0, _GAIN),
+    "Bus Watchdog": _Facts(0, (0, 127)),
+    "Goal PWM": _Facts(),
+    "Goal Current": _Facts(),
+    "Goal Velocity": _Facts(),
+    "Profile Acceleration": _Facts(0, (0, 32_767)),
+    "Profile Velocity": _Facts(0, (0, 32_767)),
+    "Goal Position": _Facts(),
+    "Realtime Tick": _READ_ONLY,
+    "Moving": _READ_ONLY,
+    "Moving Status": _READ_ONLY,
+    "Present PWM": _READ_ONLY,
+    "Present Current": _READ_ONLY,
+    "Present Load": _READ_ONLY,
+    "Present Velocity": _READ_ONLY,
+    "Present Position": _READ_ONLY,
+    "Velocity Trajectory": _READ_ONLY,
+    "Position Trajectory": _READ_ONLY,
+    "Present Input Voltage": _READ_ONLY,
+    "Present Temperature": _READ_ONLY,
+    "Backup Ready": _READ_ONLY,
+}
+
+_330 = {
+    "Baud Rate": _Facts(1, (0, 6)),
+    "Temperature Limit": _Facts(70, (0, 100)),
+}
+
+FACTS: Mapping[str, ModelFacts] = {
+    "XM430-W350": ModelFacts(2.69e-3, 45, 5.2, 2.49),
+    "XM430-W210": ModelFacts(2.69e-3, 45, 5.2, 1.49, {"Velocity Limit": _Facts(330, (0, 1023))}),
+    "XH430-W350": ModelFacts(
+        2.69e-3,
+        45,
+        9.2,
+        3.82,
+        {
+            "Current Limit": _Facts(648, (0, 648)),
+            "Velocity Limit": _Facts(130, (0, 1023)),
+            "Position P Gain": _Facts(900, _GAIN),
+        },
+    ),
+    "XM540-W270": ModelFacts(
+        2.69e-3,
+        45,
+        2.7,
+        3.82,
+        {"Current Limit": _Facts(2047, (0, 2047)), "Velocity Limit": _Facts(128, (0, 1023))},
+    ),
+    "XL330-M288": ModelFacts(
+        1.0e-3,
+        46,
+        3.4,
+        0.464,
+        {
+            **_330,
+            "Max Voltage Limit": _Facts(70, (31, 70)),
+            "Min Voltage Limit": _Facts(35, (31, 70)),
+            "Current Limit": _Facts(1750, (0, 1750)),
+            "Velocity Limit": _Facts(445, (0, 2047)),
+            "Shutdown": _Facts(53),
+            "Velocity I Gain": _Facts(1600, _GAIN),
+            "Velocity P Gain": _Facts(180, _GAIN),
+            "Position P Gain": _Facts(400, _GAIN),
+        },
+        nominal_voltage_v=5.0,
+        indirect=((168, 208, 20),),
+    ),
+    "XC330-T288": ModelFacts(
+        1.0e-3,
+        46,
+        13.9,
+        1.63,
+        {
+            **_330,
+            "Max Voltage Limit": _Facts(140, (55, 140)),
+            "Min Voltage Limit": _Facts(55, (55, 140)),
+            "Current Limit": _Facts(910, (0, 910)),
+            "Velocity Limit": _Facts(320, (0, 2047)),
+            "PWM Slope": _Facts(255, (1, 255)),
+            "Velocity I Gain": _Facts(1200, _GAIN),
+            "Velocity P Gain": _Facts(40, _GAIN),
+            "Position P Gain": _Facts(900, _GAIN),
+        },
+        nominal_voltage_v=11.1,
+        senses_supply=True,
+        indirect=((168, 208, 20),),
+    ),
+    "XL430-W250": ModelFacts(
+        0.0,
+        45,
+        8.5,
+        1.86,
+        {
+            "Temperature Limit": _Facts(72, (0, 100)),
+            "Max Voltage Limit": _Facts(140, (60, 140)),
+            "Min Voltage Limit": _Facts(60, (60, 140)),
+            "Velocity Limit": _Facts(265, (0, 1023)),
+            "Velocity I Gain": _Facts(1000, _GAIN),
+            "Position D Gain": _Facts(4000, _GAIN),
+            "Position P Gain": _Facts(640, _GAIN),
+        },
+        operating_modes=frozenset({1, 3, 4, 16}),
+        nominal_voltage_v=11.1,
+    ),
+}
+
+STANDS_FOR: Mapping[str, str] = {
+    "XH430-W210": "XM430-W210",
+    "XD430-T210": "XM430-W210",
+    "XD430-T350": "XH430-W350",
+    "XW430-T200": "XM430-W210",
+    "XW430-T333": "XM430-W350",
+    "XM540-W150": "XM540-W270",
+    "XH540-W150": "XM540-W270",
+    "XH540-W270": "XM540-W270",
+    "XD540-T150": "XM540-W270",
+    "XD540-T270": "XM540-W270",
+    "XW540-T140": "XM540-W270",
+    "XW540-T260": "XM540-W270",
+    "XL330-M077": "XL330-M288",
+    "XC330-M181": "XC330-T288",
+    "XC330-M288": "XC330-T288",
+    "XC330-T181": "XC330-T288",
+    "XC430-W150": "XL430-W250",
+    "XC430-W240": "XL430-W250",
+}
+"""Models without facts of their own, and the sister model whose factory values and ranges they are given: unsure."""

@@ -1,0 +1,148 @@
+"""The half-duplex wire from the servos to the host: which bytes arrive when, and what a collision destroys."""
+
+from collections import deque
+from typing import NamedTuple
+
+BITS_PER_BYTE = 10
+
+ROUNDING_S = 1e-9
+"""Less than this two bytes on the wire do not overlap, they follow each other [s]."""
+
+
+class Arriving(NamedTuple):
+    """Bytes on their way to the host: when the first is there, and how far apart they come [s]."""
+
+    data: bytes
+    first: float
+    byte_s: float
+
+    @property
+    def last(self) -> float:
+        return self.first + (len(self.data) - 1) * self.byte_s
+
+    def count_by(self, deadline: float) -> int:
+        """How many of the bytes are there by `deadline`."""
+        if self.last <= deadline:
+            return len(self.data)
+        if self.first > deadline:
+            return 0
+        return min(int((deadline - self.first) / self.byte_s) + 1, len(self.data))
+
+    def after(self, count: int) -> "Arriving":
+        """What is left when the first `count` bytes are gone."""
+        return Arriving(self.data[count:], self.first + count * self.byte_s, self.byte_s)
+
+
+class Wire:
+    """Replies on their way, in the order in which they reach the host `latency_s` after they were on the wire."""
+
+    def __init__(self, baud: int, latency_s: float) -> None:
+        self.baud = baud
+        self.collisions = 0
+        """How often two spoke at once."""
+        self.reply_by = float("-inf")
+        """When the last servo will have spoken [s]."""
+        self._latency_s = latency_s
+        self._arriving: deque[Arriving] = deque()
+
+    @property
+    def baud(self) -> int:
+        """The host's baud."""
+        return self._baud
+
+    @baud.setter
+    def baud(self, baud: int) -> None:
+        self._baud = baud
+        self.byte_s = BITS_PER_BYTE / baud
+
+    def put(self, data: bytes, start: float, late_s: float = 0.0) -> float:
+        """A servo speaks from time `start`; the time at which it is done. `late_s`: how much longer the adapter takes.
+
+        Both are lost when it speaks into another's reply.
+        """
+        byte_s = self.byte_s
+        end = start + len(data) * byte_s
+        waiting = start < self.reply_by
+        if waiting and self.collide(start, end):
+            return end
+        arriving = self._arriving
+        first = start + byte_s + self._latency_s + late_s
+        arriving.append(Arriving(data, first, byte_s))
+        if len(arriving) > 1 and arriving[-2].first > first:  # before an earlier instruction's reply that is to come
+            self._arriving = deque(sorted(arriving, key=lambda segment: segment.first))
+        self.reply_by = max(self.reply_by, end)
+        return end
+
+    def occupy(self, until: float) -> None:
+        """A servo speaks and is not heard."""
+        self.reply_by = max(self.reply_by, until)
+
+    def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
+        """Up to `size` bytes that are there by `deadline`, and when the last of them came, at least `now`."""
+        arriving = self._arriving
+        if arriving and len(arriving[0].data) == size:  # the usual case: what one write brought, in one read
+            segment = arriving[0]
+            last = segment.first + (size - 1) * segment.byte_s
+            if last <= deadline:
+                del arriving[0]
+                return segment.data, last if last > now else now
+        taken = b""
+        while size and arriving:
+            segment = arriving[0]
+            count = segment.count_by(deadline)
+            if not count:
+                break
+            count = min(count, size)
+            taken += segment.data[:count]
+            size -= count
+            now = max(now, segment.first + (count - 1) * segment.byte_s)
+            if count == len(segment.data):
+                arriving.popleft()
+            else:
+                arriving[0] = segment.after(count)
+        return taken, now
+
+    def count_by(self, now: float) -> int:
+        """Bytes that have reached the host by `now` [s]."""
+        return sum(segment.count_by(now) for segment in self._arriving)
+
+    @property
+    def on_the_way(self) -> int:
+        """Bytes that have reached the host or will do so."""
+        return sum(len(segment.data) for segment in self._arriving)
+
+    @property
+    def next_reply_by(self) -> float:
+        """When the replies that follow each other without a pause will all have come [s]; infinite when none comes."""
+        last = float("inf")
+        for segment in self._arriving:
+            if last < segment.first - 4 * segment.byte_s:
+                break
+            last = segment.last
+        return last
+
+    def cut(self, now: float) -> None:
+        """Nothing that is not there by `now` will ever come: the cable is out."""
+        kept = [segment._replace(data=segment.data[: segment.count_by(now)]) for segment in self._arriving]
+        self._arriving = deque(segment for segment in kept if segment.data)
+
+    def collide(self, start: float, end: float) -> bool:
+        """Whether a servo speaks while someone else does, from `start` to `end`.
+
+        Then its bytes from `start` on are lost; who began at `start` is lost by not being heard.
+        """
+        kept: deque[Arriving] = deque()
+        collided = False
+        for segment in self._arriving:
+            begins = segment.first - segment.byte_s - self._latency_s
+            ends = segment.last - self._latency_s
+            if begins < end - ROUNDING_S and ends > start + ROUNDING_S:
+                collided = True
+                count = segment.count_by(start + self._latency_s)
+                if count:
+                    kept.append(segment._replace(data=segment.data[:count]))
+            else:
+                kept.append(segment)
+        self._arriving = kept
+        self.collisions += collided
+        return collided
