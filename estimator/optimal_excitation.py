@@ -50,7 +50,7 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """The same arm with friction's step no narrower than LEAST_WIDTH: quicker to simulate, and hardly another optimum."""
+    """The same arm with friction's step no narrower than LEAST_WIDTH: quicker to simulate, much the same optimum."""
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")

@@ -65,6 +65,7 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
         with terminal.streaming(checked) as watch:
             torque, result = identify_in_steps(checked, run, config, watch, terminal.say)
         terminal.say(torque)
+        cli_results.write_report(run.path)
         _show(result, checked, run.path, json_only)
         return
     with terminal.streaming(checked) as watch:
