@@ -5,7 +5,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from drivers.control_table import load_control_table, model_names
-from drivers.errors import DriverError, ServoFault, TorqueNotOff, WrongModel, WrongSetting
+from drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongSetting
 from drivers.exchange import Exchange
 from drivers.joint import Joint
 from drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
@@ -244,8 +244,13 @@ class ServoBus:
             servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
             if watched:
                 servo.write("Bus Watchdog", ticks)
-        for servo in self._servos.values():
-            servo.write("Torque Enable", 1)
+        for joint, servo in self._servos.items():
+            try:
+                servo.write("Torque Enable", 1)
+            except ServoRefused:
+                if servo.hardware_error() != HardwareError(0):
+                    raise ServoFault(self._fault(joint)) from None
+                raise
 
     def torque_off(self) -> TorqueOff:
         """Cut torque on every servo and read it back. Tries all of them whatever fails; never raises.
