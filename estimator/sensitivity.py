@@ -41,8 +41,10 @@ class Sensitive:
         self._constants = physics.vector
         self._step = step
         self._pieces = _pieces(physics, step)
-        self._state = np.zeros((2, 2))
-        self._state[:, : self._joints] = start
+        state = np.zeros((2, 2))
+        state[:, : self._joints] = start
+        self._state = state.reshape(-1)
+        self._work = _room()
         self._causes: npt.NDArray[np.int64] = np.array([CAUSES.index(name) for name in causes])
         # How the state (q1, q2, v1, v2) changes with each cause.
         self._change = np.zeros((len(causes), 4))
@@ -66,9 +68,20 @@ class Sensitive:
         derivative = np.empty((2, samples, self._causes.size))
         _advance(
             *(self._constants, self._state, self._change, both, slopes, self._step, self._pieces),
-            *(self._causes, position, derivative),
+            *(self._work, self._causes, position, derivative),
         )
         return position[:joints], derivative[:joints]
+
+
+def _room() -> tuple[Array, ...]:
+    """Arrays that the steps write to: derivatives of both stages, the state's transition, the torques' slopes.
+
+    Made here, since what makes arrays takes a compiler seconds.
+    """
+    stages = [np.zeros(shape) for _ in range(2) for shape in ((2, STATE), (2, STATE), (3, STATE), (4, 6))]
+    for mass in (stages[2], stages[6]):
+        mass[[0, 0, 1, 2, 2], [0, 2, 2, 2, 3]] = 1.0
+    return (*stages, np.zeros((4, 4)), np.zeros((2, 2)))
 
 
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
@@ -165,7 +178,7 @@ def _arm(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: floa
 
 def _step(p: Any, x: Any, t1: float, t2: float, dt: Any, h: float, work: Any, change: Any, causes: Any) -> tuple[float, float]:
     """One step of the state x (4,) and of `change` (causes, 4); the accelerations."""
-    F, S, M, X, G, S_, N, Y = work
+    F, S, M, X, G, S_, N, Y, T, _ = work
     q1, q2, v1, v2 = x
     gh = GAMMA * h
     m22 = p[2] + p[3]
@@ -196,7 +209,6 @@ def _step(p: Any, x: Any, t1: float, t2: float, dt: Any, h: float, work: Any, ch
     a11, a12 = d11 * i11 + d12 * i12, d11 * i12 + d12 * i22
     a21, a22 = d21 * i11 + d22 * i12, d21 * i12 + d22 * i22
     # By the state: X holds what it does to stage 1, Y to stage 2, where angles have moved by h v.
-    T = np.empty((4, 4))
     for d in range(4):
         u1 = X[d, 0] - X[d, 4] * k1 - X[d, 5] * k2 - gh * X[d, 2] * k1
         u2 = X[d, 1] - X[d, 5] * k1 - gh * X[d, 3] * k2
@@ -241,15 +253,8 @@ def _step(p: Any, x: Any, t1: float, t2: float, dt: Any, h: float, work: Any, ch
     return s1, s2
 
 
-def _loop(p: Any, state: Any, change: Any, torque: Any, slopes: Any, step: float, pieces: int, causes: Any, position: Any, derivative: Any) -> None:
-    x = np.array([state[0, 0], state[0, 1], state[1, 0], state[1, 1]])
-    work = (
-        np.zeros((2, 32)), np.zeros((2, 32)), np.zeros((3, 32)), np.zeros((4, 6)),
-        np.zeros((2, 32)), np.zeros((2, 32)), np.zeros((3, 32)), np.zeros((4, 6)),
-    )
-    for mass in (work[2], work[6]):
-        mass[0, 0] = mass[0, 2] = mass[1, 2] = mass[2, 2] = mass[2, 3] = 1.0
-    dt = np.empty((2, 2))
+def _loop(p: Any, x: Any, change: Any, torque: Any, slopes: Any, step: float, pieces: int, work: Any, causes: Any, position: Any, derivative: Any) -> None:
+    dt = work[9]
     a1 = a2 = 0.0
     for k in range(position.shape[1]):
         position[0, k], position[1, k] = x[0], x[1]
@@ -259,14 +264,16 @@ def _loop(p: Any, state: Any, change: Any, torque: Any, slopes: Any, step: float
             near_1 = p[8] > 0.0 and abs(x[2]) < 6.0 * p[12] + 2.0 * step * abs(a1)
             near_2 = p[9] > 0.0 and abs(x[3]) < 6.0 * p[13] + 2.0 * step * abs(a2)
             cuts = pieces if near_1 or near_2 else 1
-            dt[:] = slopes[:, :, k, s]
+            dt[0, 0] = slopes[0, 0, k, s]
+            dt[0, 1] = slopes[0, 1, k, s]
+            dt[1, 0] = slopes[1, 0, k, s]
+            dt[1, 1] = slopes[1, 1, k, s]
             for _ in range(cuts):
                 a1, a2 = _step(p, x, torque[0, k, s], torque[1, k, s], dt, step / cuts, work, change, causes)
-    state[0, 0], state[0, 1], state[1, 0], state[1, 1] = x[0], x[1], x[2], x[3]
 
-
-_compiled = numba.njit(cache=True, nogil=True)
-_drive = _compiled(_drive)
-_arm = _compiled(_arm)
-_step = _compiled(_step)
-_advance: Callable[..., None] = _compiled(_loop)
+# Only the loop is called from Python; wrappers for the others would take a second more to compile.
+_inner = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_drive = _inner(_drive)
+_arm = _inner(_arm)
+_step = _inner(_step)
+_advance: Callable[..., None] = numba.njit(cache=True, nogil=True)(_loop)
