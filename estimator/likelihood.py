@@ -194,9 +194,7 @@ def _weights(periods: Sequence[SettledPeriod], positions: Sequence[Array]) -> tu
     return tuple(weights), outliers
 
 
-def _fit(
-    periods: Sequence[SettledPeriod], problem: Problem, minimum: Minimum, outliers: int, iterations: int
-) -> Fit:
+def _fit(periods: Sequence[SettledPeriod], problem: Problem, minimum: Minimum, outliers: int, iterations: int) -> Fit:
     x = minimum.x
     positions = problem.positions(x)
     residuals = [

@@ -134,7 +134,9 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float, F: Any, S: Any) -> 
     )
 
 
-def _arm(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: Any, F: Any, S: Any, M: Any, X: Any) -> tuple[float, ...]:
+def _arm(
+    p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: Any, F: Any, S: Any, M: Any, X: Any
+) -> tuple[float, ...]:
     """Mass matrix's first row, torques left, slopes of friction, and their derivatives.
 
     By parameters into F and S (2, causes) and M (3, causes), whose rows are m11, m12, m22; by the state
@@ -176,7 +178,9 @@ def _arm(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: floa
     )
 
 
-def _step(p: Any, x: Any, t1: float, t2: float, dt: Any, h: float, work: Any, change: Any, causes: Any) -> tuple[float, float]:
+def _step(
+    p: Any, x: Any, t1: float, t2: float, dt: Any, h: float, work: Any, change: Any, causes: Any
+) -> tuple[float, float]:
     """One step of the state x (4,) and of `change` (causes, 4); the accelerations."""
     F, S, M, X, G, S_, N, Y, T, _ = work
     q1, q2, v1, v2 = x
@@ -253,7 +257,19 @@ def _step(p: Any, x: Any, t1: float, t2: float, dt: Any, h: float, work: Any, ch
     return s1, s2
 
 
-def _loop(p: Any, x: Any, change: Any, torque: Any, slopes: Any, step: float, pieces: int, work: Any, causes: Any, position: Any, derivative: Any) -> None:
+def _loop(
+    p: Any,
+    x: Any,
+    change: Any,
+    torque: Any,
+    slopes: Any,
+    step: float,
+    pieces: int,
+    work: Any,
+    causes: Any,
+    position: Any,
+    derivative: Any,
+) -> None:
     dt = work[9]
     a1 = a2 = 0.0
     for k in range(position.shape[1]):
@@ -270,6 +286,7 @@ def _loop(p: Any, x: Any, change: Any, torque: Any, slopes: Any, step: float, pi
             dt[1, 1] = slopes[1, 1, k, s]
             for _ in range(cuts):
                 a1, a2 = _step(p, x, torque[0, k, s], torque[1, k, s], dt, step / cuts, work, change, causes)
+
 
 # Only the loop is called from Python; wrappers for the others would take a second more to compile.
 _inner = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

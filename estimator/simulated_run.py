@@ -40,9 +40,7 @@ class SimulatedRun:
         torque = motor_torque(self.command, self.rate, self.command_to_sample, self.steps, **times)
         return simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0]
 
-    def pieces(
-        self, physics: Physics, start: Array, names: tuple[str, ...]
-    ) -> Iterator[tuple[slice, Array, Array]]:
+    def pieces(self, physics: Physics, start: Array, names: tuple[str, ...]) -> Iterator[tuple[slice, Array, Array]]:
         """Piece after piece: which samples, their angles (joints, samples) [rad], and the derivatives of these
         (joints, samples, causes) by the parameters `names` and then by the state at the first sample."""
         joints, samples = self.command.shape
