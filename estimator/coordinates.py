@@ -1,8 +1,9 @@
 """Unconstrained coordinates for the likelihood: no step of it can leave the physical parameters.
 
 Positive parameters are exponentials. Coupling is sqrt(inertia_1 inertia_2) tanh(z), which every arm of
-positive masses obeys and which keeps the mass matrix positive definite. The width of the Coulomb step stays
-above a floor. Gravity, offsets and delay may have either sign.
+positive masses obeys and which keeps the mass matrix positive definite; the asymmetry of viscous friction is
+viscous tanh(z), which keeps friction positive both ways. The width of the Coulomb step stays above a floor.
+Gravity, offsets, ripple, the joints' zeros and delay may have either sign.
 """
 
 from collections.abc import Mapping
@@ -13,8 +14,8 @@ import numpy as np
 from estimator.arrays import Array
 
 LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
-MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2), at the start
-EITHER_SIGN = ("gravity", "offset", "delay")
+MOST_COUPLING = 0.95  # of its bound, at the start
+EITHER_SIGN = ("gravity", "offset", "delay", "ripple_sin", "ripple_cos", "ripple_cycles", "zero")
 
 
 @dataclass(frozen=True)
@@ -32,29 +33,27 @@ class Coordinates:
         """Parameters (parameters,) at the coordinates `x` (parameters,)."""
         value = np.where(self._either_sign, x * self.scales, np.exp(np.where(self._either_sign, 0.0, x)))
         value += self._floors
-        if "coupling" in self.names:
-            coupling, first, second = self._coupled
-            value[coupling] = np.sqrt(value[first] * value[second]) * np.tanh(x[coupling])
+        for share, first, second in self._shares:
+            value[share] = np.sqrt(value[first] * value[second]) * np.tanh(x[share])
         return value
 
     def coordinates(self, value: Array) -> Array:
         """Coordinates of the parameters `value` (parameters,), moved into the physical range."""
         above = np.maximum(value - self._floors, LEAST_SHARE * self.scales)
         x = np.where(self._either_sign, value / self.scales, np.log(above))
-        if "coupling" in self.names:
-            coupling, first, second = self._coupled
-            share = value[coupling] / np.sqrt(above[first] * above[second])
-            x[coupling] = np.arctanh(np.clip(share, -MOST_COUPLING, MOST_COUPLING))
+        for share, first, second in self._shares:
+            part = value[share] / np.sqrt(above[first] * above[second])
+            x[share] = np.arctanh(np.clip(part, -MOST_COUPLING, MOST_COUPLING))
         return x
 
     def slopes(self, x: Array) -> Array:
         """Derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
         value = self.values(x)
         slope = np.diag(np.where(self._either_sign, self.scales, value - self._floors))
-        if "coupling" in self.names:
-            coupling, first, second = self._coupled
-            slope[coupling, coupling] = np.sqrt(value[first] * value[second]) / np.cosh(x[coupling]) ** 2
-            slope[coupling, first] = slope[coupling, second] = 0.5 * value[coupling]
+        for share, first, second in self._shares:
+            slope[share, share] = np.sqrt(value[first] * value[second]) / np.cosh(x[share]) ** 2
+            slope[share, first] += 0.5 * value[share]
+            slope[share, second] += 0.5 * value[share]
         return slope
 
     @property
@@ -66,9 +65,12 @@ class Coordinates:
         return np.array([self.width_floor if _kind(name) == "coulomb_width" else 0.0 for name in self.names])
 
     @property
-    def _coupled(self) -> tuple[int, int, int]:
+    def _shares(self) -> list[tuple[int, int, int]]:
+        """Indices of what is bounded by the geometric mean of two others, and of the two."""
+        bounds = {"coupling": ("inertia_1", "inertia_2")}
+        bounds |= {f"viscous_asymmetry_{joint}": (f"viscous_{joint}",) * 2 for joint in (1, 2)}
         index = self.names.index
-        return index("coupling"), index("inertia_1"), index("inertia_2")
+        return [(index(name), *map(index, two)) for name, two in bounds.items() if name in self.names]
 
 
 def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: float) -> Array:
@@ -79,7 +81,8 @@ def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: f
     scale: Mapping[str, float] = {
         **dict.fromkeys(("inertia", "coupling", "armature"), inertia),
         **dict.fromkeys(("gravity", "coulomb", "offset"), torque),
-        "viscous": torque / velocity,
+        **dict.fromkeys(("viscous", "viscous_asymmetry"), torque / velocity),
+        **dict.fromkeys(("ripple_sin", "ripple_cos", "ripple_cycles", "zero"), 0.02),
         "stribeck_velocity": velocity,
         "coulomb_width": 0.05,
         **dict.fromkeys(("stribeck_rise", "load"), 1.0),

@@ -4,6 +4,8 @@ import numpy as np
 
 from estimator.arrays import Array
 
+DIFFERENCE = 1e-7  # s
+
 
 def motor_torque(
     command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float
@@ -30,6 +32,24 @@ def motor_torque(
     step = 1.0 / (steps * rate)
     means = [(gathered[i + 1] - gathered[i] - lag * (present[i + 1] - present[i])) / step for i in range(steps)]
     return np.stack(means, axis=2)
+
+
+def torque_slopes(
+    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float
+) -> Array:
+    """Derivatives of `motor_torque` by delay and by lag (2, joints, samples, steps) [N m/s].
+
+    By central differences: the torque is piecewise linear in the delay and smooth in the lag.
+    """
+
+    def at(delay: float, lag: float) -> Array:
+        return motor_torque(command, rate, command_to_sample, steps, delay=delay, lag=lag)
+
+    late = (at(delay + DIFFERENCE, lag) - at(delay - DIFFERENCE, lag)) / (2.0 * DIFFERENCE)
+    if lag <= 0.0:
+        return np.stack((late, np.zeros_like(late)))
+    change = min(DIFFERENCE, 0.1 * lag)
+    return np.stack((late, (at(delay, lag + change) - at(delay, lag - change)) / (2.0 * change)))
 
 
 def _before(command: Array, rate: float, shift: int) -> Array:

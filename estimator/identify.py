@@ -1,5 +1,6 @@
 """The estimator's front door: a settled period in, parameters with standard errors and predictions out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,9 @@ from estimator.arrays import Array
 from estimator.drive import motor_torque
 from estimator.errors import ModelError, PeriodicityError, ShapeError
 from estimator.least_squares import fit_lines
-from estimator.likelihood import fit_period
+from estimator.likelihood import fit_runs
 from estimator.model import Model
-from estimator.period import SettledPeriod
+from estimator.period import SettledPeriod, without_spikes
 from estimator.physics import Physics
 from estimator.simulation import simulate, steps_per_sample
 
@@ -20,11 +21,11 @@ PERIODIC = 1e-7  # rad and rad/s, from one period's end to the next
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one settled period says of the arm.
+    """What settled periods say of the arm.
 
-    `std` and `covariance` hold what position errors leave open, scaled by the residual as it is, so that
-    rounding is in them as it came out (a residual of 0.2887 encoder steps RMS is rounding alone). They hold
-    nothing of what repeats in every sample: an error of the torque constant, by which all parameters of a
+    `std` and `covariance` hold what position errors leave open, scaled by the residual as it is and widened
+    where it is correlated (`estimator.covariance`), so that rounding is in them as it came out (a residual of
+    0.2887 encoder steps RMS is rounding alone). They hold nothing of what repeats in every sample: an error of the torque constant, by which all parameters of a
     joint scale, of the encoder's zero or linearity, or of the model. A residual well above 0.29 steps says
     that the model lacks something and that the parameters are off by more than `std`.
     """
@@ -52,7 +53,11 @@ class Estimate:
     position_step: Array
     """The encoders' steps (joints,) [rad]."""
     iterations: int
-    """Of the likelihood."""
+    """Simulations with derivatives that the likelihood took."""
+    outliers: int = 0
+    """Samples left out or weighed down because they are far from their neighbours or from the model."""
+    correlation_time: float = 1.0
+    """Samples over which the residual is correlated, and over which `covariance` counts it as one."""
 
     @property
     def std(self) -> Array:
@@ -72,17 +77,21 @@ class Estimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
-def identify(period: SettledPeriod, model: Model) -> Estimate:
-    """Estimate the parameters of `model` from one settled period: regression on its lines, then maximum
-    likelihood.
+def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model) -> Estimate:
+    """Estimate the parameters of `model` from one settled period, or from several of one arm together:
+    regression on their lines, then maximum likelihood.
 
-    The same period gives the same numbers to the last digit. Raises ModelError when `model` has another
-    number of joints than `period`, UnidentifiableError and ConvergenceError.
+    The same periods give the same numbers to the last digit. Raises ModelError when `model` has another
+    number of joints than a period, UnidentifiableError and ConvergenceError.
     """
-    if model.joints != period.joints:
-        raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
-    linear = fit_lines(period)
-    fit = fit_period(period, model, linear)
+    given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
+    for period in given:
+        if model.joints != period.joints:
+            raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
+    used = [without_spikes(period) for period in given]
+    linear = fit_lines(*used)
+    fit = fit_runs(used, model, linear)
+    spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
         model,
         model.names,
@@ -91,11 +100,13 @@ def identify(period: SettledPeriod, model: Model) -> Estimate:
         fit.covariance,
         linear.value,
         linear.std,
-        fit.start,
-        fit.position,
-        np.where(period.valid, period.position - fit.position, np.nan),
-        period.position_step,
+        fit.starts[0],
+        fit.positions[0],
+        np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
+        used[0].position_step,
         fit.iterations,
+        fit.outliers + spikes,
+        fit.correlation_time,
     )
 
 

@@ -1,4 +1,4 @@
-"""Stage 1: linear least squares on the Fourier lines of one settled period. No starting values, no local
+"""Stage 1: linear least squares on the Fourier lines of settled periods. No starting values, no local
 minima.
 
 The motion's lines up to where signal meets noise are differentiated exactly, the regressor evaluated on
@@ -12,7 +12,7 @@ import numpy as np
 
 from estimator.arm_model import parameter_names, regressor
 from estimator.arrays import Array
-from estimator.errors import UnidentifiableError
+from estimator.errors import ShapeError, UnidentifiableError
 from estimator.fourier import Lines, Motion, cut_off, held_lines, lines_of, motion_of
 from estimator.period import SettledPeriod
 
@@ -32,28 +32,51 @@ class LinearEstimate:
     """Standard errors if the residual were white (parameters,): optimistic for other friction."""
     delay: float
     """Delay of the motors' torque [s]."""
-    motion: Motion
-    """The period's motion from its lines up to `harmonics`."""
-    harmonics: int
-    """Highest harmonic used."""
+    motions: tuple[Motion, ...]
+    """Each period's motion from its lines up to `harmonics`."""
+    harmonics: tuple[int, ...]
+    """Highest harmonic used of each period."""
+
+    @property
+    def motion(self) -> Motion:
+        """Of the first period."""
+        return self.motions[0]
 
 
-def fit_lines(period: SettledPeriod) -> LinearEstimate:
-    """Estimate the base parameters. Raises UnidentifiableError when the motion does not tell them apart."""
-    lines = lines_of(period.filled())
-    harmonics = cut_off(lines)
-    motion = motion_of(lines, harmonics, period.fundamental, period.samples)
-    Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)
-    columns = np.fft.rfft(Y, axis=1)[:, : harmonics + 1] / period.samples
-    torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : harmonics + 1]
-    slope = 1j * period.fundamental * np.arange(harmonics + 1) * torque
-    A = np.concatenate((columns, slope[:, :, None]), axis=2)
+def fit_lines(*periods: SettledPeriod) -> LinearEstimate:
+    """Estimate the base parameters from one or more settled periods of one arm.
 
-    theta, _ = _solve(A, torque, np.ones(period.joints))
+    Raises UnidentifiableError when the motion does not tell them apart, ShapeError for periods of arms with
+    different numbers of joints.
+    """
+    joints = periods[0].joints
+    if any(period.joints != joints for period in periods):
+        raise ShapeError(f"periods of {[period.joints for period in periods]} joints: they must be of one arm")
+    lines = [lines_of(period.filled()) for period in periods]
+    harmonics = tuple(map(cut_off, lines))
+    motions = tuple(
+        motion_of(line, highest, period.fundamental, period.samples)
+        for line, highest, period in zip(lines, harmonics, periods, strict=True)
+    )
+    equations = [_equations(*each) for each in zip(periods, motions, harmonics, strict=True)]
+    A = np.concatenate([columns for columns, _ in equations], axis=1)
+    torque = np.concatenate([goal for _, goal in equations], axis=1)
+
+    theta, _ = _solve(A, torque, np.ones(joints))
     # The second time each joint counts by what the first left unexplained of it.
     left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
-    theta, std = _solve(A, torque, 1.0 / left)
-    return LinearEstimate(parameter_names(period.joints), theta[:-1], std[:-1], float(theta[-1]), motion, harmonics)
+    theta, std = _solve(A, torque, 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max()))
+    return LinearEstimate(parameter_names(joints), theta[:-1], std[:-1], float(theta[-1]), motions, harmonics)
+
+
+def _equations(period: SettledPeriod, motion: Motion, harmonics: int) -> tuple[Lines, Lines]:
+    """One period's columns (joints, lines, unknowns) and torques (joints, lines), line by line."""
+    Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)
+    # One joint after the other: a long period's spectra of all regressors at once would fill the memory.
+    columns = np.stack([np.fft.rfft(rows, axis=0)[: harmonics + 1] for rows in Y]) / period.samples
+    torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : harmonics + 1]
+    slope = 1j * period.fundamental * np.arange(harmonics + 1) * torque
+    return np.concatenate((columns, slope[:, :, None]), axis=2), torque
 
 
 def _solve(columns: Lines, torque: Lines, weight: Array) -> tuple[Array, Array]:

@@ -1,23 +1,29 @@
-"""Stage 2: maximum likelihood, by least squares of measured minus simulated position over one period.
+"""Stage 2: maximum likelihood, by least squares of measured minus simulated position over settled periods.
 
 With errors of position that are alike and independent from sample to sample, as rounding nearly is, the
-most likely parameters are those of the smallest weighted sum of squares. The state at the first sample is
-unknown too: simulating until the motion is periodic would take two or more periods in place of one.
+most likely parameters are those of the smallest weighted sum of squares. The state at the first sample of
+each run is unknown too: simulating until the motion is periodic would take two or more periods in place of one.
+
+How large the errors are is itself estimated, joint by joint, between a coarse fit and the fine one, and samples
+far outside are weighed down there (Huber): a few wild readings then cost nothing.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
-from estimator.drive import motor_torque
+from estimator.covariance import Scatter, correlation_time, robust_covariance
 from estimator.least_squares import LinearEstimate
-from estimator.levenberg_marquardt import Minimum, minimise
+from estimator.levenberg_marquardt import Minimum, Quadratic, minimise
 from estimator.model import Model
+from estimator.normal_equations import normal_equations
 from estimator.period import SettledPeriod
 from estimator.physics import Physics
-from estimator.simulation import simulate, steps_per_sample
+from estimator.ripple import find_ripple
+from estimator.simulated_run import SimulatedRun
 
 WIDTH_FLOOR = 3e-4  # rad/s: narrower cannot be told from friction that sticks
 # From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both.
@@ -29,6 +35,7 @@ ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02}
 LEAST_LAG = 1e-4  # s, at the start
+OUTLIER = 4.0  # standard deviations; rounding never leaves more than 1.7
 
 
 @dataclass(frozen=True)
@@ -38,104 +45,176 @@ class Fit:
     value: Array
     """In the order of `Model.names` [SI]."""
     covariance: Array
-    """Of `value`: inverse information times the residual's variance. Infinite for what leaves no trace."""
-    start: Array
-    """Angles and velocities at the first sample (2, joints) [rad, rad/s]."""
-    position: Array
-    """Simulated positions (joints, samples) [rad]."""
+    """Of `value`, right for errors that are correlated too. Infinite for what leaves no trace."""
+    starts: tuple[Array, ...]
+    """Of each run, angles and velocities at the first sample (2, joints) [rad, rad/s]."""
+    positions: tuple[Array, ...]
+    """Of each run, simulated positions (joints, samples) [rad]."""
+    outliers: int
+    """Samples that were weighed down."""
+    correlation_time: float
+    """Samples over which the residual is correlated; 1 is white."""
     iterations: int
-    """Jacobians taken."""
+    """Simulations with derivatives."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One period's residuals under one model, by coordinates: the parameters', then the first sample's."""
+    """Residuals of several runs under one model, by coordinates: the parameters', then each run's first state."""
 
-    period: SettledPeriod
+    runs: tuple[SimulatedRun, ...]
     coordinates: Coordinates
     state_scale: Array
     """Of the state at the first sample (2 joints,) [rad, rad/s]."""
+    weights: tuple[Array, ...]
+    """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return len(self.coordinates.names)
 
     def physics(self, x: Array) -> Physics:
         """The physics at the coordinates `x`."""
-        names = self.coordinates.names
-        return _physics(names, self.coordinates.values(x[: len(names)]))
+        values = self.coordinates.values(x[: self.count]).tolist()
+        return Physics.of(dict(zip(self.coordinates.names, values, strict=True)))
 
-    def start(self, x: Array) -> Array:
-        """The state at the first sample (2, joints) at the coordinates `x`."""
-        return (x[len(self.coordinates.names) :] * self.state_scale).reshape(2, -1)
+    def start(self, x: Array, run: int) -> Array:
+        """The state at the first sample of a run (2, joints) at the coordinates `x`."""
+        size = self.state_scale.size
+        first = self.count + run * size
+        return (x[first : first + size] * self.state_scale).reshape(2, -1)
 
-    def position(self, x: Array) -> Array:
-        """Simulated positions (joints, samples) [rad]."""
-        period = self.period
+    def evaluate(self, x: Array) -> Quadratic:
+        """The weighted sum of squares at `x` with its normal equations."""
         physics = self.physics(x)
-        steps = steps_per_sample(period.rate)
-        torque = motor_torque(
-            period.torque,
-            period.rate,
-            period.command_to_sample,
-            steps,
-            delay=physics.delay,
-            lag=physics.lag,
-        )
-        return simulate(physics, self.start(x), torque, 1.0 / (period.rate * steps))[0]
+        total = Quadratic(0.0, np.zeros((x.size, x.size)), np.zeros(x.size))
+        for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
+            transform = self._transform(x, index)
+            n, b = np.zeros((transform.shape[0],) * 2), np.zeros(transform.shape[0])
+            cost = 0.0
+            for part, position, derivative in run.pieces(physics, self.start(x, index), self.coordinates.names):
+                root = weight[:, part]
+                r = (root * (position - run.measured[:, part])).reshape(-1)
+                J = (root[:, :, None] * derivative).reshape(r.size, -1)
+                if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
+                    return Quadratic(np.inf, total.normal, total.gradient)
+                normal, gradient = normal_equations(J, r)
+                n, b, cost = n + normal, b + gradient, cost + float(np.sum(r * r))
+            total = Quadratic(
+                total.cost + cost,
+                total.normal + transform.T @ n @ transform,
+                total.gradient + transform.T @ b,
+            )
+        return total
 
-    def residual(self, x: Array) -> Array:
-        """Simulated less measured positions in units of their noise, 0 where a sample is missing (all,)."""
-        difference = np.where(self.period.valid, self.position(x) - self.period.position, 0.0)
-        return (difference / self.period.noise[:, None]).reshape(-1)
+    def positions(self, x: Array) -> tuple[Array, ...]:
+        """Simulated positions of each run (joints, samples) [rad]."""
+        physics = self.physics(x)
+        return tuple(run.position(physics, self.start(x, index)) for index, run in enumerate(self.runs))
+
+    def scatter(self, x: Array, lags: int) -> Array:
+        """Sum of products of the scores, in coordinates (coordinates, coordinates); see `covariance`."""
+        physics = self.physics(x)
+        total = np.zeros((x.size, x.size))
+        for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
+            transform = self._transform(x, index)
+            scatter = Scatter(transform.shape[0], lags)
+            for part, position, derivative in run.pieces(physics, self.start(x, index), self.coordinates.names):
+                square = weight[:, part] ** 2 * (position - run.measured[:, part])
+                scatter.add(np.einsum("js,jsc->sc", square, derivative))
+            total += transform.T @ scatter.sum() @ transform
+        return total
+
+    def _transform(self, x: Array, run: int) -> Array:
+        """Derivatives of a run's parameters and first state by all coordinates (those, coordinates)."""
+        size = self.state_scale.size
+        transform = np.zeros((self.count + size, x.size))
+        transform[: self.count, : self.count] = self.coordinates.slopes(x[: self.count])
+        first = self.count + run * size
+        transform[self.count :, first : first + size] = np.diag(self.state_scale)
+        return transform
 
 
-def fit_period(period: SettledPeriod, model: Model, linear: LinearEstimate) -> Fit:
+def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate) -> Fit:
     """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError."""
-    velocity = float(np.sqrt(np.mean(linear.motion.velocity**2)))
-    torque = float(np.sqrt(np.mean(period.torque**2)))
-    scales = scales_of(model.names, torque, velocity, abs(float(linear.value[0])))
-    state_scale = np.repeat([ANGLE_SCALE, velocity], period.joints)
-    state = np.stack((linear.motion.position[:, 0], linear.motion.velocity[:, 0])).reshape(-1) / state_scale
-    coordinates = Coordinates(model.names, scales, WIDTH_FLOOR)
-    problem = Problem(period, coordinates, state_scale)
-    tries = []
+    problem, states = _problem(periods, model, linear)
+    samples = int(sum(period.valid.sum() for period in periods))
+    ripple = find_ripple(periods, linear) if model.ripple else {}
+    tries: list[Minimum] = []
     for width in STARTING_WIDTHS:
-        value = _start(model, linear, width)
-        x = np.concatenate((coordinates.coordinates(value), state))
-        tries.append(minimise(problem.residual, x, COARSE))
-        if tries[-1].cost < EXPLAINED * period.valid.sum():
+        x = np.concatenate((problem.coordinates.coordinates(_start(model, linear, ripple, width)), states))
+        tries.append(minimise(problem.evaluate, x, COARSE))
+        if tries[-1].at.cost < EXPLAINED * samples:
             break
-    best = min(tries, key=lambda found: found.cost)
-    minimum = minimise(problem.residual, best.x, FINE)
-    return Fit(
-        coordinates.values(minimum.x[: value.size]),
-        _covariance(minimum, coordinates, int(period.valid.sum())),
-        problem.start(minimum.x),
-        problem.position(minimum.x),
-        sum(found.iterations for found in tries) + minimum.iterations,
-    )
+    best = min(tries, key=lambda found: found.at.cost)
+    weights, outliers = _weights(periods, problem.positions(best.x))
+    problem = Problem(problem.runs, problem.coordinates, problem.state_scale, weights)
+    minimum = minimise(problem.evaluate, best.x, FINE)
+    return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, minimum)))
 
 
-def _physics(names: tuple[str, ...], value: Array) -> Physics:
-    return Physics.of(dict(zip(names, value.tolist(), strict=True)))
+def _problem(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate) -> tuple[Problem, Array]:
+    """The problem with every sample weighed by the noise that is known beforehand, and the states to start from."""
+    velocity = float(np.sqrt(np.mean([np.mean(motion.velocity**2) for motion in linear.motions])))
+    torque = float(np.sqrt(np.mean([np.mean(period.torque**2) for period in periods])))
+    scales = scales_of(model.names, torque, velocity, abs(float(linear.value[0])))
+    state_scale = np.repeat([ANGLE_SCALE, velocity], model.joints)
+    states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
+    weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0) for period in periods)
+    runs = tuple(SimulatedRun.of(period) for period in periods)
+    return Problem(runs, Coordinates(model.names, scales, WIDTH_FLOOR), state_scale, weights), np.concatenate(states)
 
 
-def _start(model: Model, linear: LinearEstimate, width: float) -> Array:
+def _start(model: Model, linear: LinearEstimate, ripple: dict[str, float], width: float) -> Array:
     """Parameters to start from [SI] (parameters,): stage 1's, and what it does not see."""
-    known = dict(zip(linear.names, linear.value.tolist(), strict=True))
+    known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | ripple
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), width)
-    known |= {"delay": linear.delay, "lag": max(linear.delay, LEAST_LAG)}
+    if model.drive == "delay":
+        known["delay"] = linear.delay
+    known |= {"lag": max(linear.delay, LEAST_LAG)}
     return np.array([known.get(name, START.get(name.rstrip("_12"), 0.0)) for name in model.names])
 
 
-def _covariance(minimum: Minimum, coordinates: Coordinates, samples: int) -> Array:
-    """Covariance of the parameters, the start's state taken as unknown with them."""
-    x, normal = minimum.x, minimum.normal
-    count = len(coordinates.names)
-    variance = minimum.cost / max(1, samples - x.size)
-    norm = np.sqrt(np.diag(normal))
-    seen = norm > 1e-12 * norm.max()
-    lengths = np.outer(norm[seen], norm[seen])
-    of_x = np.zeros((x.size, x.size))
-    of_x[np.ix_(seen, seen)] = np.linalg.pinv(normal[np.ix_(seen, seen)] / lengths, hermitian=True) / lengths
-    slope = coordinates.slopes(x[:count])
-    covariance: Array = variance * slope @ of_x[:count, :count] @ slope.T
-    covariance[~seen[:count], ~seen[:count]] = np.inf
-    return covariance
+def _weights(periods: Sequence[SettledPeriod], positions: Sequence[Array]) -> tuple[tuple[Array, ...], int]:
+    """Weights by how large each joint's errors turned out, and the number of samples far outside them."""
+    weights = []
+    outliers = 0
+    for period, position in zip(periods, positions, strict=True):
+        error = np.where(period.valid, np.abs(period.position - position), 0.0)
+        # 1.35 medians are a standard deviation between those of rounding (1.15) and of normal errors (1.48).
+        typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
+        spread = np.maximum(typical, period.noise)[:, None]
+        far = error > OUTLIER * spread
+        weight = np.where(far, np.sqrt(OUTLIER * spread / np.where(far, error, 1.0)), 1.0)
+        inside = np.where(far | ~period.valid, np.nan, error)
+        rms = np.sqrt(np.nanmean(inside**2, axis=1))[:, None]
+        weights.append(np.where(period.valid, weight / np.maximum(rms, period.noise[:, None]), 0.0))
+        outliers += int(far.sum())
+    return tuple(weights), outliers
+
+
+def _fit(periods: Sequence[SettledPeriod], problem: Problem, minimum: Minimum, outliers: int, iterations: int) -> Fit:
+    x = minimum.x
+    positions = problem.positions(x)
+    residuals = [
+        weight * (period.filled() - position)
+        for period, position, weight in zip(periods, positions, problem.weights, strict=True)
+    ]
+    lags = correlation_time(residuals)
+    count = problem.count
+    samples = int(sum(period.valid.sum() for period in periods))
+    covariance = robust_covariance(minimum.at, problem.scatter(x, lags), samples, count)
+    slopes = problem.coordinates.slopes(x[:count])
+    hidden = np.isinf(np.diag(covariance))
+    covariance = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T
+    covariance[hidden, hidden] = np.inf
+    return Fit(
+        problem.coordinates.values(x[:count]),
+        covariance,
+        tuple(problem.start(x, run) for run in range(len(periods))),
+        positions,
+        outliers,
+        float(lags),
+        iterations,
+    )

@@ -7,19 +7,25 @@ from estimator.arm_model import parameter_names, parameter_units
 from estimator.errors import ModelError
 
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]
-Drive = Literal["delay", "lag"]
+Drive = Literal["delay", "lag", "delay_lag"]
 
 FRICTION_TERMS: dict[str, tuple[str, ...]] = {
     "coulomb": ("coulomb_width",),
     "stribeck": ("coulomb_width", "stribeck_rise", "stribeck_velocity"),
     "stribeck_load": ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
 }
-DRIVES = ("delay", "lag")
+DRIVE_TERMS: dict[str, tuple[str, ...]] = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
+RIPPLE = ("ripple_sin", "ripple_cos", "ripple_cycles")
 UNITS = {
     "coulomb_width": "rad/s",
     "stribeck_rise": "1",
     "stribeck_velocity": "rad/s",
     "load": "1",
+    "viscous_asymmetry": "N m s/rad",
+    "ripple_sin": "1",
+    "ripple_cos": "1",
+    "ripple_cycles": "1",
+    "zero": "rad",
     "delay": "s",
     "lag": "s",
 }
@@ -32,7 +38,10 @@ class Model:
     Friction: `coulomb` is viscous v + coulomb tanh(v / coulomb_width); `stribeck` multiplies coulomb by 1 +
     stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level.
     Drive: `delay` is a pure delay of the torque on top of what `SettledPeriod` knows, `lag` a first-order
-    lag.
+    lag, `delay_lag` both. `asymmetry` adds viscous_asymmetry |v|: friction that differs with direction (of the
+    Coulomb level, that is the offset). `ripple` multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles
+    q) + ripple_cos cos(ripple_cycles q), ripple_cycles per turn of the joint. `zeros` adds the errors of the
+    encoders' zeros, true angle = measured angle + zero; the first joint's shows only under gravity.
 
     Raises ModelError for other names and for other than one or two joints.
     """
@@ -40,13 +49,16 @@ class Model:
     joints: int
     friction: Friction = "coulomb"
     drive: Drive = "delay"
+    asymmetry: bool = False
+    ripple: bool = False
+    zeros: bool = False
 
     def __post_init__(self) -> None:
         parameter_names(self.joints)
         if self.friction not in FRICTION_TERMS:
             raise ModelError(f"friction model {self.friction!r}: choose one of {', '.join(FRICTION_TERMS)}")
-        if self.drive not in DRIVES:
-            raise ModelError(f"drive model {self.drive!r}: choose one of {', '.join(DRIVES)}")
+        if self.drive not in DRIVE_TERMS:
+            raise ModelError(f"drive model {self.drive!r}: choose one of {', '.join(DRIVE_TERMS)}")
 
     @property
     def base_names(self) -> tuple[str, ...]:
@@ -56,8 +68,16 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """The base parameters, then the friction terms joint by joint, then the drive's."""
-        terms = (f"{term}_{joint + 1}" for term in FRICTION_TERMS[self.friction] for joint in range(self.joints))
-        return (*self.base_names, *terms, self.drive)
+        more = FRICTION_TERMS[self.friction]
+        more += ("viscous_asymmetry",) * self.asymmetry + RIPPLE * self.ripple + ("zero",) * self.zeros
+        terms = (f"{term}_{joint + 1}" for term in more for joint in range(self.joints))
+        return (*self.base_names, *terms, *DRIVE_TERMS[self.drive])
+
+    @property
+    def description(self) -> str:
+        """In words, for a person."""
+        words = {"asymmetry": self.asymmetry, "ripple": self.ripple, "zeros": self.zeros}
+        return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 
     @property
     def units(self) -> tuple[str, ...]:

@@ -1,13 +1,15 @@
 """One settled period: what the estimator works on."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from estimator.arrays import Array, Mask
 from estimator.errors import RecordingError, ShapeError, StandstillError
 
 FEWEST_SAMPLES = 32
+SPIKE = 8.0
 LEAST_VALID = 0.5  # of a joint's samples
 LEAST_MOTION = 4.0  # encoder steps from end to end
 MOST_GAP = 4.0  # from the last sample to the first, in largest moves between neighbours
@@ -78,6 +80,21 @@ class SettledPeriod:
             if not valid.all():
                 row[~valid] = np.interp(index[~valid], index[valid], row[valid], period=self.samples)
         return position
+
+
+def without_spikes(period: SettledPeriod) -> SettledPeriod:
+    """The same period with single wild readings (a bit lost on the bus, say) marked as missing.
+
+    A reading is wild when it is further than SPIKE encoder steps, and than SPIKE times what is usual, from the
+    median of itself and its two neighbours on either side.
+    """
+    position = period.filled()
+    away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))
+    usual = np.maximum(1.5 * np.median(away, axis=1), np.maximum(period.position_step, period.noise))
+    wild = (away > SPIKE * usual[:, None]) & period.valid
+    if not wild.any():
+        return period
+    return replace(period, position=np.where(wild, np.nan, period.position))
 
 
 def _check_shapes(period: SettledPeriod) -> None:

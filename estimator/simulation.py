@@ -2,8 +2,12 @@
 
 The equations are those of `estimator.arm_model` with a friction law that is smooth:
 
-    friction(v) = viscous v + level(v) tanh(v / width)
+    motor torque = torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
+    friction(v) = viscous v + viscous_asymmetry |v| + level(v) tanh(v / width)
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
+
+with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb level itself is the offset.
+`estimator.sensitivity` differentiates these equations and this scheme.
 
 Each step is the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999): L-stable for the
 slope of the friction, which its Jacobian holds, and of second order whatever else that Jacobian leaves out.
@@ -59,23 +63,33 @@ def _pieces(physics: Physics, step: float) -> int:
     return int(2 ** math.ceil(math.log2(max(needed, 1.0))))
 
 
-# Compiled code takes its arguments by position; p is `Physics.vector`.
+# Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
+def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, float]:
+    """Torque that a drive leaves its joint after friction, and the slope of that friction."""
+    p = p[6 + joint :: 2]
+    if p[10] != 0.0:
+        t *= 1.0 + p[8] * math.sin(p[10] * q) + p[9] * math.cos(p[10] * q)
+    level = p[1] * (1.0 + p[4] * math.exp(-((v / p[5]) ** 2))) + p[6] * abs(t)
+    bend = math.tanh(v / p[3])
+    return t - p[2] - p[0] * v - (p[7] * v + level) * bend, p[0] + level / p[3] * (1.0 - bend * bend)
+
+
 def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:
     """Mass matrix's first row, torques left for acceleration, and the slopes of friction."""
+    left_1, slope_1 = _drive(p, 0, q1, v1, t1)
+    left_2, slope_2 = _drive(p, 1, q2, v2, t2)
+    q1 += p[28]
+    q2 += p[29]
     across = p[1] * math.cos(q2)
     turning = p[1] * math.sin(q2)
     weight = p[5] * math.cos(q1 + q2)
-    level_1 = p[8] * (1.0 + p[14] * math.exp(-((v1 / p[16]) ** 2))) + p[18] * abs(t1)
-    level_2 = p[9] * (1.0 + p[15] * math.exp(-((v2 / p[17]) ** 2))) + p[19] * abs(t2)
-    bend_1 = math.tanh(v1 / p[12])
-    bend_2 = math.tanh(v2 / p[13])
     return (
         p[0] + p[2] + 2.0 * across,
         p[2] + across,
-        t1 - p[10] - p[4] * math.cos(q1) - weight + turning * (2.0 * v1 + v2) * v2 - p[6] * v1 - level_1 * bend_1,
-        t2 - p[11] - weight - turning * v1 * v1 - p[7] * v2 - level_2 * bend_2,
-        p[6] + level_1 / p[12] * (1.0 - bend_1 * bend_1),
-        p[7] + level_2 / p[13] * (1.0 - bend_2 * bend_2),
+        left_1 - p[4] * math.cos(q1) - weight + turning * (2.0 * v1 + v2) * v2,
+        left_2 - weight - turning * v1 * v1,
+        slope_1,
+        slope_2,
     )
 
 
@@ -120,5 +134,6 @@ def _loop(p: Any, state: Any, torque: Any, step: float, pieces: int, position: A
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
 
 
+_drive = numba.njit(cache=True, nogil=True)(_drive)
 _forces = numba.njit(cache=True, nogil=True)(_forces)
 _simulate: Callable[[Array, Array, Array, float, int, Array], None] = numba.njit(cache=True, nogil=True)(_loop)

@@ -46,12 +46,18 @@ def test_the_sum_of_cosines_is_what_is_written() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_crest_factor_is_low_and_soon_found(seed: int) -> None:
+def test_crest_factor_is_low(seed: int) -> None:
     """Schroeder's phases give 1.7 and more for 25 lines, random ones 2.5 to 3.5."""
-    began = time.perf_counter()
     wave = design_multisine(400.0, 10.0, zippered_lines(10.0, (0.1, 5.0), 2), (0.8, 0.42), seed)
-    assert time.perf_counter() - began < 2.0
-    assert wave.crest_factor.max() < 1.5
+    assert wave.crest_factor.max() < 1.43
+
+
+def test_many_lines_take_no_longer_than_a_person_notices() -> None:
+    began = time.perf_counter()
+    wave = design_multisine(400.0, 100.0, zippered_lines(100.0, (0.1, 5.0), 2), (0.8, 0.42), 1)
+    assert len(wave.lines[0]) == 246
+    assert time.perf_counter() - began < 4.0  # 0.5 s on a machine with nothing else to do
+    assert wave.crest_factor.max() < 1.43
 
 
 def test_a_seed_is_a_multisine() -> None:

@@ -1,0 +1,76 @@
+"""A fake arm's settled motion without its bus: positions as they are, to be given errors and rounded afterwards."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from estimator.excitation import design_multisine, zippered_lines
+from estimator.period import SettledPeriod
+from fakes.arm import Arm
+from fakes.two_link import make_plant
+
+RATE = 400.0
+PERIOD = 10.0
+BAND = (0.1, 5.0)
+STEP = 2.0 * math.pi / 4096  # rad
+CURRENT_STEP = 2.69e-3  # A
+COMMAND_TO_SAMPLE = 3e-4  # s
+LINKS = (
+    {"length": 0.147, "mass": 0.180, "centre": 0.081, "inertia": 7.0e-4},
+    {"length": 0.180, "mass": 0.200, "centre": 0.112, "inertia": 2.9e-4},
+)
+DRIVES = (
+    {"viscous": 0.045, "coulomb": 0.055, "offset": 0.004},
+    {"viscous": 0.040, "coulomb": 0.050, "offset": -0.003},
+)
+SERVO = {"mass": 0.082, "rotor_inertia": 8.0e-8, "gear_ratio": 353.5, "torque_constant": 1.8}
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One settled period."""
+
+    torque: np.ndarray
+    """Commanded, of whole current steps (joints, samples) [N m]."""
+    position: np.ndarray
+    """Exact angles (joints, samples) [rad]."""
+    start: np.ndarray
+    """Angles and velocities at the first sample (2, joints) [rad, rad/s]."""
+    step: float = STEP
+
+    def period(self, position: np.ndarray) -> SettledPeriod:
+        """As if these positions (joints, samples) [rad] had been read."""
+        steps = np.full(len(position), self.step)
+        return SettledPeriod(RATE, self.torque, position, COMMAND_TO_SAMPLE, steps)
+
+    def rounded(self) -> SettledPeriod:
+        """As an encoder reads it."""
+        return self.period(np.round(self.position / self.step) * self.step)
+
+
+def servo_arm(friction: dict[str, float]) -> Arm:
+    """The arm of configs/fake_two_link.toml with this friction and drive."""
+    drives = [{**SERVO, **drive, **friction} for drive in DRIVES]
+    return Arm.model_validate({"start": (-math.pi / 2, 0.0), "links": LINKS, "drives": drives})
+
+
+def record(arm: Arm, seed: int, peak: tuple[float, float]) -> Recorded:
+    """Play one multisine: one period to settle, one kept."""
+    wave = design_multisine(RATE, PERIOD, zippered_lines(PERIOD, BAND, 2), peak, seed)
+    constant = np.array([drive.torque_constant for drive in arm.drives])[:, None]
+    current = np.round(wave.torque / constant / CURRENT_STEP) * CURRENT_STEP
+    commands: list[Any] = current.T.tolist()
+    plant = make_plant(arm)
+    position = np.empty((2, wave.samples))
+    start = np.empty((2, 2))
+    for turn in range(2):
+        for k, command in enumerate(commands):
+            t = (turn * wave.samples + k) / RATE
+            plant.advance(t + COMMAND_TO_SAMPLE, command)
+            position[:, k] = plant.position
+            if k == 0:
+                start = np.array([plant.position, plant.velocity])
+            plant.advance(t + 1.0 / RATE, command)
+    return Recorded(current * constant, position, start)
