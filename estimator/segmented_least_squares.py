@@ -19,7 +19,7 @@ Residual = Callable[[int, Array, Array], Array]
 """Residuals (rows,) of one segment at shared coordinates (shared,) and its own (own,)."""
 
 DIFFERENCE = 1e-4  # of a coordinate, which is of the size of 1
-LONGEST = 1.0  # change of one coordinate in one step
+LONGEST = 2.0  # change of one coordinate in one step
 ITERATIONS = 60
 FIRST_DAMPING = 1e-3
 LEAST_DAMPING = 1e-8

@@ -25,13 +25,13 @@ from estimator.segmented_least_squares import Segmented, minimise_segmented
 from estimator.simulation import simulate
 
 LONGEST_STEP = 1e-3  # s
-WIDTH_FLOOR = 3e-4  # rad/s
+WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a second of motion
 STARTING_WIDTH = 0.05  # rad/s
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "delay": 0.0, "lag": 1e-3}
 SHORT = 0.25  # of the segments' length, to begin with
 FEWEST = 8  # samples in a segment
 COARSE = 1e-3
-FINE = 1e-6
+FINE = 1e-5
 ANGLE_SCALE = 0.1  # rad
 START_WINDOW = 0.03  # s on either side, for the state that a segment starts from
 
@@ -269,9 +269,9 @@ def _cubic(place: Array, steps: int) -> tuple[Array, Array]:
 
 
 def _state_at(recording: Recording, time: float) -> Array:
-    """Angles and velocities (2, joints) at `time` by a straight line through the samples around it."""
-    window = max(START_WINDOW, 3.0 * recording.interval)
+    """Angles and velocities (2, joints) at `time` by a cubic through the samples around it."""
+    window = max(START_WINDOW, 5.0 * recording.interval)
     near = np.abs(recording.time - time) <= window
     filled = recording.filled()[:, near]
-    line = np.polynomial.polynomial.polyfit(recording.time[near] - time, filled.T, 1)
-    return np.asarray(line)
+    cubic = np.polynomial.polynomial.polyfit(recording.time[near] - time, filled.T, 3)
+    return np.asarray(cubic[:2])
