@@ -145,7 +145,7 @@ class DescriptorPort(Port):
     def discard_input(self) -> None:
         try:
             termios.tcflush(self._descriptor, termios.TCIFLUSH)
-        except _FAILURES as error:
+        except (*_FAILURES, ValueError) as error:  # ValueError: closed
             raise self._lost(error) from error
 
     def close(self) -> None:

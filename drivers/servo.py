@@ -5,6 +5,7 @@ all, and a status says that the packet was understood, not what the register hol
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TypeVar
 
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
@@ -53,7 +54,9 @@ class Servo:
 
     def write(self, register: str, value: int) -> None:
         """Write a register and read it back; raises as `read`, and ServoRefused when it reads back otherwise."""
-        self.write_only(register, value)
+        # A status may be lost, or switched off (Status Return Level 1): what counts is what the register holds.
+        with suppress(NoReply):
+            self.write_only(register, value)
         actual = self.read(register)
         if actual != value:
             raise ServoRefused(f"{self.title}: {register} was written as {value} but reads back as {actual}.")

@@ -78,7 +78,8 @@ def _mend(used: Way, ways: list[Way], wanted: float) -> str:
         return ""
     better = next((way for way in ways if way.sound and way.rate >= wanted), None)
     if better is not None:
-        return f"Set port.one_write = {str(better.one_write).lower()} and port.fast_sync_read = {str(better.fast).lower()}."
+        one_write, fast = str(better.one_write).lower(), str(better.fast).lower()
+        return f"Set port.one_write = {one_write} and port.fast_sync_read = {fast}."
     if not any(way.sound for way in ways):
         return "Replies get lost whichever way they are asked for: check cables, supply and termination."
     best = max((way for way in ways if way.sound), key=lambda way: way.rate)

@@ -5,6 +5,7 @@ The modules that do the work are imported inside the commands, so that `hil --he
 
 import json
 import sys
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -161,7 +162,7 @@ def setup(
     opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)
-        confirm = (lambda _: True) if yes else (lambda question: typer.confirm(question))
+        confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
         changes = set_up(servo, confirm, new_id=new_id, new_baud=new_baud, return_delay_us=return_delay_us)
     finally:
         opened.close()

@@ -7,7 +7,8 @@ from pathlib import Path
 import fakes
 from drivers.bus import ServoBus
 from drivers.clock import Clock, WallClock
-from drivers.errors import DriverError, TorqueNotOff
+from drivers.errors import DriverError, TorqueNotOff, WrongSetting
+from drivers.latency import command_to_set, latency_timer
 from hil.config import Config
 from hil.errors import ExperimentError, HilError, RunFolderError
 from hil.plan import Plan, make_plan
@@ -33,6 +34,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
     with StopRequest() as stop, ServoBus.open(config.bus) as bus:
         clock = bus.port.clock
         run.event(clock.now(), f"opened {config.port.url} at {config.port.baud} baud")
+        _check_rate(config, bus)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder:
@@ -54,7 +56,8 @@ def _play(
         run.event(clock.now(), what)
 
     try:
-        with bus.torque(config.safety.watchdog), _on_time(clock, note):
+        # In this order: what _on_time does takes longer than the watchdog waits.
+        with _on_time(clock, note), bus.torque(config.safety.watchdog):
             note(f"torque on, watchdog {config.safety.watchdog:g} s")
             Stream(bus, plan, config, recorder, stop, watch, note).run()
     except BaseException as error:
@@ -76,6 +79,22 @@ def _on_time(clock: Clock, note: Note) -> Iterator[None]:
     with real_time() as granted:
         note("; ".join(map(str, granted)))
         yield
+
+
+def _check_rate(config: Config, bus: ServoBus) -> None:
+    """What the wire and the adapter make impossible from the outset; `hil check` measures what is possible."""
+    rate, wire = config.experiment.rate, bus.prepared.longest
+    if wire > 1 / rate:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms on the wire alone at "
+            f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
+        )
+    file = latency_timer(bus.port.url)
+    if file is not None and bus.port.latency + wire > 1 / rate:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which leaves "
+            f"{1 / (bus.port.latency + wire):.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+        )
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
