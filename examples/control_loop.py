@@ -1,0 +1,56 @@
+"""What both examples share: an identified run, and a loop that sends torques at a fixed rate under hil's guard."""
+
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fakes
+from drivers.bus import ServoBus
+from drivers.rate import FixedRate
+from hil import load_model
+from hil.config import Config, load_config
+from hil.dynamics import ArmModel
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
+from hil.guard import Guard
+from hil.run_folder import RunFolder
+
+Array = NDArray[np.float64]
+Controller = Callable[[int, Array, Array], Array]
+"""Takes the number of the sample, angles [rad] and velocities [rad/s] (joints,); gives torques [N m] (joints,)."""
+
+
+def identified_arm() -> tuple[Config, ArmModel]:
+    """The run folder on the command line, or the realistic fake arm, identified now."""
+    if len(sys.argv) > 1:
+        run = RunFolder.open(Path(sys.argv[1]))
+        return run.load_config(), load_model(run.path)
+    config = load_config(Path("fake_two_link"))
+    with tempfile.TemporaryDirectory() as folder:
+        run = RunFolder.create(Path(folder) / "run", config)
+        run_experiment(config, run, config.path, lambda _: None)
+        estimate_run(run)
+        return config, load_model(run.path)
+
+
+def play(config: Config, model: ArmModel, controller: Controller, samples: int) -> Array:
+    """Run the controller for so many samples; measured angles (samples, joints) [rad]. Torque is off afterwards."""
+    fakes.register()
+    guard = Guard(config)
+    measured = np.empty((samples, len(model.joints)))
+    goals = [0.0] * len(model.joints)
+    with ServoBus.open(config.bus) as bus, bus.torque(config.safety.watchdog):
+        rate = FixedRate(bus.port.clock, config.experiment.rate)
+        for index in range(samples):
+            rate.wait()
+            state = bus.exchange(goals)
+            guard.look(state)
+            measured[index] = state.position
+            # This torque leaves with the next exchange, one sample later.
+            torque = controller(index, measured[index], np.array(state.velocity))
+            goals = guard.clamp(model.goal(torque).tolist())
+    return measured
