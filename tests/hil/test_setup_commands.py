@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 from typer.testing import CliRunner
 
 import fakes
@@ -158,11 +159,15 @@ def test_check_changes_nothing(arm: Arm, ports: list[Any]) -> None:
 
 
 def test_check_does_not_touch_an_arm_that_somebody_drives(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fakes.servo import Servo
+    open_port = serial.serial_for_url
 
-    monkeypatch.setattr(Servo, "torque_enabled", True, raising=False)
-    read = Servo.read
-    monkeypatch.setattr(Servo, "read", lambda self, at, size: (0, b"\1") if at == 64 else read(self, at, size))
+    def driven(*args: Any, **kwargs: Any) -> Any:
+        port = open_port(*args, **kwargs)
+        for servo in port.bus.servos.values():
+            servo.write(64, b"\1")
+        return port
+
+    monkeypatch.setattr(serial, "serial_for_url", driven)
     found = look(arm())
     assert found["joint 'elbow'", "torque"].level is Level.STOP
     assert found["bus", "rate"].found == "not measured"
