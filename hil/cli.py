@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from hil import __version__
+from hil import __version__, cli_init, cli_results
 
 if TYPE_CHECKING:
     from hil.config import Config
@@ -21,12 +21,14 @@ app = typer.Typer(
     name="hil",
     help="Identify the dynamics of Dynamixel servo arms, on the bus or on a fake one.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
-ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file that describes the arm.")]
+ConfigPath = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="TOML file of the arm, or the name of a bundled one.")
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
 PortOrConfig = Annotated[
     str | None,
@@ -62,6 +64,7 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
     terminal.say(torque)
     with terminal.busy("Estimating"):
         result = estimate_run(run)
+        cli_results.write_report(run.path)
     _show(result, checked, run.path, json_only)
 
 
@@ -76,6 +79,7 @@ def estimate(run: RunPath, json_only: Json = False) -> None:
     terminal = Terminal(quiet=json_only)
     with terminal.busy("Estimating"):
         result = estimate_run(folder)
+        cli_results.write_report(folder.path)
     _show(result, folder.load_config(), folder.path, json_only)
 
 
@@ -91,6 +95,7 @@ def scan(
     from drivers.port import open_port
     from drivers.servo_model import BAUD_RATES
     from hil import scan as scanning
+    from hil.config import port_url
     from hil.setup_view import print_ports, print_scan, scanned
     from hil.terminal import Terminal
 
@@ -99,7 +104,7 @@ def scan(
         return
     bauds = tuple(baud or BAUD_RATES)
     terminal = Terminal(quiet=json_only)
-    opened = open_port(_port_url(port), bauds[0])
+    opened = open_port(port_url(port), bauds[0])
     try:
         with terminal.busy(f"Asking {len(bauds)} baud rates"):
             heard = list(scanning.scan(opened, bauds))
@@ -146,6 +151,7 @@ def setup(
     """Set a servo's ID, baud or return delay: a question before each write to EEPROM, each write read back."""
     from drivers.port import open_port
     from drivers.servo_model import BAUD_RATES
+    from hil.config import port_url
     from hil.setup import open_servo, set_up
     from hil.setup_view import changed, print_changes
 
@@ -153,7 +159,7 @@ def setup(
         raise typer.BadParameter(f"{new_baud}: a servo can do {', '.join(map(str, BAUD_RATES))}.")
     if json_only and not yes:
         raise typer.BadParameter("--json asks no questions: it needs --yes.")
-    opened = open_port(_port_url(port), baud)
+    opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
@@ -161,6 +167,13 @@ def setup(
     finally:
         opened.close()
     print(json.dumps(changed(changes))) if json_only else print_changes(changes)
+
+
+app.command(epilog="Example: hil report runs/20261121-153000-fake_two_link --png pictures")(cli_results.report)
+app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --format urdf --format mjcf")(
+    cli_results.export
+)
+app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.init)
 
 
 def main() -> NoReturn:
@@ -185,18 +198,6 @@ def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool)
     from hil.result_table import print_result
 
     print_result(result, config, path, Console(highlight=False))
-
-
-def _port_url(port: str) -> str:
-    """The port's URL: as given, or what a configuration says."""
-    import fakes
-
-    fakes.register()
-    if port.endswith(".toml") and "://" not in port:
-        from hil.config import load_config
-
-        return load_config(Path(port)).url
-    return port
 
 
 def _default_folder(config: Path) -> Path:

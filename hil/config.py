@@ -10,11 +10,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+import fakes
 from drivers.bus import BusConfig
 from drivers.joint import Joint
 from drivers.servo_model import SERVO_MODELS, Mode, servo_model
 from fakes.description import FakeArm
 from fakes.table_errors import describe
+from hil.bundled import find_config
 from hil.errors import ConfigError
 
 FAKE_URL = "fake://"
@@ -229,7 +231,8 @@ class Config(_Table):
 
 
 def load_config(path: Path) -> Config:
-    """Read and check a TOML file; raises ConfigError."""
+    """Read and check a TOML file, or the bundled one of that bare name; raises ConfigError."""
+    path = find_config(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -273,3 +276,11 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
             f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than "
             f"{product} = {math.floor(most * 1000) / 1000:g} N m"
         )
+
+
+def port_url(port: str) -> str:
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
+    fakes.register()
+    if port.endswith(".toml") and "://" not in port:
+        return load_config(Path(port)).url
+    return port

@@ -82,7 +82,7 @@ def _torque_constants(config: Config) -> list[str]:
 
 
 def _next(result: dict[str, Any], run: Path) -> list[str]:
-    lines = [f"Run folder: {run}"]
+    lines = [f"Run folder: {run}, its report: {run / 'report.html'}"]
     worst = max(result["fit"]["residual_rms_ticks"])
     if worst <= GOOD_RESIDUAL_TICKS:
         lines.append("The model explains the motion down to the encoder's rounding. Estimate again from the recording:")

@@ -6,6 +6,7 @@ events.jsonl    what happened when, one JSON object a line, written as it happen
 samples.npy     every sample (hil.recording)
 lateness.json   how many samples were how late (hil.timing)
 result.json     parameters with error bars, fit, validation, timing
+period.npz      the settled periods as measured and as the model has them (hil.period_file)
 """
 
 import json
