@@ -25,8 +25,7 @@ class Clock(Protocol):
 class WallClock:
     """The machine's monotonic clock. Sleeps to just before the deadline, then spins."""
 
-    def now(self) -> float:
-        return time.perf_counter()
+    now = staticmethod(time.perf_counter)  # itself, not a call around it: it is asked twice a cycle
 
     def wait_until(self, deadline: float) -> None:
         remaining = deadline - time.perf_counter()

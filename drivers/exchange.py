@@ -21,7 +21,8 @@ from drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 HOST_S = 0.75e-3
 """Allowed for the computer itself, USB frames included, on top of what wire, servos and adapter take."""
 
-_CRC = struct.Struct("<H")
+_crc = crc16.umts
+_pack_crc = struct.Struct("<H").pack
 
 
 class Reply(NamedTuple):
@@ -58,7 +59,7 @@ class Exchange:
         if goal.size != 2:
             raise ValueError(f"{goal.name} has {goal.size} bytes; a goal of 2 bytes is needed.")
         self._port = port
-        self._clock = port.clock
+        self._now = port.clock.now
         self.ids = tuple(ids)
         self.fast = fast
         self.one_write = one_write
@@ -72,7 +73,7 @@ class Exchange:
         self._slow_every = slow_every
         self._until_slow = slow_every
         self._slow = 0
-        self._span = 0
+        self._lost = 0
         self._late_possible = False
 
     @property
@@ -93,7 +94,8 @@ class Exchange:
         Raises PortLost; ValueError for a wrong number of goals or one that does not fit into two bytes.
         """
         port = self._port
-        span = self._next_span()
+        self._until_slow -= 1
+        span = 0 if self._until_slow > 0 and not self._late_possible else self._other_span()
         read = self._reads[span]
         fields = self._fields
         fields[2::2] = goal_ticks
@@ -101,35 +103,31 @@ class Exchange:
             goals = self._write.pack(*fields)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
-        goals += _CRC.pack(crc16.umts(goals))
-        before = self._clock.now()
+        goals += _pack_crc(_crc(goals))
+        timeout = self._timeouts[span]
+        before = self._now()
         if self.one_write:
-            port.write(goals + read.request)
+            received = port.ask(goals + read.request, read.reply_size, timeout, before)
         else:
             port.write(goals)
-            port.write(read.request)
-        timeout = self._timeouts[span]
-        received = port.read(read.reply_size, timeout)
+            received = port.ask(read.request, read.reply_size, timeout, before)
         servos = read.unpack(received)
         if servos is None:
             servos = self._search(read, received, before + timeout)
-        return Reply(before, self._clock.now(), span, servos)
+            if None in servos:
+                self._late_possible, self._lost = True, span
+        return Reply(before, self._now(), span, servos)
 
-    def _next_span(self) -> int:
-        """The span to read now; drops what a former request may still have brought in."""
-        self._until_slow -= 1
-        if self._late_possible:
-            self._late_possible = False
-            self._port.discard_input()
-            # An answer that comes later still must not be taken for the answer to this request. Nothing in a packet
-            # says which request it answers, but its length does when the spans differ.
-            self._span = self._next_slow() if self._span == 0 else 0
-        elif self._until_slow <= 0:
+    def _other_span(self) -> int:
+        """The span to read where it is not simply the first: after a loss, or in a slow turn."""
+        if not self._late_possible:
             self._until_slow = self._slow_every
-            self._span = self._next_slow()
-        else:
-            self._span = 0
-        return self._span
+            return self._next_slow()
+        self._late_possible = False
+        self._port.discard_input()
+        # An answer that comes later still must not be taken for the answer to this request. Nothing in a packet
+        # says which request it answers, but its length does when the spans differ.
+        return self._next_slow() if self._lost == 0 else 0
 
     def _next_slow(self) -> int:
         slow = len(self._reads) - 1
@@ -142,12 +140,11 @@ class Exchange:
         """Find the answers among stuffed, damaged or missing ones, reading on until all are there or time is up."""
         while True:
             answers, over = read.search(received)
-            remaining = deadline - self._clock.now()
+            remaining = deadline - self._now()
             if over or remaining <= 0:
                 break
             # Byte by byte: how long a stuffed packet is shows only as it comes.
             received += self._port.read(1, remaining)
-        self._late_possible = None in answers
         return answers
 
     def _timeout(self, read: GroupRead, return_delay: float) -> float:
@@ -156,7 +153,7 @@ class Exchange:
         return wire + return_delay * len(self.ids) + self._port.latency + HOST_S
 
     def _bytes(self, read: GroupRead) -> int:
-        return self._write.size + _CRC.size + len(read.request) + read.reply_size
+        return self._write.size + 2 + len(read.request) + read.reply_size
 
 
 def _front(goal: Register, count: int) -> bytes:

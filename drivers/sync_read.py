@@ -16,6 +16,7 @@ from drivers.packet import ALERT, BROADCAST_ID, HEADER, Framer, Instruction, Pac
 
 Answer = tuple[int, ...] | None
 
+_crc = crc16.umts
 _ERROR_BITS = 0xFF & ~ALERT
 _FORMATS = {(1, False): "B", (2, False): "H", (4, False): "I", (1, True): "b", (2, True): "h", (4, True): "i"}
 
@@ -80,21 +81,23 @@ class SyncRead:
         length = span.size + 11  # header, ID, LEN, INST, ERR, data, CRC
         self.reply_size = length * len(self._ids)
         behind_id = (span.size + 4).to_bytes(2, "little") + bytes((Instruction.STATUS,))
+        # All answers in one unpacking: per servo its ERR, its values and its CRC.
+        self._whole = Struct("<" + f"8xB{span.format}H" * len(self._ids))
+        width = len(span.registers) + 2
         self._parts = [
-            (HEADER + bytes((servo_id,)) + behind_id, index * length, index * length + 8, (index + 1) * length - 2)
-            for index, servo_id in enumerate(self._ids)
+            (HEADER + bytes((servo_id,)) + behind_id, n * length, (n + 1) * length - 2, n * width, (n + 1) * width - 1)
+            for n, servo_id in enumerate(self._ids)
         ]
 
     def unpack(self, received: bytes) -> list[Answer] | None:
         if len(received) != self.reply_size:
             return None
+        fields = self._whole.unpack(received)
         answers: list[Answer] = []
-        for front, start, values, end in self._parts:
-            if not received.startswith(front, start):
+        for front, start, end, first, check in self._parts:
+            if fields[check] != _crc(received[start:end]) or not received.startswith(front, start):
                 return None
-            if crc16.umts(received[start:end]) != received[end] | received[end + 1] << 8:
-                return None
-            answers.append(self._values.unpack_from(received, values))
+            answers.append(fields[first:check])
         return answers
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
@@ -121,6 +124,9 @@ class FastSyncRead:
     def __init__(self, ids: Sequence[int], span: Span) -> None:
         self._ids = tuple(ids)
         self._values = Struct(f"<Bx{span.format}")
+        # All parts in one unpacking: per servo its ERR, ID, values and CRC.
+        self._whole = Struct("<8x" + f"BB{span.format}H" * len(self._ids))
+        self._width = len(span.registers) + 3
         self.request = _request(Instruction.FAST_SYNC_READ, ids, span)
         part = span.size + 4  # ERR, ID, data, CRC
         length = 1 + part * len(self._ids)
@@ -132,17 +138,19 @@ class FastSyncRead:
         self.reply_size = self._parts[-1][2]
 
     def unpack(self, received: bytes) -> list[Answer] | None:
-        end = self.reply_size - 2
-        if len(received) != end + 2 or not received.startswith(self._front):
+        if len(received) != self.reply_size or not received.startswith(self._front):
             return None
-        if crc16.umts(received[:end]) != received[end] | received[end + 1] << 8:
+        fields = self._whole.unpack(received)
+        if fields[-1] != _crc(received[:-2]):
             return None
         answers: list[Answer] = []
-        for servo_id, start, _ in self._parts:
-            answer = self._values.unpack_from(received, start)
-            if received[start + 1] != servo_id or answer[0] & _ERROR_BITS:
+        at, width = 0, self._width
+        for servo_id in self._ids:
+            error = fields[at]
+            if fields[at + 1] != servo_id or error & _ERROR_BITS:
                 return None
-            answers.append(answer)
+            answers.append((error, *fields[at + 2 : at + width - 1]))
+            at += width
         return answers
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
@@ -151,7 +159,7 @@ class FastSyncRead:
         answers: list[Answer] = []
         for servo_id, start, end in self._parts:
             whole = len(packet) >= end and packet[start + 1] == servo_id
-            if not whole or crc16.umts(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
+            if not whole or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
                 break
             answer = self._values.unpack_from(packet, start)
             answers.append(answer[:1] if answer[0] & _ERROR_BITS else answer)

@@ -96,13 +96,13 @@ def test_after_a_pulled_cable_the_bus_says_that_torque_is_not_confirmed(served_p
         if pulled == "before the write":
             pty.pull()
         else:
-            write = bus.port.write
 
-            def write_then_pull(data: bytes) -> None:
-                write(data)
+            def ask(data: bytes, count: int, timeout: float, start: float) -> bytes:
+                bus.port.write(data)
                 pty.pull()
+                return bus.port.read(count, timeout)
 
-            bus.port.write = write_then_pull  # type: ignore[method-assign]
+            bus.port.ask = ask  # type: ignore[method-assign]
         bus.exchange([0.1, 0.1])
     cause: Any = caught.value.__context__
     assert isinstance(cause, PortLost)
