@@ -60,9 +60,9 @@ def test_fast_sync_read_can_be_forbidden(fake_config: Make) -> None:
 def test_a_firmware_that_should_have_it_and_does_not_answer_is_read_the_old_way(
     fake_config: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from fakes.bus import FakeBus
+    from fakes.instructions import Instructions
 
-    monkeypatch.setattr(FakeBus, "_fast_sync_read", lambda *_: None)
+    monkeypatch.setattr(Instructions, "_fast_sync_read", lambda *_: None)
     with ServoBus.open(fake_config()) as bus:
         assert not bus.prepared.fast
         assert bus.exchange([0.0, 0.0]).missing == (False, False)
