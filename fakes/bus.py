@@ -17,11 +17,12 @@ from drivers.clock import Clock
 from drivers.packet import Packet
 from fakes.fault_effects import begin, end, put_with_faults
 from fakes.faults import Fault, FaultKind, Faults
-from fakes.instructions import Instructions, Reply
+from fakes.instructions import Instructions
 from fakes.plant import Plant
 from fakes.present import PRESENT_END, PRESENT_START
 from fakes.receiver import Receiver
 from fakes.servo import Servo
+from fakes.state_reads import Reply
 from fakes.supply import Supply
 from fakes.wire import Wire
 

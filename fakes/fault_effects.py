@@ -27,7 +27,8 @@ def begin(fault: Fault, servos: Sequence[Servo], plant: Plant, now: float) -> No
             case FaultKind.OVERLOAD:
                 servo.fail(HardwareError.OVERLOAD)
             case FaultKind.LOW_VOLTAGE:
-                servo.dip_v = servo.input_voltage_v - (servo.memory.get("Min Voltage Limit", 95) / 10 - fault.size)
+                lowest = servo.memory.get("Min Voltage Limit", 95) / 10
+                servo.dip(servo.input_voltage_v - (lowest - fault.size))
             case FaultKind.STUCK_JOINT:
                 _jam(plant, joint, True)
             case FaultKind.ENCODER_JUMP:
@@ -43,7 +44,7 @@ def end(fault: Fault, servos: Sequence[Servo], plant: Plant) -> None:
             case FaultKind.SILENT_SERVO:
                 servo.connected = True
             case FaultKind.LOW_VOLTAGE:
-                servo.dip_v = 0.0
+                servo.dip(0.0)
             case FaultKind.STUCK_JOINT:
                 _jam(plant, joint, False)
             case FaultKind.ENCODER_JUMP:

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from drivers.packet import (
-    ALERT,
     BROADCAST_ID,
     HEADER,
     MAX_LENGTH,
@@ -27,20 +26,11 @@ from drivers.packet import (
     encode_status,
 )
 from fakes.maintenance import RESET_ALL
-from fakes.present import STATE_END, STATE_START
 from fakes.servo import Servo
-
-_STATE_SPAN = STATE_START.to_bytes(2, "little") + (STATE_END - STATE_START).to_bytes(2, "little")
-_FRONT_LENGTH = 8  # header, ID, LEN, INST of a status
-_STUFFED = b"\xff\xff\xfd"
-_ALERT = {0: b"\0", ALERT: bytes((ALERT,))}
+from fakes.state_reads import SPAN, Reply, StateReads
 
 Part = tuple[int, int, int]
 """What a group read asks of one servo: ID, address, length."""
-
-
-Reply = tuple[int, float, bytes]
-"""Who speaks, how long it waits before it does [s], and its bytes."""
 
 
 class Line(Protocol):
@@ -75,7 +65,7 @@ class Instructions:
         self._by_id: dict[int, tuple[Servo, ...]] = {}
         self._shadows: dict[int, tuple[Servo, ...]] = {}
         self._writers: dict[int, tuple[Servo, ...]] = {}
-        self._state_reads: dict[bytes, tuple[tuple[Servo, int, bytes], ...]] = {}
+        self._state_reads = StateReads(self._servos, line)
         self._broadcast: dict[int, Callable[[bytes, float], None]] = {
             Instruction.PING: self._broadcast_ping,
             Instruction.SYNC_READ: self._sync_read,
@@ -90,7 +80,7 @@ class Instructions:
     def route(self) -> None:
         """Find out who listens to which ID."""
         self._by_id, self._shadows, self._writers = {}, {}, {}
-        self._state_reads.clear()
+        self._state_reads.forget()
         for servo in self._servos:
             self._by_id[servo.id] = (*self._by_id.get(servo.id, ()), servo)
             if servo.shadow_id is not None:
@@ -193,45 +183,17 @@ class Instructions:
     def _sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 4:
             return
-        if body.startswith(_STATE_SPAN) and self._state_read(body, now):
+        if body.startswith(SPAN) and (replies := self._state_reads.sync_read(body, self._by_id, now)):
+            self._line.send(replies, now)
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
         self._group_read([(servo_id, address, length) for servo_id in body[4:]], now)
 
-    def _state_read(self, body: bytes, now: float) -> bool:
-        """The group read of a control cycle, prepared once; False when it has to go the long way after all."""
-        prepared = self._state_reads.get(body)
-        if prepared is None:
-            prepared = self._state_reads[body] = self._prepare_state_read(body[4:])
-        positions, velocities, currents = self._line.joints()
-        replies = []
-        for servo, joint, front in prepared:
-            if servo.heard_at != now or not servo.status_return_level:
-                return False
-            state = servo.present.state(positions[joint], velocities[joint], currents[joint])
-            if _STUFFED in state:
-                reply = encode_status(servo.id, servo.alert, state)
-            else:
-                reply = front + _ALERT[servo.alert] + state
-                reply += crc(reply).to_bytes(2, "little")
-            replies.append((servo.id, servo.return_delay_s, reply))
-        if replies:
-            self._line.send(replies, now)
-        return bool(replies)
-
-    def _prepare_state_read(self, ids: bytes) -> tuple[tuple[Servo, int, bytes], ...]:
-        """Servos, their joints and the beginnings of their replies; empty when one of them is not as usual."""
-        prepared = []
-        for servo_id in ids:
-            servos = self._by_id.get(servo_id, ())
-            if len(servos) != 1 or not servos[0].model.operating_modes:
-                return ()
-            front = encode_status(servo_id, 0, bytes(STATE_END - STATE_START))[:_FRONT_LENGTH]
-            prepared.append((servos[0], self._servos.index(servos[0]), front))
-        return tuple(prepared)
-
     def _fast_sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 5:
+            return
+        if body.startswith(SPAN) and (replies := self._state_reads.fast_sync_read(body, self._by_id, now)):
+            self._line.send(replies, now)
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
         self._fast_read([(servo_id, address, length) for servo_id in body[4:]], now)
@@ -265,7 +227,7 @@ class Instructions:
         sent = 0
         for servo_id, address, length in parts:
             servo = self._answering(servo_id, now)
-            if servo is None or servo.firmware < servo.model.fast_read_firmware:
+            if servo is None or not servo.has_fast_reads:
                 break
             error, data = self._read(servo, address, length)
             whole += bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")

@@ -9,7 +9,6 @@ torque constant, is applied to the joint directly. A joint angle of the model is
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -87,11 +86,11 @@ def make_plant(
 
     torque_constant [N m/A], one per joint; current_lag [s], first order. Raises PlantError.
     """
+    is_text = model.lstrip().startswith("<")
     try:
-        is_text = model.lstrip().startswith("<")
         compiled = mujoco.MjModel.from_xml_string(model) if is_text else mujoco.MjModel.from_xml_path(model)
     except ValueError as error:
-        raise PlantError(f"model = {Path(model).name if len(model) < 200 else 'text'}: {error}") from error
+        raise PlantError(f"model = {'text' if is_text else model}: {error}") from error
     known = [
         mujoco.mj_id2name(compiled, mujoco.mjtObj.mjOBJ_JOINT, index)
         for index in range(compiled.njnt)

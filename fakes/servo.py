@@ -78,6 +78,8 @@ class Servo:
     ) -> None:
         self.model = model
         self.firmware = firmware
+        self.has_fast_reads = firmware >= model.fast_read_firmware
+        """Whether it knows Fast Sync Read, Fast Bulk Read and Control Table Backup."""
         self.connected = True
         """False: its bus cable is out. It hears nothing and says nothing; its motor does as last told."""
         self.heard_at = 0.0
@@ -252,13 +254,8 @@ class Servo:
             self._check_health()
             self._derive()
 
-    @property
-    def dip_v(self) -> float:
-        """What a fault takes off the supply's voltage [V]."""
-        return self._dip_v
-
-    @dip_v.setter
-    def dip_v(self, volt: float) -> None:
+    def dip(self, volt: float) -> None:
+        """Take so much off the supply's voltage [V]; 0 ends it."""
         self._dip_v = volt
         self._check_health()
         self._derive()
@@ -301,7 +298,7 @@ class Servo:
                     self.reboot(now)
             case Instruction.CLEAR:
                 error = self.present.clear(body, moving, self._angle())
-            case Instruction.CONTROL_TABLE_BACKUP if self.firmware >= self.model.fast_read_firmware:
+            case Instruction.CONTROL_TABLE_BACKUP if self.has_fast_reads:
                 error = self._backup.execute(self.memory, body)
                 self._derive()
             case _:
