@@ -58,6 +58,20 @@ def test_words_come_first_then_every_section_and_figure(identified: Path) -> Non
         assert said in page
 
 
+def test_a_run_in_steps_shows_prediction_beside_what_was_seen(identified: Path) -> None:
+    path = identified / "result.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    figures_of_step = [[0.1234 * row, -0.2] for row in range(6)]
+    step = {"name": "pilot", "peak_torque": [0.2, 0.1], "within_quantile": True}
+    step |= dict.fromkeys(("predicted_median", "predicted_quantile_99", "seen"), figures_of_step)
+    result["steps"] = [step, {**step, "name": "full", "within_quantile": False}]
+    path.write_text(json.dumps(result), encoding="utf-8")
+    page = make_page(RunData.load(identified))
+    assert "In full a peak went beyond" in page
+    assert "pilot, peak torque shoulder 0.2 N m and elbow 0.1 N m" in page
+    assert "0.617" in page
+
+
 def test_names_and_events_cannot_break_out_of_the_page(identified: Path) -> None:
     with (identified / "events.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps({"time": 99.0, "event": "<script>alert(1)</script>"}) + "\n")
