@@ -14,6 +14,7 @@ import pytest
 from hil.errors import ResultError, RunFolderError
 from hil.report.page import make_page, sections, write_report
 from hil.report.pictures import figures, save_pictures
+from hil.report.png import save_png
 from hil.report.run_data import RunData
 from hil.report.sections.verdict import verdict
 
@@ -146,8 +147,9 @@ def test_pictures_stand_alone_as_svg_and_png(identified: Path, tmp_path: Path) -
     for path in svgs:
         assert ET.parse(path).getroot().tag.endswith("svg")
     pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
-    for path in save_pictures(data, tmp_path / "pictures", "png"):
-        assert path.read_bytes().startswith(b"\x89PNG")
+    for figure in {type(figure): figure for figure in figures(data)}.values():
+        save_png(figure, tmp_path / f"{figure.name}.png")
+        assert (tmp_path / f"{figure.name}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_runs_that_are_not_whole_are_named(identified: Path, tmp_path: Path) -> None:
