@@ -30,7 +30,7 @@ def init(
     bauds = tuple(baud or BAUD_RATES)
     opened = open_port(url, bauds[0])
     try:
-        typer.echo(f"Asking at {len(bauds)} baud rates ...", err=True)
+        typer.echo("Asking who is on the bus ...", err=True)
         heard = list(scan(opened, bauds))
         answers = interview(opened, url, heard, _default if yes else _prompt, _say)
     finally:

@@ -49,8 +49,7 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for path in (ROOT / "configs").glob("*.toml"):
         text = path.read_text(encoding="utf-8")
         if path.stem.startswith("fake"):
-            for old, new in SHORT:
-                text = text.replace(old, new, 1)
+            text = cut_short(text)
             (here / path.stem).write_text(text, encoding="utf-8")  # found before the bundled one of that name
         (here / "configs" / path.name).write_text(text, encoding="utf-8")
     new = text_of_new_servos((here / "configs" / "fake_two_link.toml").read_text(encoding="utf-8"))
@@ -64,11 +63,15 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def text_of_new_servos(text: str) -> str:
-    """The same arm with servos as they come from the factory: 57600 baud."""
-    elbow = '[[fake.servos]]\nid = 2\n'
-    assert elbow in text
-    text = text.replace(elbow, elbow.replace("2", "3"))  # ID 2 is what a document gives to the new one
-    return text.replace("[[fake.servos]]\n", "[[fake.servos]]\nbaud = 57600\n")
+    """The same arm with servos as they come from the factory, at 57600 baud, and with ID 2 still free."""
+    new = text.replace("[[fake.servos]]\n", "[[fake.servos]]\nbaud = 57600\n")
+    return new.replace("baud = 57600\nid = 2", "baud = 57600\nid = 9")
+
+
+def cut_short(text: str) -> str:
+    for old, new in SHORT:
+        text = text.replace(old, new, 1)
+    return text
 
 
 def as_here(command: str) -> list[str]:
@@ -97,13 +100,15 @@ def test_commands_run(document: Path, place: Path, capsys: pytest.CaptureFixture
                 main()
             printed = capsys.readouterr()
             assert not caught.value.code, f"{command}: {printed.out[-500:]}{printed.err[-1000:]}"
+            if words[1] == "init":
+                mine = Path("my_arm.toml")
+                mine.write_text(cut_short(mine.read_text(encoding="utf-8")), encoding="utf-8")
         elif words[0] == "hil":
             serve(words)
         elif words[0] == "python" and words[1].startswith("examples/"):
             environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-            subprocess.run(
-                [sys.executable, *words[1:], "runs/finished"], check=True, capture_output=True, env=environment
-            )
+            command_line = [sys.executable, *words[1:], "runs/finished"]
+            subprocess.run(command_line, check=True, capture_output=True, env=environment)
         elif words[0] == "python":
             ast.parse((ROOT / words[1]).read_text(encoding="utf-8"))  # a benchmark: run by hand, it takes minutes
         else:

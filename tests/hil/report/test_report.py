@@ -14,6 +14,7 @@ import pytest
 from hil.errors import ResultError, RunFolderError
 from hil.report.page import make_page, sections, write_report
 from hil.report.pictures import figures, save_pictures
+from hil.report.png import save_png
 from hil.report.run_data import RunData
 from hil.report.sections.verdict import verdict
 
@@ -56,6 +57,20 @@ def test_words_come_first_then_every_section_and_figure(identified: Path) -> Non
         assert page.count(f'aria-label="{figure.title}') == 2
     for said in ("inertia_1", "gravity_2", "coulomb_2", "XM430-W350, ID 1", "seed"):
         assert said in page
+
+
+def test_a_run_in_steps_shows_prediction_beside_what_was_seen(identified: Path) -> None:
+    path = identified / "result.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    figures_of_step = [[0.1234 * row, -0.2] for row in range(6)]
+    step = {"name": "pilot", "peak_torque": [0.2, 0.1], "within_quantile": True}
+    step |= dict.fromkeys(("predicted_median", "predicted_quantile_99", "seen"), figures_of_step)
+    result["steps"] = [step, {**step, "name": "full", "within_quantile": False}]
+    path.write_text(json.dumps(result), encoding="utf-8")
+    page = make_page(RunData.load(identified))
+    assert "In full a peak went beyond" in page
+    assert "pilot, peak torque shoulder 0.2 N m and elbow 0.1 N m" in page
+    assert "0.617" in page
 
 
 def test_names_and_events_cannot_break_out_of_the_page(identified: Path) -> None:
@@ -132,8 +147,9 @@ def test_pictures_stand_alone_as_svg_and_png(identified: Path, tmp_path: Path) -
     for path in svgs:
         assert ET.parse(path).getroot().tag.endswith("svg")
     pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
-    for path in save_pictures(data, tmp_path / "pictures", "png"):
-        assert path.read_bytes().startswith(b"\x89PNG")
+    for figure in {type(figure): figure for figure in figures(data)}.values():
+        save_png(figure, tmp_path / f"{figure.name}.png")
+        assert (tmp_path / f"{figure.name}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_runs_that_are_not_whole_are_named(identified: Path, tmp_path: Path) -> None:

@@ -1,0 +1,46 @@
+"""What the dry runs had predicted of each step, pilot to full size, and what was then seen."""
+
+from typing import Any
+
+from hil.report.run_data import RunData
+from hil.report.section import Section, Table
+from hil.report.words import listed, number
+
+_QUANTITIES = (
+    "lowest position [rad]",
+    "highest position [rad]",
+    "velocity [rad/s]",
+    "current [A]",
+    "torque [N m]",
+    "power [W]",
+)
+"""Rows of a step's figures, as the dry run orders them."""
+
+
+def steps(data: RunData) -> Section | None:
+    """Where the run was played in steps."""
+    played = data.result.get("steps")
+    if not played:
+        return None
+    outside = [str(step["name"]) for step in played if not step["within_quantile"]]
+    said = (
+        f"In {listed(outside)} a peak went beyond what the dry run had given as the most in 99 of 100 arms."
+        if outside
+        else "Every peak with a limit stayed within what the dry run had given as the most in 99 of 100 arms."
+    )
+    tables = tuple(_table(step, data.names) for step in played)
+    return Section("steps", "Predicted before, seen after", (said,), tables)
+
+
+def _table(step: dict[str, Any], names: list[str]) -> Table:
+    rows = [
+        (
+            f"{name}: {quantity}",
+            *(number(step[key][row][joint], 3) for key in ("predicted_median", "predicted_quantile_99", "seen")),
+        )
+        for joint, name in enumerate(names)
+        for row, quantity in enumerate(_QUANTITIES)
+    ]
+    torque = listed([f"{name} {number(peak, 3)} N m" for name, peak in zip(names, step["peak_torque"], strict=True)])
+    head = ("joint and peak", "typical arm", "99 of 100 arms", "seen")
+    return Table(head, tuple(rows), caption=f"{step['name']}, peak torque {torque}")
