@@ -2,6 +2,7 @@
 
 HilError                    exit code
 ├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
+├── MissingExtra            2   an optional package is not installed
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
 └── ExperimentError         1   the experiment could not be finished
     ├── SafetyStop          1   the guard saw a limit passed and stopped the arm
@@ -29,6 +30,12 @@ class ConfigError(HilError):
 
 class RunFolderError(HilError):
     """The run folder cannot be used. Example: `--out` names a folder that holds another run."""
+
+    exit_code = 2
+
+
+class MissingExtra(HilError):
+    """An optional package is not installed. Example: `hil compare --peers mujoco` without the extra `peers`."""
 
     exit_code = 2
 
