@@ -1,55 +1,46 @@
-"""The servos of one arm on one port: set-up work before the control cycle, and torque off after it.
+"""The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
 
-Set-up goes through `dynamixel-sdk`'s packet handler on our port; every register that matters for safety is read back.
-"""
-
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
-
-from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
 from drivers.control_table import load_control_table, model_names
-from drivers.errors import (
-    DriverError,
-    NoReply,
-    ServoRefused,
-    TorqueNotOff,
-    WrongModel,
-    WrongReply,
-    WrongSetting,
-)
+from drivers.errors import DriverError, ServoFault, TorqueNotOff, WrongModel, WrongSetting
 from drivers.exchange import Exchange
 from drivers.joint import Joint
-from drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, StatusError, encode
-from drivers.port import Port, SdkPort
-from drivers.servo_model import WATCHDOG_UNIT
+from drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
+from drivers.port import Port, open_port
+from drivers.servo import Servo, describe_error
+from drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
+from drivers.state import NAN, Converter, State, spans
 
-_T = TypeVar("_T")
-
-CURRENT_MODE = 0
-_ATTEMPTS = 3
-"""How often a set-up exchange is tried before a damaged or missing reply is believed."""
+_PROBES = 3
+"""How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
 
 
-class State(NamedTuple):
-    """One sample of the arm in SI units; NaN where a servo did not answer.
+@dataclass(frozen=True)
+class BusConfig:
+    """Where the servos are and how they are talked to.
 
-    time_before_write, time_after_read: s on the port's clock. goal_current: what was sent, a whole number of ticks,
-    and current: what the servo measured [A]; velocity [rad/s]; position [rad]; error: the ERR bytes, 0 where missing.
+    url: device or pyserial URL. one_write: Sync Write and group read leave in one write; False where `hil check` finds
+    that an arm needs two. fast_sync_read: use it where every servo's firmware has it. slow_every: cycles from one
+    reading of tick or voltage and temperature to the next.
     """
 
-    time_before_write: float
-    time_after_read: float
-    goal_current: tuple[float, ...]
-    current: tuple[float, ...]
-    velocity: tuple[float, ...]
-    position: tuple[float, ...]
-    error: tuple[int, ...]
-    missing: tuple[bool, ...]
+    url: str
+    baud: int
+    joints: tuple[Joint, ...]
+    one_write: bool = True
+    fast_sync_read: bool = True
+    slow_every: int = 100
+
+    def __post_init__(self) -> None:
+        modes = {joint.mode for joint in self.joints}
+        if len(modes) != 1:
+            raise ValueError(
+                "One Sync Write drives all joints, so all must be in current mode or all in PWM mode: "
+                + ", ".join(f"{joint} is in {joint.mode.name} mode" for joint in self.joints)
+            )
 
 
 @dataclass(frozen=True)
@@ -64,34 +55,57 @@ class TorqueOff:
             return f"Torque is off on all {len(self.confirmed)} servos, read back."
         names = "; ".join(f"{joint}: {why}" for joint, why in self.unconfirmed)
         return (
-            f"TORQUE OFF IS NOT CONFIRMED for {names}. The Bus Watchdog stops a servo that hears nothing, but cut the "
+            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that hears nothing, but cut the "
             "supply before you reach into the arm."
         )
 
 
 class ServoBus:
-    """The servos of an arm on an open port. Use as a context manager; `close` may be called twice."""
+    """The servos of an arm on an open port. Use as a context manager; `close` may be called twice.
 
-    def __init__(self, port: Port, joints: Sequence[Joint]) -> None:
+        with ServoBus.open(BusConfig("/dev/ttyUSB0", 1_000_000, joints)) as bus, bus.torque(watchdog=0.1):
+            state = bus.exchange([0.1, 0.0])
+
+    After any error the same object can still send torque off, and `torque_off_report` says whether that succeeded.
+    """
+
+    def __init__(self, port: Port, config: BusConfig) -> None:
         self.port = port
-        self.joints = tuple(joints)
-        self._tables = {joint: load_control_table(joint.servo.name) for joint in self.joints}
-        self._sdk_port = SdkPort(port)
-        self._sdk = PacketHandler(2.0)
+        self.config = config
+        self.joints = config.joints
+        self._servos = {
+            joint: Servo(port, joint.id, load_control_table(joint.servo.name), joint.title) for joint in self.joints
+        }
         self._exchange: Exchange | None = None
+        self._converter = Converter(self.joints, [NAN] * len(self.joints))
         self.torque_off_report: TorqueOff | None = None
 
     @classmethod
-    def open(cls, url: str, baud: int, joints: Sequence[Joint]) -> ServoBus:
-        """Open the port; raises PortNotOpened. Nothing is sent yet."""
-        port = Port(url, baud)
+    def open(cls, config: BusConfig) -> "ServoBus":
+        """Open the port, check who answers, bring every servo into its mode with torque off.
+
+        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting; the port is closed then.
+        """
+        bus = cls.connect(config)
         try:
-            return cls(port, joints)
+            bus.check_identity()
+            bus.prepare()
+        except BaseException:
+            bus.close()
+            raise
+        return bus
+
+    @classmethod
+    def connect(cls, config: BusConfig) -> "ServoBus":
+        """Open the port and send nothing, for set-up work; raises PortNotOpened."""
+        port = open_port(config.url, config.baud)
+        try:
+            return cls(port, config)
         except BaseException:
             port.close()
             raise
 
-    def __enter__(self) -> ServoBus:
+    def __enter__(self) -> "ServoBus":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -100,88 +114,69 @@ class ServoBus:
     def close(self) -> None:
         self.port.close()
 
-    def read(self, joint: Joint, register: str) -> int:
-        """The value of a register, in ticks; raises NoReply, WrongReply, ServoRefused, PortLost."""
-        entry = self._tables[joint][register]
-
-        def ask() -> tuple[list[int], int, int]:
-            data, result, error = self._sdk.readTxRx(self._sdk_port, joint.id, entry.address, entry.size)
-            return data, result, error
-
-        return entry.decode(bytes(self._try(joint, f"reading {register}", ask)))
-
-    def write(self, joint: Joint, register: str, value: int) -> None:
-        """Write a register and read it back; raises as `read`, and ServoRefused when it reads back otherwise."""
-        entry = self._tables[joint][register]
-        data = list(entry.encode(value))
-
-        def send() -> tuple[None, int, int]:
-            result, error = self._sdk.writeTxRx(self._sdk_port, joint.id, entry.address, entry.size, data)
-            return None, result, error
-
-        self._try(joint, f"writing {value} to {register}", send)
-        actual = self.read(joint, register)
-        if actual != value:
-            raise ServoRefused(f"{_title(joint)}: {register} was written as {value} but reads back as {actual}.")
-
-    def ping(self, joint: Joint) -> int:
-        """The model number that answers at the joint's ID; raises as `read`."""
-
-        def ask() -> tuple[int, int, int]:
-            number, result, error = self._sdk.ping(self._sdk_port, joint.id)
-            return number, result, error
-
-        return self._try(joint, "ping", ask)
+    def servo(self, joint: Joint) -> Servo:
+        """The joint's servo, for reading and writing registers."""
+        return self._servos[joint]
 
     def check_identity(self) -> None:
         """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel."""
-        for joint in self.joints:
-            number = self.ping(joint)
-            if number != self._tables[joint].number:
+        for joint, servo in self._servos.items():
+            number = servo.ping()
+            if number != servo.table.number:
                 found = model_names().get(number, f"model number {number}")
                 raise WrongModel(
-                    f"{_title(joint)}: a {found} answers at ID {joint.id}, where the configuration has a "
+                    f"{joint.title}: a {found} answers at ID {joint.id}, where the configuration has a "
                     f"{joint.servo.name}. Correct `model` or `id` in the configuration, or change the servo's ID."
                 )
-            firmware = self.read(joint, "Firmware Version")
+            firmware = servo.read("Firmware Version")
             if firmware < joint.servo.watchdog_firmware:
                 raise WrongModel(
-                    f"{_title(joint)}: firmware {firmware} has no Bus Watchdog; {joint.servo.watchdog_firmware} or "
+                    f"{joint.title}: firmware {firmware} has no Bus Watchdog; {joint.servo.watchdog_firmware} or "
                     "newer is needed. Update it with DYNAMIXEL Wizard 2.0."
                 )
 
     def prepare(self) -> None:
-        """Bring every servo into current mode with torque off, and prepare the exchange.
+        """Bring every servo into its mode with torque off, and prepare the exchange.
 
-        Raises WrongSetting where a register forbids an experiment and changing it is the user's decision.
+        Raises ServoFault, and WrongSetting where a register forbids an experiment and changing it is the user's
+        decision.
         """
-        delays = []
-        for joint in self.joints:
-            self.write(joint, "Torque Enable", 0)
-            fault = self.read(joint, "Hardware Error Status")
-            if fault:
-                raise WrongSetting(
-                    f"{_title(joint)} reports {HardwareError(fault)!r}; it stays without torque until it is rebooted. "
-                    "Find the cause, then switch the supply off and on."
-                )
-            drive_mode = self.read(joint, "Drive Mode")
-            if drive_mode:
-                raise WrongSetting(
-                    f"{_title(joint)}: Drive Mode is {drive_mode}, 0 is needed (no reverse, no torque on by goal). "
-                    "Set it to 0 with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
-                )
-            if self.read(joint, "Operating Mode") != CURRENT_MODE:
-                self.write(joint, "Operating Mode", CURRENT_MODE)
-            delays.append(2e-6 * self.read(joint, "Return Delay Time"))
-        self._exchange = Exchange(
+        self.port.lower_latency()
+        for joint, servo in self._servos.items():
+            _prepare_servo(joint, servo)
+        supply = [VOLTAGE_UNIT * servo.read("Present Input Voltage") for servo in self._servos.values()]
+        units = [joint.drive_unit(voltage) for joint, voltage in zip(self.joints, supply, strict=True)]
+        self._converter = Converter(self.joints, units)
+        one_write = self.config.one_write
+        fast = self.config.fast_sync_read and self.knows_fast_sync_read()
+        exchange = self.make_exchange(fast=fast, one_write=one_write)
+        nothing = [0] * len(self.joints)
+        if fast and all(None in exchange.cycle(nothing).servos for _ in range(_PROBES)):
+            exchange = self.make_exchange(fast=False, one_write=one_write)
+        self._exchange = exchange
+
+    def knows_fast_sync_read(self) -> bool:
+        """Whether every servo's firmware has Fast Sync Read."""
+        return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
+
+    def make_exchange(self, *, fast: bool, one_write: bool, slow_every: int | None = None) -> Exchange:
+        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first."""
+        servos = self._servos.values()
+        tables = [servo.table for servo in servos]
+        mode = self.joints[0].mode
+        return Exchange(
             self.port,
-            [joint.id for joint in self.joints],
-            [self._tables[joint] for joint in self.joints],
-            max(delays),
+            [servo.id for servo in servos],
+            tables[0]["Goal Current" if mode is Mode.CURRENT else "Goal PWM"],
+            spans(mode, tables),
+            max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos),
+            fast=fast,
+            one_write=one_write,
+            slow_every=slow_every or self.config.slow_every,
         )
 
     @property
-    def exchange_timing(self) -> Exchange:
+    def prepared(self) -> Exchange:
         """The prepared exchange; raises RuntimeError before `prepare`."""
         if self._exchange is None:
             raise RuntimeError("ServoBus.prepare has not been called")
@@ -189,37 +184,29 @@ class ServoBus:
 
     def read_positions(self) -> tuple[float, ...]:
         """Every joint's angle [rad], by set-up reads."""
-        return tuple(joint.angle(self.read(joint, "Present Position")) for joint in self.joints)
+        return tuple(joint.angle(servo.read("Present Position")) for joint, servo in self._servos.items())
 
-    def exchange(self, goal_current: Sequence[float]) -> State:
-        """Send goal currents [A], one per joint, and read the arm's state. Raises PortLost, ValueError on NaN."""
-        joints = self.joints
-        ticks = [joint.current_ticks(goal) for joint, goal in zip(joints, goal_current, strict=True)]
-        before, after, replies = self.exchange_timing.cycle(ticks)
-        sent = tuple([joint.current_unit * tick for joint, tick in zip(joints, ticks, strict=True)])
-        current, velocity, position, error, missing = [], [], [], [], []
-        for joint, reply in zip(joints, replies, strict=True):
-            if reply is None:
-                current.append(_NAN)
-                velocity.append(_NAN)
-                position.append(_NAN)
-                error.append(0)
-            else:
-                current.append(reply.current_ticks * joint.current_unit)
-                velocity.append(reply.velocity_ticks * joint.velocity_unit)
-                position.append((reply.position_ticks - joint.zero_ticks) * joint.position_unit)
-                error.append(reply.error)
-            missing.append(reply is None)
-        return State(
-            before,
-            after,
-            sent,
-            tuple(current),
-            tuple(velocity),
-            tuple(position),
-            tuple(error),
-            tuple(missing),
-        )
+    def exchange(self, goals: Sequence[float]) -> State:
+        """Send goals, one per joint [A, or V under PWM], and read the arm's state.
+
+        A silent servo is marked missing. Raises PortLost; ValueError for a goal that is no number.
+        """
+        ticks = self._converter.ticks(goals)
+        exchange = self._exchange or self.prepared
+        return self._converter.state(ticks, exchange.cycle(ticks))
+
+    def check_alerts(self, state: State) -> None:
+        """Where a servo raised its alert bit, read the cause; raises ServoFault, which names all of them."""
+        faults = [self._fault(joint) for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
+        if faults:
+            raise ServoFault(" ".join(faults))
+
+    def _fault(self, joint: Joint) -> str:
+        try:
+            cause = describe_error(self._servos[joint].hardware_error())
+        except DriverError as error:
+            cause = f"unknown, it could not be read ({error})"
+        return _fault_text(joint, cause)
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
@@ -241,69 +228,61 @@ class ServoBus:
         ticks = round(watchdog / WATCHDOG_UNIT)
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
-        for joint in self.joints:
-            self.write(joint, "Bus Watchdog", 0)
+        for joint, servo in self._servos.items():
+            servo.write("Bus Watchdog", 0)
             # Changing Operating Mode leaves Goal Current at Current Limit.
-            self.write(joint, "Goal Current", 0)
-            self.write(joint, "Bus Watchdog", ticks)
-        for joint in self.joints:
-            self.write(joint, "Torque Enable", 1)
+            servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
+            servo.write("Bus Watchdog", ticks)
+        for servo in self._servos.values():
+            servo.write("Torque Enable", 1)
 
     def torque_off(self) -> TorqueOff:
         """Cut torque on every servo and read it back. Tries all of them whatever fails; never raises DriverError."""
         self._broadcast_torque_off()
         confirmed, unconfirmed = [], []
-        for joint in self.joints:
+        for joint, servo in self._servos.items():
             try:
-                self.write(joint, "Torque Enable", 0)
+                servo.write("Torque Enable", 0)
             except DriverError as error:
                 unconfirmed.append((joint, str(error)))
             else:
                 confirmed.append(joint)
                 with suppress(DriverError):
-                    self.write(joint, "Bus Watchdog", 0)
+                    servo.write("Bus Watchdog", 0)
         self.torque_off_report = TorqueOff(tuple(confirmed), tuple(unconfirmed))
         return self.torque_off_report
 
     def _broadcast_torque_off(self) -> None:
         """One packet to all servos first: it takes 0.2 ms, the confirmed writes after it some ms each."""
-        entry = self._tables[self.joints[0]]["Torque Enable"]
+        entry = self._servos[self.joints[0]].table["Torque Enable"]
         body = entry.address.to_bytes(2, "little") + b"\x00"
-        try:
+        # Where this fails, the confirmed writes will say so.
+        with suppress(DriverError):
             self.port.write(encode(BROADCAST_ID, Instruction.WRITE, body))
-        except DriverError:
-            return  # the confirmed writes will say so
-
-    def _try(self, joint: Joint, what: str, action: Callable[[], tuple[_T, int, int]]) -> _T:
-        """Run one SDK exchange until it succeeds, at most `_ATTEMPTS` times; turn result codes into exceptions."""
-        for _ in range(_ATTEMPTS):
-            value, result, error = action()
-            if result == COMM_SUCCESS:
-                break
-        if result == COMM_RX_TIMEOUT:
-            raise NoReply(
-                f"{_title(joint)} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its "
-                "supply, its cable, its ID and its baud rate."
-            )
-        if result != COMM_SUCCESS:
-            text = self._sdk.getTxRxResult(result)
-            raise WrongReply(f"{_title(joint)}: {what} failed: {text} Do two servos share ID {joint.id}?")
-        refused = error & ~ALERT
-        if refused:
-            raise ServoRefused(f"{_title(joint)} refused {what}: {_status_error(refused)}.")
-        return value
 
 
-_NAN = float("nan")
+def _prepare_servo(joint: Joint, servo: Servo) -> None:
+    servo.write("Torque Enable", 0)
+    fault = servo.hardware_error()
+    if fault != HardwareError(0):
+        raise ServoFault(_fault_text(joint, describe_error(fault)))
+    drive_mode = servo.read("Drive Mode")
+    if drive_mode:
+        raise WrongSetting(
+            f"{joint.title}: Drive Mode is {drive_mode}, 0 is needed (no reverse, no torque on by goal). "
+            "Set it to 0 with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
+        )
+    if servo.read("Operating Mode") != joint.mode:
+        servo.write("Operating Mode", joint.mode)
 
 
-def _title(joint: Joint) -> str:
-    text = str(joint)
-    return text[0].upper() + text[1:]
+def _fault_text(joint: Joint, cause: str) -> str:
+    return (
+        f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
+        "find the cause, then switch its supply off and on."
+    )
 
 
-def _status_error(code: int) -> str:
-    try:
-        return StatusError(code).name.replace("_", " ").lower() + " error"
-    except ValueError:
-        return f"error {code}"
+def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:
+    needed = joint.servo.fast_sync_read_firmware
+    return needed is not None and servo.read("Firmware Version") >= needed

@@ -2,11 +2,13 @@
 
 DriverError
 ├── UnknownModel        a model name or number that no control table describes
-├── PortNotOpened       the port does not exist, is taken, or may not be opened
+├── PortNotOpened       the port does not exist, is taken, or cannot do this baud
+│   └── NotPermitted    the port exists, but this user may not open it
 ├── PortLost            the port was open and then failed: cable pulled, adapter gone
 ├── NoReply             a servo did not answer: wrong ID, wrong baud rate, no power
 ├── WrongReply          a servo answered with something that is not an answer to the question
 ├── ServoRefused        a servo answered with an error code: access, range, limit
+├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
 ├── WrongModel          another model, or one whose firmware is too old, answers at this ID
 ├── WrongSetting        a register holds a value with which no experiment may start
 └── TorqueNotOff        a servo could not be confirmed to be without torque
@@ -14,7 +16,12 @@ DriverError
 
 
 class DriverError(Exception):
-    """Anything that went wrong between the computer and the servos."""
+    """Anything that went wrong between the computer and the servos.
+
+    last_samples: what an experiment had recorded last before it, where one was running.
+    """
+
+    last_samples: object = None
 
 
 class UnknownModel(DriverError):
@@ -22,7 +29,11 @@ class UnknownModel(DriverError):
 
 
 class PortNotOpened(DriverError):
-    """The port could not be opened. Example: the adapter is unplugged, or the user is not in group `dialout`."""
+    """The port could not be opened. Example: the adapter is unplugged, or another program has the port."""
+
+
+class NotPermitted(PortNotOpened):
+    """The user may not open the port. Example: a new user who is not in group `dialout`."""
 
 
 class PortLost(DriverError):
@@ -39,6 +50,10 @@ class WrongReply(DriverError):
 
 class ServoRefused(DriverError):
     """The servo understood and refused. Example: an EEPROM register written while torque is on."""
+
+
+class ServoFault(DriverError):
+    """The servo reports a hardware error. Example: overload, after which it stays without torque until rebooted."""
 
 
 class WrongModel(DriverError):

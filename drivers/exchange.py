@@ -1,129 +1,165 @@
-"""The control cycle on the wire: goal currents out, states in, one write and one bounded read.
+"""The control cycle on the wire: goals out, states in, one write and one bounded read.
 
-A Sync Write has no reply, so the Sync Read that follows it leaves in the same write: one transaction of the adapter
-instead of two. Both packets are prepared once; a cycle patches the goal currents and one CRC.
+A Sync Write has no reply, so the group read that follows it leaves in the same write: one transaction of the adapter
+instead of two. All packets are prepared once; a cycle packs the goals and one CRC.
+
+Which registers come back may change from cycle to cycle: `spans[0]` mostly, and every `slow_every`-th time one of the
+others, in turn. All spans should hold what the control needs; the slow ones hold more.
 """
 
 import struct
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from drivers.clock import Clock
-from drivers.control_table import ControlTable
-from drivers.packet import BROADCAST_ID, Framer, Instruction, Packet, crc, encode
-from drivers.port import ADAPTER_LATENCY_S, Port
+from fastcrc import crc16
 
-_STATE = struct.Struct("<hii")  # Present Current, Present Velocity, Present Position
-_REPLY = struct.Struct("<4sBHBBhiiH")  # header, ID, LEN, INST, ERR, the three above, CRC
-_HEADER = b"\xff\xff\xfd\x00"
-_REPLY_LENGTH = _STATE.size + 4  # INST, ERR, CRC
+from drivers.control_table import Register
+from drivers.packet import BROADCAST_ID, HEADER, Instruction
+from drivers.port import Port
+from drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
+HOST_S = 0.75e-3
+"""Allowed for the computer itself, USB frames included, on top of what wire, servos and adapter take."""
 
-class ServoReply(NamedTuple):
-    """One servo's answer, in ticks. `error` is the ERR byte: its low bits a StatusError, bit 7 the Alert."""
-
-    error: int
-    current_ticks: int
-    velocity_ticks: int
-    position_ticks: int
+_CRC = struct.Struct("<H")
 
 
 class Reply(NamedTuple):
-    """One exchange: times on the port's clock [s] and one answer per servo, None where none came."""
+    """One exchange: times on the port's clock [s], which of the spans was read, and one answer per servo.
+
+    See drivers.sync_read for what an answer is; None where none came.
+    """
 
     time_before_write: float
     time_after_read: float
-    servos: Sequence[ServoReply | None]
+    span: int
+    servos: Sequence[Answer]
 
 
 class Exchange:
-    """Sync Write of Goal Current and Sync Read of Present Current, Velocity and Position for a fixed list of servos.
+    """Sync Write of a two-byte goal register and a group read of the servos' state, for a fixed list of servos.
 
-    tables: each servo's control table; all must hold these registers at the same addresses.
-    return_delay: the longest Return Delay Time of the servos [s].
+    return_delay: the longest Return Delay Time of the servos [s]. fast: read with Fast Sync Read. one_write: both
+    packets leave in one write; else in two. slow_every: cycles from one slow span to the next.
     """
 
-    def __init__(self, port: Port, ids: Sequence[int], tables: Sequence[ControlTable], return_delay: float) -> None:
+    def __init__(
+        self,
+        port: Port,
+        ids: Sequence[int],
+        goal: Register,
+        spans: Sequence[Span],
+        return_delay: float,
+        *,
+        fast: bool = False,
+        one_write: bool = True,
+        slow_every: int = 100,
+    ) -> None:
+        if goal.size != 2:
+            raise ValueError(f"{goal.name} has {goal.size} bytes; a goal of 2 bytes is needed.")
         self._port = port
-        self._clock: Clock = port.clock
+        self._clock = port.clock
         self.ids = tuple(ids)
-        goal, first = tables[0]["Goal Current"], tables[0]["Present Current"]
-        for table in tables:
-            if table["Goal Current"] != goal or table["Present Current"] != first:
-                raise ValueError(f"{table.model} and {tables[0].model} do not share addresses on one bus.")
-        goals = b"".join(bytes((servo_id, 0, 0)) for servo_id in ids)
-        header = goal.address.to_bytes(2, "little") + goal.size.to_bytes(2, "little")
-        write = encode(BROADCAST_ID, Instruction.SYNC_WRITE, header + goals)
-        span = first.address.to_bytes(2, "little") + _STATE.size.to_bytes(2, "little")
-        read = encode(BROADCAST_ID, Instruction.SYNC_READ, span + bytes(ids))
-        # Two-byte values between ID bytes can never hold FF FF FD, so the length of the Sync Write never changes.
-        self._crc_at = len(write) - 2
-        self._goals_at = [len(write) - 2 - 3 * len(ids) + 3 * index + 1 for index in range(len(ids))]
-        self._request = bytearray(write + read)
-        self._reply_size = _REPLY.size * len(ids)
-        self.command_to_sample = port.wire_time(len(read))
-        """Seconds from the goal currents' arrival at the servos to the arrival of the request for their state."""
-        wire = port.wire_time(len(self._request) + self._reply_size + 4 * len(ids))
-        self._timeout = wire + return_delay * len(ids) + ADAPTER_LATENCY_S
+        self.fast = fast
+        self.one_write = one_write
+        # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
+        self._write = struct.Struct("<12s" + "Bh" * len(self.ids))
+        self._fields: list[bytes | int] = [_front(goal, len(self.ids))]
+        for servo_id in self.ids:
+            self._fields += [servo_id, 0]
+        self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in spans]
+        self._timeouts = [self._timeout(read, return_delay) for read in self._reads]
+        self._slow_every = slow_every
+        self._until_slow = slow_every
+        self._slow = 0
+        self._span = 0
         self._late_possible = False
 
-    def cycle(self, goal_current_ticks: Sequence[int]) -> Reply:
-        """Send one goal current per servo and read all states. Raises PortLost; a silent servo is a None."""
-        request = self._request
-        for at, ticks in zip(self._goals_at, goal_current_ticks, strict=True):
-            struct.pack_into("<h", request, at, ticks)
-        struct.pack_into("<H", request, self._crc_at, crc(bytes(request[: self._crc_at])))
-        if self._late_possible:
-            # A reply that came after its timeout must not be taken for the answer to this request.
-            self._port.discard_input()
-            self._late_possible = False
+    @property
+    def command_to_sample(self) -> float:
+        """s from the goals' arrival at the servos to the arrival of the request for their state: what lies between them
+        on the wire. With two writes the adapter may add a pause that is not known here.
+        """
+        return self._port.wire_time(len(self._reads[0].request))
+
+    @property
+    def longest(self) -> float:
+        """s that the longest exchange takes on the wire, without adapter and computer: no faster cycle is possible."""
+        return self._port.wire_time(max(self._bytes(read) for read in self._reads))
+
+    def cycle(self, goal_ticks: Sequence[int]) -> Reply:
+        """Send one goal per servo and read all states. A silent servo is a None.
+
+        Raises PortLost; ValueError for a wrong number of goals or one that does not fit into two bytes.
+        """
+        port = self._port
+        span = self._next_span()
+        read = self._reads[span]
+        fields = self._fields
+        fields[2::2] = goal_ticks
+        try:
+            goals = self._write.pack(*fields)
+        except struct.error:
+            raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
+        goals += _CRC.pack(crc16.umts(goals))
         before = self._clock.now()
-        self._port.write(request)
-        received = self._port.read(self._reply_size, self._timeout)
-        servos = self._unpack(received)
+        if self.one_write:
+            port.write(goals + read.request)
+        else:
+            port.write(goals)
+            port.write(read.request)
+        timeout = self._timeouts[span]
+        received = port.read(read.reply_size, timeout)
+        servos = read.unpack(received)
         if servos is None:
-            servos = self._search(received, before + self._timeout)
-        return Reply(before, self._clock.now(), servos)
+            servos = self._search(read, received, before + timeout)
+        return Reply(before, self._clock.now(), span, servos)
 
-    def _unpack(self, received: bytes) -> list[ServoReply | None] | None:
-        """The usual case: every servo answered, no byte was stuffed. None when it is not that case."""
-        if len(received) != self._reply_size:
-            return None
-        servos: list[ServoReply | None] = []
-        size = _REPLY.size
-        for index, servo_id in enumerate(self.ids):
-            raw = received[index * size : (index + 1) * size]
-            header, sender, length, instruction, error, current, velocity, position, check = _REPLY.unpack(raw)
-            if (
-                header != _HEADER
-                or sender != servo_id
-                or length != _REPLY_LENGTH
-                or instruction != Instruction.STATUS
-                or check != crc(raw[:-2])
-            ):
-                return None
-            servos.append(ServoReply(error, current, velocity, position))
-        return servos
+    def _next_span(self) -> int:
+        """The span to read now; drops what a former request may still have brought in."""
+        self._until_slow -= 1
+        if self._late_possible:
+            self._late_possible = False
+            self._port.discard_input()
+            # An answer that comes later still must not be taken for the answer to this request. Nothing in a packet
+            # says which request it answers, but its length does when the spans differ.
+            self._span = self._next_slow() if self._span == 0 else 0
+        elif self._until_slow <= 0:
+            self._until_slow = self._slow_every
+            self._span = self._next_slow()
+        else:
+            self._span = 0
+        return self._span
 
-    def _search(self, received: bytes, deadline: float) -> list[ServoReply | None]:
+    def _next_slow(self) -> int:
+        slow = len(self._reads) - 1
+        if not slow:
+            return 0
+        self._slow = self._slow % slow + 1
+        return self._slow
+
+    def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:
         """Find the answers among stuffed, damaged or missing ones, reading on until all are there or time is up."""
-        framer = Framer()
-        found: dict[int, ServoReply] = {}
         while True:
-            for packet in framer.feed(received):
-                reply = _reply_of(packet)
-                if reply is not None and packet.id in self.ids:
-                    found[packet.id] = reply
+            answers, over = read.search(received)
             remaining = deadline - self._clock.now()
-            if len(found) == len(self.ids) or remaining <= 0:
+            if over or remaining <= 0:
                 break
             # Byte by byte: how long a stuffed packet is shows only as it comes.
-            received = self._port.read(1, remaining)
-        self._late_possible = len(found) < len(self.ids)
-        return [found.get(servo_id) for servo_id in self.ids]
+            received += self._port.read(1, remaining)
+        self._late_possible = None in answers
+        return answers
+
+    def _timeout(self, read: GroupRead, return_delay: float) -> float:
+        # Each servo's answer may be stuffed twice.
+        wire = self._port.wire_time(self._bytes(read) + 2 * len(self.ids))
+        return wire + return_delay * len(self.ids) + self._port.latency + HOST_S
+
+    def _bytes(self, read: GroupRead) -> int:
+        return self._write.size + _CRC.size + len(read.request) + read.reply_size
 
 
-def _reply_of(packet: Packet) -> ServoReply | None:
-    if not packet.is_status or len(packet.data) != _STATE.size:
-        return None
-    return ServoReply(packet.error, *_STATE.unpack(packet.data))
+def _front(goal: Register, count: int) -> bytes:
+    """A Sync Write up to its first ID."""
+    length = 7 + 3 * count  # INST, address, size, then per servo ID and value, CRC
+    return struct.pack("<4sBHBHH", HEADER, BROADCAST_ID, length, Instruction.SYNC_WRITE, goal.address, goal.size)

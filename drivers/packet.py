@@ -134,11 +134,13 @@ class Framer:
     A packet whose CRC does not match is counted in `bad_crc`. A host then looks for a header right behind the failed
     one, since its length may be what was corrupted. With `damaged=True` the framer does as a servo: it believes the
     length and gives the packet marked as damaged, because a servo answers it with an error.
+    A LEN above `longest` is noise.
     """
 
-    def __init__(self, *, damaged: bool = False) -> None:
+    def __init__(self, *, damaged: bool = False, longest: int = MAX_LENGTH) -> None:
         self._buffer = bytearray()
         self._give_damaged = damaged
+        self._longest = longest
         self.bad_crc = 0
         self.noise_bytes = 0
 
@@ -171,7 +173,7 @@ class Framer:
             if len(buffer) < 7:
                 return None
             length = buffer[5] | buffer[6] << 8
-            if length < 3 or length > MAX_LENGTH or buffer[4] in _NO_ID:
+            if length < 3 or length > self._longest or buffer[4] in _NO_ID:
                 self._drop(1)
                 continue
             end = 7 + length

@@ -1,57 +1,61 @@
 """A serial port that cannot wedge: any pyserial URL, bounded reads, one error when the cable is gone.
 
-Two classes: `Port` for us, and `SdkPort`, which lets `dynamixel-sdk` work on the same open port.
+`open_port` opens one. `Port` works through pyserial and so on anything that pyserial can open; `DescriptorPort`
+does the reading and writing of a local device itself, at half of pyserial's cost per cycle.
 """
 
 import contextlib
+import os
+import select
 import termios
-from typing import Protocol, cast
+import time
+from typing import Any, cast
 
 import serial
 
 from drivers.clock import Clock, WallClock
-from drivers.errors import PortLost, PortNotOpened
-
-ADAPTER_LATENCY_S = 0.016
-"""Latency timer of an FTDI adapter as it comes from the factory: the longest that a reply may lie in it."""
+from drivers.errors import NotPermitted, PortLost, PortNotOpened
+from drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
 
 _FAILURES = (OSError, termios.error)
-# OSError covers SerialException. A pulled cable gives termios.error from reset_input_buffer.
+# OSError covers SerialException. A pulled cable gives termios.error, which is no OSError, from flushing the input.
+
+_WRITE_PATIENCE_S = 0.1
+"""How long a device may refuse to take bytes before it counts as lost."""
 
 
-class _Serial(Protocol):
-    """What we use of a pyserial port."""
-
-    timeout: float | None
-
-    def read(self, size: int = ..., /) -> bytes: ...
-    def write(self, data: bytes | bytearray, /) -> int | None: ...
-    def reset_input_buffer(self) -> None: ...
-    def close(self) -> None: ...
+def open_port(url: str, baud: int) -> "Port":
+    """Open a device or pyserial URL; raises PortNotOpened, which says why and what to do."""
+    try:
+        # exclusive: a second program on the same bus would steal replies and send goals of its own.
+        opened = serial.serial_for_url(url, baudrate=baud, timeout=0, exclusive=True)
+    except (OSError, termios.error, ValueError) as error:
+        kind = NotPermitted if "Permission denied" in str(error) else PortNotOpened
+        raise kind(f"Cannot open port {url!r} at {baud} baud: {_why(error)}. {_advice(error)}".rstrip()) from error
+    return (DescriptorPort if type(opened) is serial.Serial else Port)(url, baud, opened)
 
 
 class Port:
-    """An open serial port.
+    """An open serial port. Every method but `close` raises PortLost when the device fails.
 
-    Raises PortNotOpened from the constructor and PortLost from everything else; after PortLost the port may be used
-    again (a replugged cable needs a new Port) and `close` never raises.
+    After PortLost the same object may be used again, and fails again as long as the device is gone; a cable that was
+    plugged in again needs a new port. `latency` is the longest that a reply may lie in the adapter [s].
     """
 
-    def __init__(self, url: str, baud: int) -> None:
+    def __init__(self, url: str, baud: int, opened: Any) -> None:
         self.url = url
         self.baud = baud
-        try:
-            self._serial = cast(_Serial, serial.serial_for_url(url, baudrate=baud, timeout=0))
-        except (*_FAILURES, ValueError) as error:
-            raise PortNotOpened(f"Cannot open port {url!r} at {baud} baud: {_why(error)}") from error
-        self.clock: Clock = getattr(self._serial, "clock", None) or WallClock()
+        self.latency = adapter_latency(url)
+        self._serial = opened
+        self.clock: Clock = getattr(opened, "clock", None) or WallClock()
         self.is_open = True
 
     def wire_time(self, count: int) -> float:
         """Seconds that `count` bytes take on the wire (8 data bits, start and stop)."""
         return count * 10 / self.baud
 
-    def write(self, data: bytes | bytearray) -> None:
+    def write(self, data: bytes) -> None:
+        """Send bytes; returns when the device has taken them, not when they have left it."""
         try:
             self._serial.write(data)
         except _FAILURES as error:
@@ -63,7 +67,7 @@ class Port:
             # Setting the timeout makes pyserial look at the terminal's settings, so only when it changes.
             if self._serial.timeout != timeout:
                 self._serial.timeout = timeout
-            return self._serial.read(count)
+            return cast(bytes, self._serial.read(count))
         except _FAILURES as error:
             raise self._lost(error) from error
 
@@ -74,6 +78,25 @@ class Port:
         except _FAILURES as error:
             raise self._lost(error) from error
 
+    def set_baud(self, baud: int) -> None:
+        """Change the port's baud; raises PortNotOpened when the adapter cannot."""
+        try:
+            self._serial.baudrate = baud
+        except (*_FAILURES, ValueError) as error:
+            raise PortNotOpened(f"Port {self.url!r} cannot be set to {baud} baud: {_why(error)}.") from error
+        self.baud = baud
+
+    def lower_latency(self) -> bool:
+        """Set the adapter's latency timer to 1 ms; False when it has one and that was not permitted."""
+        file = latency_timer(self.url)
+        if file is None or read_latency_ms(file) <= WANTED_MS:
+            return True
+        if not write_latency_ms(file):
+            with contextlib.suppress(*_FAILURES, ValueError, NotImplementedError):
+                self._serial.set_low_latency_mode(True)
+        self.latency = adapter_latency(self.url)
+        return read_latency_ms(file) <= WANTED_MS
+
     def close(self) -> None:
         """Close; harmless when closed or when the cable is gone."""
         self.is_open = False
@@ -81,57 +104,98 @@ class Port:
             self._serial.close()
 
     def _lost(self, error: BaseException) -> PortLost:
+        if not self.is_open:
+            return PortLost(f"Port {self.url!r} was closed.")
         return PortLost(f"Port {self.url!r} failed: {_why(error)}. Is the cable plugged in and the adapter powered?")
 
 
-class SdkPort:
-    """The port that `dynamixel-sdk`'s packet handler works on, in place of its own PortHandler.
+class DescriptorPort(Port):
+    """A local device, read and written on its file descriptor.
 
-    Against that one: reads wait instead of polling, time is the port's clock, and a failure cannot leave the port
-    marked as in use, after which torque could never be switched off. Method names are the SDK's.
+    pyserial opens and configures it, without blocking and with VMIN = VTIME = 0.
     """
 
-    def __init__(self, port: Port, reply_timeout: float = ADAPTER_LATENCY_S + 2e-3) -> None:
-        self._port = port
-        self._reply_timeout = reply_timeout
-        self._deadline = 0.0
+    def __init__(self, url: str, baud: int, opened: Any) -> None:
+        super().__init__(url, baud, opened)
+        self._descriptor: int = opened.fileno()
+        poll = select.poll()
+        poll.register(self._descriptor, select.POLLIN)
+        self._wait_ms = poll.poll
 
-    @property
-    def is_using(self) -> bool:
-        return False
+    def write(self, data: bytes) -> None:
+        try:
+            written = os.write(self._descriptor, data)
+            if written < len(data):
+                self._write_rest(data[written:])
+        except BlockingIOError:
+            self._write_rest(data)
+        except OSError as error:
+            raise self._lost(error) from error
 
-    @is_using.setter
-    def is_using(self, value: bool) -> None:
-        """The SDK sets it around each exchange and leaves it set after an exception: not kept."""
+    def read(self, count: int, timeout: float) -> bytes:
+        deadline = time.perf_counter() + timeout
+        try:
+            received = self._read_once(count, timeout)
+            while len(received) < count and (remaining := deadline - time.perf_counter()) > 0:
+                received += self._read_once(count - len(received), remaining)
+        except OSError as error:
+            raise self._lost(error) from error
+        return received
 
-    def getBaudRate(self) -> int:  # noqa: N802
-        return self._port.baud
+    def discard_input(self) -> None:
+        try:
+            termios.tcflush(self._descriptor, termios.TCIFLUSH)
+        except (*_FAILURES, ValueError) as error:  # ValueError: closed
+            raise self._lost(error) from error
 
-    def clearPort(self) -> None:  # noqa: N802
-        self._port.discard_input()
+    def close(self) -> None:
+        # A closed number may soon be another file's: nothing of ours may touch it again.
+        self._descriptor = -1
+        self._wait_ms = _never_ready
+        super().close()
 
-    def writePort(self, packet: list[int]) -> int:  # noqa: N802
-        self._port.write(bytes(packet))
-        return len(packet)
+    def _read_once(self, count: int, timeout: float) -> bytes:
+        """What one wait of at most `timeout` [s] brings; nothing when it brings nothing. Raises OSError."""
+        whole_ms = int(timeout * 1e3)
+        if not self._wait_ms(whole_ms):
+            # poll counts in ms and rounds up; select does not.
+            rest = max(0.0, timeout - whole_ms * 1e-3)
+            if not select.select([self._descriptor], [], [], rest)[0]:
+                return b""
+        received = os.read(self._descriptor, count)
+        if not received:
+            raise OSError("the device is ready but gives nothing; it is gone, or another program reads from it")
+        return received
 
-    def readPort(self, length: int) -> bytes:  # noqa: N802
-        remaining = self._deadline - self._port.clock.now()
-        return self._port.read(length, max(0.0, remaining))
+    def _write_rest(self, data: bytes) -> None:
+        """Write what the device did not take at once, as it makes room."""
+        deadline = time.perf_counter() + self.wire_time(len(data)) + _WRITE_PATIENCE_S
+        try:
+            while data:
+                remaining = deadline - time.perf_counter()
+                if remaining <= 0:
+                    raise TimeoutError(f"it takes no more bytes, {len(data)} are left")
+                if select.select([], [self._descriptor], [], remaining)[1]:
+                    data = data[os.write(self._descriptor, data) :]
+        except (OSError, ValueError) as error:
+            raise self._lost(error) from error
 
-    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
-        # Twice the reply's wire time: once for the instruction before it, once for the reply.
-        self._set_timeout(2 * self._port.wire_time(packet_length) + self._reply_timeout)
 
-    def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
-        self._set_timeout(msec / 1000)
-
-    def isPacketTimeout(self) -> bool:  # noqa: N802
-        return self._port.clock.now() >= self._deadline
-
-    def _set_timeout(self, timeout: float) -> None:
-        self._deadline = self._port.clock.now() + timeout
+def _never_ready(_timeout_ms: float | None = None, /) -> list[tuple[int, int]]:
+    raise OSError("the port was closed")
 
 
 def _why(error: BaseException) -> str:
     text = str(error.args[-1] if error.args else error)
     return text.rstrip(".") or type(error).__name__
+
+
+def _advice(error: BaseException) -> str:
+    text = str(error)
+    if "Permission denied" in text:
+        return "Add yourself to the port's group (`sudo usermod -aG dialout $USER`), then log out and in again."
+    if "exclusively lock" in text:
+        return "Another program has it open: close that one first."
+    if "No such file" in text:
+        return "Is the adapter plugged in? `hil scan` lists the ports that exist."
+    return ""

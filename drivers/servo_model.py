@@ -1,12 +1,15 @@
 """What a servo's ticks mean, by model: the facts that the SDK's control tables leave out.
 
-Sources: ROBOTIS e-Manual, page of each model (current unit, resolution, Operating Mode, stall figures).
+Sources: ROBOTIS e-Manual, page of each model (current unit, resolution, Operating Mode, stall figures). None of the
+torque constants below was measured here.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from types import MappingProxyType
+from typing import NamedTuple
 
 from drivers.errors import UnknownModel
 
@@ -16,50 +19,146 @@ VELOCITY_UNIT = 0.229 * 2 * math.pi / 60
 WATCHDOG_UNIT = 0.020
 """s per tick of Bus Watchdog."""
 
+RETURN_DELAY_UNIT = 2e-6
+"""s per tick of Return Delay Time."""
+
+VOLTAGE_UNIT = 0.1
+"""V per tick of Present Input Voltage."""
+
+FULL_PWM_TICKS = 885
+"""Goal PWM that puts the whole supply voltage on the motor."""
+
+BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
+"""Baud by the value of the register Baud Rate. The 330 models end at 4 M."""
+
+
+class Mode(IntEnum):
+    """How a joint is driven: the value of Operating Mode. A goal is a current [A], or a voltage [V] under PWM."""
+
+    CURRENT = 0
+    PWM = 16
+
+    @property
+    def goal_unit(self) -> str:
+        return "A" if self is Mode.CURRENT else "V"
+
+
+class Stall(NamedTuple):
+    """One line of the e-Manual's stall figures: V, A, N m at the output shaft."""
+
+    voltage: float
+    current: float
+    torque: float
+
+
+class Published(NamedTuple):
+    """A torque constant as published: the middle of the figures, and the lowest and the highest of them.
+
+    Uncertain whatever the spread: stall torque is the peak that a servo reaches, friction included, and a servo of the
+    same model can differ from it by tens of percent. Where it matters, measure it with a known weight.
+    """
+
+    value: float
+    low: float
+    high: float
+
 
 @dataclass(frozen=True, slots=True)
 class ServoModel:
-    """Units of one model with a current mode.
+    """Units of one model.
 
-    current_unit: A per tick of Goal and Present Current.
+    current_unit: A per tick of Goal and Present Current; None where the model has neither current mode nor sensor.
+    stalls: the e-Manual's stall figures.
+    other_constants: further published torque constants [N m/A].
     position_steps: ticks of Present Position per turn.
     watchdog_firmware: first firmware with a Bus Watchdog.
-    fast_sync_read_firmware: first firmware that answers Fast Sync Read.
+    fast_sync_read_firmware: first firmware that answers Fast Sync Read; None where no firmware does.
     """
 
     name: str
-    current_unit: float
+    current_unit: float | None
+    stalls: tuple[Stall, ...]
+    other_constants: tuple[float, ...] = ()
     position_steps: int = 4096
     watchdog_firmware: int = 38
-    fast_sync_read_firmware: int = 45
+    fast_sync_read_firmware: int | None = 45
 
     @property
     def position_unit(self) -> float:
         """rad per tick of Present Position."""
         return 2 * math.pi / self.position_steps
 
+    @property
+    def default_mode(self) -> Mode:
+        """Current mode where the servo has it, else PWM."""
+        return Mode.PWM if self.current_unit is None else Mode.CURRENT
+
+    @property
+    def torque_per_ampere(self) -> Published:
+        """N m/A at the output shaft: stall torque over stall current, and what else has been published."""
+        return _spread([stall.torque / stall.current for stall in self.stalls] + list(self.other_constants))
+
+    @property
+    def torque_per_volt(self) -> Published:
+        """N m/V at the output shaft, at rest: stall torque over supply voltage.
+
+        In PWM mode the motor's torque is this times the applied voltage, less what turning generates: an identified
+        viscous friction then includes the back-EMF.
+        """
+        return _spread([stall.torque / stall.voltage for stall in self.stalls])
+
+
+def _spread(values: list[float]) -> Published:
+    low, high = min(values), max(values)
+    return Published(sorted(values)[len(values) // 2], low, high)
+
+
+_WORKBENCH_XM430 = 1 / (149.795 * 2.69e-3)
+# ROBOTIS' own dynamixel-workbench takes 149.795 ticks per N m for the whole XM family: 2.48 N m/A.
 
 _MODELS = (
-    ServoModel("XM430-W350", 2.69e-3),
-    ServoModel("XM430-W210", 2.69e-3),
-    ServoModel("XH430-W350", 2.69e-3),
-    ServoModel("XH430-W210", 2.69e-3),
-    ServoModel("XM540-W270", 2.69e-3),
-    ServoModel("XM540-W150", 2.69e-3),
-    ServoModel("XL330-M288", 1.0e-3, fast_sync_read_firmware=46),
-    ServoModel("XL330-M077", 1.0e-3, fast_sync_read_firmware=46),
-    ServoModel("XC330-T288", 1.0e-3, fast_sync_read_firmware=46),
+    ServoModel(
+        "XM430-W350",
+        2.69e-3,
+        (Stall(11.1, 2.1, 3.8), Stall(12.0, 2.3, 4.1), Stall(14.8, 2.7, 4.8)),
+        (_WORKBENCH_XM430,),
+    ),
+    ServoModel("XM430-W210", 2.69e-3, (Stall(11.1, 2.1, 2.7), Stall(12.0, 2.3, 3.0), Stall(14.8, 2.7, 3.7))),
+    ServoModel("XH430-W350", 2.69e-3, (Stall(11.1, 1.2, 3.1), Stall(12.0, 1.3, 3.4), Stall(14.8, 1.5, 4.2))),
+    ServoModel("XH430-W210", 2.69e-3, (Stall(11.1, 1.2, 2.2), Stall(12.0, 1.3, 2.5), Stall(14.8, 1.5, 3.1))),
+    ServoModel("XM540-W270", 2.69e-3, (Stall(11.1, 4.2, 10.0), Stall(12.0, 4.4, 10.6), Stall(14.8, 5.5, 12.9))),
+    ServoModel("XM540-W150", 2.69e-3, (Stall(11.1, 4.2, 6.9), Stall(12.0, 4.4, 7.3), Stall(14.8, 5.5, 8.9))),
+    ServoModel(
+        "XL330-M288",
+        1.0e-3,
+        (Stall(3.7, 1.11, 0.42), Stall(5.0, 1.47, 0.52), Stall(6.0, 1.74, 0.60)),
+        fast_sync_read_firmware=46,
+    ),
+    ServoModel(
+        "XL330-M077",
+        1.0e-3,
+        (Stall(3.7, 1.11, 0.180), Stall(5.0, 1.47, 0.215), Stall(6.0, 1.74, 0.228)),
+        fast_sync_read_firmware=46,
+    ),
+    # Its current sensor sits in the supply, not in a motor phase.
+    ServoModel(
+        "XC330-T288",
+        1.0e-3,
+        (Stall(9.0, 0.61, 0.76), Stall(11.1, 0.80, 0.92), Stall(12.0, 0.88, 1.00)),
+        fast_sync_read_firmware=46,
+    ),
+    ServoModel("XL430-W250", None, (Stall(9.0, 1.0, 1.0), Stall(11.1, 1.3, 1.4), Stall(12.0, 1.4, 1.5))),
 )
 
-CURRENT_MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})
-"""Models that can be commanded a current, by name."""
+SERVO_MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})
+"""Models that the driver can drive, by name."""
 
 
 def servo_model(name: str) -> ServoModel:
     """The model's units; raises UnknownModel with the names that are possible."""
     try:
-        return CURRENT_MODELS[name]
+        return SERVO_MODELS[name]
     except KeyError:
         raise UnknownModel(
-            f"{name!r} is not a servo model with a current mode. Possible: {', '.join(CURRENT_MODELS)}."
+            f"{name!r} is not a servo model that can be driven here. Possible: {', '.join(SERVO_MODELS)}."
         ) from None

@@ -109,7 +109,7 @@ def fit_period(period: SettledPeriod, model: Model, linear: LinearEstimate) -> F
         _covariance(minimum, coordinates, int(period.valid.sum())),
         problem.start(minimum.x),
         problem.position(minimum.x),
-        minimum.iterations,
+        sum(found.iterations for found in tries) + minimum.iterations,
     )
 
 

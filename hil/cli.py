@@ -5,13 +5,14 @@ The modules that do the work are imported inside the commands, so that `hil --he
 
 import json
 import sys
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from hil import __version__
+from hil import __version__, cli_init, cli_results
 
 if TYPE_CHECKING:
     from hil.config import Config
@@ -20,13 +21,19 @@ app = typer.Typer(
     name="hil",
     help="Identify the dynamics of Dynamixel servo arms, on the bus or on a fake one.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
-ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file that describes the arm.")]
+ConfigPath = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="TOML file of the arm, or the name of a bundled one.")
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
+PortOrConfig = Annotated[
+    str | None,
+    typer.Argument(metavar="[PORT]", help="Serial port or pyserial URL, or a TOML file; without it: list the ports."),
+]
 OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default runs/TIME-ARM.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
 
@@ -57,6 +64,7 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
     terminal.say(torque)
     with terminal.busy("Estimating"):
         result = estimate_run(run)
+        cli_results.write_report(run.path)
     _show(result, checked, run.path, json_only)
 
 
@@ -71,7 +79,101 @@ def estimate(run: RunPath, json_only: Json = False) -> None:
     terminal = Terminal(quiet=json_only)
     with terminal.busy("Estimating"):
         result = estimate_run(folder)
+        cli_results.write_report(folder.path)
     _show(result, folder.load_config(), folder.path, json_only)
+
+
+@app.command(epilog="Example: hil scan /dev/ttyUSB0")
+def scan(
+    port: PortOrConfig = None,
+    baud: Annotated[
+        list[int] | None, typer.Option("--baud", help="Only this baud; may be given more than once.")
+    ] = None,
+    json_only: Json = False,
+) -> None:
+    """Find servos: every baud, every ID, with model, firmware, voltage, temperature and errors."""
+    from drivers.port import open_port
+    from drivers.servo_model import BAUD_RATES
+    from hil import scan as scanning
+    from hil.config import port_url
+    from hil.setup_view import print_ports, print_scan, scanned
+    from hil.terminal import Terminal
+
+    if port is None:
+        print_ports(scanning.serial_ports(), json_only)
+        return
+    bauds = tuple(baud or BAUD_RATES)
+    terminal = Terminal(quiet=json_only)
+    opened = open_port(port_url(port), bauds[0])
+    try:
+        with terminal.busy(f"Asking {len(bauds)} baud rates"):
+            heard = list(scanning.scan(opened, bauds))
+    finally:
+        opened.close()
+    print(json.dumps(scanned(heard))) if json_only else print_scan(heard, port)
+    if not any(each.servos for each in heard):
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: hil check configs/my_arm.toml")
+def check(config: ConfigPath, json_only: Json = False) -> None:
+    """Look for everything that would stop an experiment, with how to mend it. Torque stays off."""
+    import fakes
+    from hil.check import Level, check_arm
+    from hil.config import load_config
+    from hil.setup_view import found, print_findings
+    from hil.terminal import Terminal
+
+    checked = load_config(config)
+    fakes.register()
+    with Terminal(quiet=json_only).busy("Looking"):
+        findings = list(check_arm(checked))
+    print(json.dumps(found(findings))) if json_only else print_findings(findings, config)
+    if any(finding.level is Level.STOP for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command(
+    epilog="Example: hil setup /dev/ttyUSB0 --baud 57600 --id 1 --new-id 2 --new-baud 1000000 --return-delay-us 0"
+)
+def setup(
+    port: Annotated[str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, or a TOML file.")],
+    servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
+    baud: Annotated[int, typer.Option("--baud", help="Its present baud.")] = 1_000_000,
+    new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
+    new_baud: Annotated[int | None, typer.Option("--new-baud")] = None,
+    return_delay_us: Annotated[
+        int | None, typer.Option("--return-delay-us", min=0, max=508, help="0 is wanted.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Answer every question with yes.")] = False,
+    json_only: Json = False,
+) -> None:
+    """Set a servo's ID, baud or return delay: a question before each write to EEPROM, each write read back."""
+    from drivers.port import open_port
+    from drivers.servo_model import BAUD_RATES
+    from hil.config import port_url
+    from hil.setup import open_servo, set_up
+    from hil.setup_view import changed, print_changes
+
+    if new_baud is not None and new_baud not in BAUD_RATES:
+        raise typer.BadParameter(f"{new_baud}: a servo can do {', '.join(map(str, BAUD_RATES))}.")
+    if json_only and not yes:
+        raise typer.BadParameter("--json asks no questions: it needs --yes.")
+    opened = open_port(port_url(port), baud)
+    try:
+        servo = open_servo(opened, servo_id)
+        confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
+        changes = set_up(servo, confirm, new_id=new_id, new_baud=new_baud, return_delay_us=return_delay_us)
+    finally:
+        opened.close()
+    print(json.dumps(changed(changes))) if json_only else print_changes(changes)
+
+
+app.command(epilog="Example: hil report runs/20261121-153000-fake_two_link --png pictures")(cli_results.report)
+app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --format urdf --format mjcf")(
+    cli_results.export
+)
+app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.init)
 
 
 def main() -> NoReturn:

@@ -10,13 +10,19 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+import fakes
+from drivers.bus import BusConfig
 from drivers.joint import Joint
-from drivers.servo_model import CURRENT_MODELS, servo_model
+from drivers.servo_model import SERVO_MODELS, Mode, servo_model
 from fakes.description import FakeArm
 from fakes.table_errors import describe
+from hil.bundled import find_config
 from hil.errors import ConfigError
 
 FAKE_URL = "fake://"
+
+SLOW_INTERVAL_S = 0.25
+"""From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
 
 
 class _Table(BaseModel):
@@ -31,6 +37,8 @@ class PortConfig(_Table):
 
     url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
+    one_write: bool = Field(True, description="commands and request in one write; false where hil check says so")
+    fast_sync_read: bool = Field(True, description="read with Fast Sync Read where every servo's firmware has it")
 
 
 class JointConfig(_Table):
@@ -38,14 +46,18 @@ class JointConfig(_Table):
 
     name: str = Field(min_length=1, max_length=20)
     id: int = Field(ge=0, le=252)
-    model: Literal[tuple(CURRENT_MODELS)]  # type: ignore[valid-type]
+    model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
     direction: Literal[-1, 1] = 1
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
-    torque_constant: PositiveFloat = Field(le=100, description="N m/A at the output shaft")
+    mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
+    torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
     torque_constant_std: float = Field(0.0, ge=0, description="N m/A")
+    torque_per_volt: PositiveFloat | None = Field(None, le=100, description="N m/V at the output shaft, pwm mode only")
+    torque_per_volt_std: float = Field(0.0, ge=0, description="N m/V")
     position_limit: Range = Field(description="rad")
     velocity_limit: PositiveFloat = Field(description="rad/s")
-    current_limit: PositiveFloat = Field(le=30, description="A")
+    current_limit: PositiveFloat | None = Field(None, le=30, description="A")
+    voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -54,9 +66,49 @@ class JointConfig(_Table):
             raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
         return self
 
+    @model_validator(mode="after")
+    def _driven(self) -> Self:
+        pwm = self.drive_mode is Mode.PWM
+        if not pwm and servo_model(self.model).current_unit is None:
+            raise ValueError(f'mode = "current": a {self.model} has no current mode; use "pwm"')
+        values = (self.torque_constant, self.current_limit), (self.torque_per_volt, self.voltage_limit)
+        names = ("torque_constant", "current_limit"), ("torque_per_volt", "voltage_limit")
+        mode = self.drive_mode.name.lower()
+        for name, value in zip(names[pwm], values[pwm], strict=True):
+            if value is None:
+                raise ValueError(f"{name} is missing; {mode} mode needs it")
+        for name, value in zip(names[not pwm], values[not pwm], strict=True):
+            if value is not None:
+                raise ValueError(f"{name} = {value:g}: it means nothing in {mode} mode; {' and '.join(names[pwm])} do")
+        return self
+
+    @property
+    def drive_mode(self) -> Mode:
+        if self.mode is None:
+            return servo_model(self.model).default_mode
+        return Mode[self.mode.upper()]
+
+    @property
+    def torque_per_goal(self) -> float:
+        """N m per A, or per V in pwm mode."""
+        value = self.torque_per_volt if self.drive_mode is Mode.PWM else self.torque_constant
+        assert value is not None  # checked above
+        return value
+
+    @property
+    def torque_per_goal_std(self) -> float:
+        return self.torque_per_volt_std if self.drive_mode is Mode.PWM else self.torque_constant_std
+
+    @property
+    def goal_limit(self) -> float:
+        """A, or V in pwm mode."""
+        value = self.voltage_limit if self.drive_mode is Mode.PWM else self.current_limit
+        assert value is not None  # checked above
+        return value
+
     @property
     def joint(self) -> Joint:
-        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks)
+        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks, self.drive_mode)
 
 
 class ArmConfig(_Table):
@@ -150,6 +202,8 @@ class Config(_Table):
         for joint, rest, peak in zip(self.joints, self.arm.rest_pose, self.experiment.peak_torque, strict=True):
             _check_rest_pose(joint, rest)
             _check_peak_torque(joint, peak)
+        if len({joint.drive_mode for joint in self.joints}) != 1:
+            raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
         return self
@@ -160,12 +214,25 @@ class Config(_Table):
         return f"{FAKE_URL}{self.path.resolve()}" if self.port.url == FAKE_URL else self.port.url
 
     @property
+    def bus(self) -> BusConfig:
+        """What the driver needs to know."""
+        return BusConfig(
+            self.url,
+            self.port.baud,
+            tuple(joint.joint for joint in self.joints),
+            one_write=self.port.one_write,
+            fast_sync_read=self.port.fast_sync_read,
+            slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
+        )
+
+    @property
     def is_fake(self) -> bool:
         return self.port.url.startswith(FAKE_URL)
 
 
 def load_config(path: Path) -> Config:
-    """Read and check a TOML file; raises ConfigError."""
+    """Read and check a TOML file, or the bundled one of that bare name; raises ConfigError."""
+    path = find_config(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -202,9 +269,18 @@ def _check_rest_pose(joint: JointConfig, rest: float) -> None:
 
 
 def _check_peak_torque(joint: JointConfig, peak: float) -> None:
-    most = joint.current_limit * joint.torque_constant
+    most = joint.goal_limit * joint.torque_per_goal
+    product = "voltage_limit * torque_per_volt" if joint.drive_mode is Mode.PWM else "current_limit * torque_constant"
     if peak > most * (1 + 1e-9):
         raise ValueError(
-            f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than current_limit * "
-            f"torque_constant = {math.floor(most * 1000) / 1000:g} N m"
+            f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than "
+            f"{product} = {math.floor(most * 1000) / 1000:g} N m"
         )
+
+
+def port_url(port: str) -> str:
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
+    fakes.register()
+    if port.endswith(".toml") and "://" not in port:
+        return load_config(Path(port)).url
+    return port

@@ -4,6 +4,8 @@ HilError                    exit code
 ├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
 ├── MissingExtra            2   an optional package is not installed
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
+├── ResultError             2   no result.json, half written, damaged, or from a newer hil
+├── ExportError             2   the format cannot hold this arm, or a package for it is not installed
 └── ExperimentError         1   the experiment could not be finished
     ├── SafetyStop          1   the guard saw a limit passed and stopped the arm
     ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
@@ -17,9 +19,13 @@ estimator.errors.EstimationError  1   the recording does not determine the param
 
 
 class HilError(Exception):
-    """Root of hil's own errors."""
+    """Root of hil's own errors.
+
+    last_samples: what had been recorded last before it (rows of hil.recording), where an experiment was running.
+    """
 
     exit_code = 1
+    last_samples: object = None
 
 
 class ConfigError(HilError):
@@ -36,6 +42,18 @@ class RunFolderError(HilError):
 
 class MissingExtra(HilError):
     """An optional package is not installed. Example: `hil compare --peers mujoco` without the extra `peers`."""
+
+    exit_code = 2
+
+
+class ResultError(HilError):
+    """There is no result to work with. Example: `hil report` of a run that was stopped before its estimate."""
+
+    exit_code = 2
+
+
+class ExportError(HilError):
+    """A model cannot be written in a format. Example: no link of positive mass has these parameters."""
 
     exit_code = 2
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from estimator.identify import Estimate, identify, predict
 from estimator.model import Model
 from hil.config import Config
+from hil.period_file import PlayedPeriod, save_periods
 from hil.plan import HELD_OUT, IDENTIFY
 from hil.recording import load_samples
 from hil.result import make_result
@@ -25,18 +26,20 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
     period = settled_period(config, facts, samples, IDENTIFY)
     model = Model(len(config.joints), config.model.friction, config.model.drive)
     estimate = identify(period, model)
-    held_out = _held_out(config, facts, samples, estimate) if HELD_OUT in facts.segments else None
+    played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+    if HELD_OUT in facts.segments:
+        played[HELD_OUT] = _held_out(config, facts, samples, estimate)
     seconds = round(time.perf_counter() - started, 3)
     kept_time = {**timing(samples, config.experiment.rate), "estimation_seconds": seconds}
+    held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     result = make_result(config, facts.config, period, estimate, held_out, kept_time)
+    save_periods(run.path, played)
     run.write_result(result)
     return result
 
 
-def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void], estimate: Estimate) -> NDArray[np.float64]:
-    """RMS of measured minus freely predicted position of the held-out multisine, over the motion's RMS, per joint."""
+def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void], estimate: Estimate) -> PlayedPeriod:
+    """The held-out multisine beside the model's free prediction of it."""
     other = settled_period(config, facts, samples, HELD_OUT)
     predicted = predict(estimate, other.torque, other.rate, other.command_to_sample)
-    error = other.position - predicted
-    motion = other.position - np.nanmean(other.position, axis=1, keepdims=True)
-    return np.asarray(np.sqrt(np.nanmean(error**2, axis=1) / np.nanmean(motion**2, axis=1)))
+    return PlayedPeriod(other.rate, other.torque, other.position, predicted)

@@ -1,18 +1,26 @@
 """The experiment on the bus: open, check, arm, stream, and torque off however it ends."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import fakes
 from drivers.bus import ServoBus
-from drivers.errors import TorqueNotOff
+from drivers.clock import Clock, WallClock
+from drivers.errors import DriverError, TorqueNotOff, WrongSetting
+from drivers.latency import command_to_set, latency_timer
 from hil.config import Config
-from hil.errors import ExperimentError, RunFolderError
+from hil.errors import ExperimentError, HilError, RunFolderError
 from hil.plan import Plan, make_plan
+from hil.realtime import real_time
 from hil.recording import Recorder
-from hil.run_folder import RunFacts, RunFolder
+from hil.run_folder import RunFacts, RunFolder, write_json
 from hil.stop import StopRequest
-from hil.stream import Stream, Watch
+from hil.stream import Note, Stream, Watch
+from hil.timing import lateness_histogram
+
+_LAST_SAMPLES = 100
+"""How many samples an error carries with it."""
 
 
 def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch) -> str:
@@ -23,17 +31,16 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
     """
     plan = make_plan(config)
     fakes.register()
-    joints = [joint.joint for joint in config.joints]
-    with StopRequest() as stop, ServoBus.open(config.url, config.port.baud, joints) as bus:
+    with StopRequest() as stop, ServoBus.open(config.bus) as bus:
         clock = bus.port.clock
         run.event(clock.now(), f"opened {config.port.url} at {config.port.baud} baud")
-        bus.check_identity()
-        bus.prepare()
+        _check_rate(config, bus)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
-        with Recorder(run.samples_path, len(joints), plan.capacity) as recorder:
+        with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder:
             stop.check()
             _play(config, run, plan, bus, recorder, stop, watch)
+            write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
         torque = str(bus.torque_off_report)
         run.event(clock.now(), torque)
         return torque
@@ -49,15 +56,45 @@ def _play(
         run.event(clock.now(), what)
 
     try:
-        with bus.torque(config.safety.watchdog):
+        # In this order: what _on_time does takes longer than the watchdog waits.
+        with _on_time(clock, note), bus.torque(config.safety.watchdog):
             note(f"torque on, watchdog {config.safety.watchdog:g} s")
             Stream(bus, plan, config, recorder, stop, watch, note).run()
     except BaseException as error:
+        if isinstance(error, DriverError | HilError):
+            error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
         with suppress(RunFolderError):
             note(f"stopped: {error} {bus.torque_off_report}")
         raise
+
+
+@contextmanager
+def _on_time(clock: Clock, note: Note) -> Iterator[None]:
+    """Real-time scheduling and the like while the stream runs on the wall clock; a virtual one is never late."""
+    if not isinstance(clock, WallClock):
+        yield
+        return
+    with real_time() as granted:
+        note("; ".join(map(str, granted)))
+        yield
+
+
+def _check_rate(config: Config, bus: ServoBus) -> None:
+    """What the wire and the adapter make impossible from the outset; `hil check` measures what is possible."""
+    rate, wire = config.experiment.rate, bus.prepared.longest
+    if wire > 1 / rate:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms on the wire alone at "
+            f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
+        )
+    file = latency_timer(bus.port.url)
+    if file is not None and bus.port.latency + wire > 1 / rate:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which leaves "
+            f"{1 / (bus.port.latency + wire):.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+        )
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
@@ -74,7 +111,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
 def _write_facts(config: Config, run: RunFolder, plan: Plan, bus: ServoBus, shown_path: Path) -> None:
     facts = RunFacts(
         config=str(shown_path),
-        command_to_sample=bus.exchange_timing.command_to_sample,
+        command_to_sample=bus.prepared.command_to_sample,
         position_step=[joint.servo.position_unit for joint in bus.joints],
         segments=[segment.role for segment in plan.segments],
     )

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Sequence
 
-from drivers.bus import State
 from drivers.packet import ALERT
+from drivers.state import State
 from hil.config import Config
 from hil.errors import SafetyStop
 
@@ -17,7 +17,7 @@ class Guard:
         self._low = [joint.position_limit[0] for joint in config.joints]
         self._high = [joint.position_limit[1] for joint in config.joints]
         self._velocity = [joint.velocity_limit for joint in config.joints]
-        self._current = [joint.current_limit for joint in config.joints]
+        self._current = [joint.goal_limit for joint in config.joints]
         self._max_missing = config.safety.max_missing
         self._missing = [0] * len(config.joints)
 

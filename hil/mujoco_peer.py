@@ -153,7 +153,10 @@ def _modifier(name: str, unit: float) -> Any:
         elif term == "offset":
             spec.actuator(name).gear = [-value, 0, 0, 0, 0, 0]
         else:
-            setattr(spec.joint(f"joint_{joint}"), _JOINT_FIELDS[term], value)
+            hinge, field = spec.joint(f"joint_{joint}"), _JOINT_FIELDS[term]
+            # Damping has higher orders of velocity too since MuJoCo 4.
+            orders = np.size(getattr(hinge, field))
+            setattr(hinge, field, value if orders == 1 else [value] + [0.0] * (orders - 1))
 
     return modify
 

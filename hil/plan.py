@@ -95,7 +95,7 @@ def _lines(config: Config) -> Sequence[Sequence[int]]:
 def _segment(config: Config, role: str, seed: int) -> Segment:
     experiment = config.experiment
     multisine = design_multisine(experiment.rate, experiment.period, _lines(config), experiment.peak_torque, seed)
-    constants = np.array([joint.torque_constant for joint in config.joints])
-    limits = np.array([joint.current_limit for joint in config.joints])
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    limits = np.array([joint.goal_limit for joint in config.joints])
     current = np.clip(multisine.torque.T / constants, -limits, limits)
     return Segment(role, multisine, current, round(experiment.ramp * experiment.rate))

@@ -8,12 +8,13 @@ import os
 import struct
 from collections.abc import Sequence
 from enum import IntEnum
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.bus import State
+from drivers.state import State
 from hil.errors import RunFolderError
 
 
@@ -30,7 +31,8 @@ class Phase(IntEnum):
 
 def sample_type(joints: int) -> np.dtype[np.void]:
     """One row: times [s], where in the plan, and per joint goal and measured current [A], velocity [rad/s], position
-    [rad], the servo's ERR byte and whether its reply is missing (then the measured values are NaN).
+    [rad], the servo's ERR byte, whether its reply is missing (then the measured values are NaN), and, a few times a
+    second in turn (else NaN), the servo's own clock [s], its supply [V] and its temperature [degrees C].
     """
     each = (joints,)
     return np.dtype(
@@ -47,6 +49,9 @@ def sample_type(joints: int) -> np.dtype[np.void]:
             ("position", "<f8", each),
             ("error", "u1", each),
             ("missing", "u1", each),
+            ("servo_clock", "<f4", each),
+            ("supply_voltage", "<f4", each),
+            ("temperature", "<f4", each),
         ]
     )
 
@@ -56,7 +61,8 @@ class Recorder:
 
     def __init__(self, path: Path, joints: int, capacity: int) -> None:
         self._path = path
-        self._row = struct.Struct(f"<dddBBh{4 * joints}d{2 * joints}B")
+        self._row = struct.Struct(f"<dddBBh{4 * joints}d{2 * joints}B{3 * joints}f")
+        self._nothing_slow = (float("nan"),) * (3 * joints)
         dtype = sample_type(joints)
         assert self._row.size == dtype.itemsize
         try:
@@ -95,6 +101,7 @@ class Recorder:
             *state.position,
             *state.error,
             *state.missing,
+            *(self._nothing_slow if state.slow is None else chain(*state.slow)),
         )
         self.count += 1
 

@@ -7,6 +7,8 @@ covariance   of parameters and extra together, rows in the order of `names`
 fit          residual of the settled period, in encoder steps, against the encoder's own rounding
 validation   free prediction of another multisine, as a fraction of the motion's RMS
 timing       how the stream kept its ticks, and how long the estimation took
+arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, mode, limits, torque per
+             goal [N m/A, or N m/V in pwm mode]
 truth        only on a fake arm
 """
 
@@ -52,10 +54,31 @@ def make_result(
         },
         "validation": {} if held_out is None else {"held_out_rms": [float(value) for value in held_out]},
         "timing": timing,
+        "arm": _arm(config),
     }
     if config.is_fake and config.fake is not None:
         result["truth"] = base_parameters(config.fake.arm)
     return result
+
+
+def _arm(config: Config) -> dict[str, Any]:
+    return {
+        "gravity": config.arm.gravity,
+        "rest_pose": config.arm.rest_pose,
+        "joints": [
+            {
+                "name": joint.name,
+                "model": joint.model,
+                "mode": joint.drive_mode.name.lower(),
+                "torque_per_goal": joint.torque_per_goal,
+                "torque_per_goal_std": joint.torque_per_goal_std,
+                "goal_limit": joint.goal_limit,
+                "position_limit": joint.position_limit,
+                "velocity_limit": joint.velocity_limit,
+            }
+            for joint in config.joints
+        ],
+    }
 
 
 def _entries(estimate: Estimate, start: int, end: int) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from drivers.servo_model import Mode
 from hil.config import Config
 
 GOOD_RESIDUAL_TICKS = 0.30
@@ -68,17 +69,20 @@ def _fit(result: dict[str, Any]) -> list[str]:
 
 def _torque_constants(config: Config) -> list[str]:
     unsure = [
-        f"{joint.name} {100 * joint.torque_constant_std / joint.torque_constant:.0f} %"
+        f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.0f} %"
         for joint in config.joints
-        if joint.torque_constant_std
+        if joint.torque_per_goal_std
     ]
+    lines = []
+    if any(joint.drive_mode is Mode.PWM for joint in config.joints):
+        lines.append("Driven by voltage: the viscous friction includes what the motor generates when it turns.")
     if not unsure:
-        return []
-    return [f"Every value also scales with its joint's torque constant, known to: {', '.join(unsure)}."]
+        return lines
+    return [*lines, f"Every value also scales with its joint's torque constant, known to: {', '.join(unsure)}."]
 
 
 def _next(result: dict[str, Any], run: Path) -> list[str]:
-    lines = [f"Run folder: {run}"]
+    lines = [f"Run folder: {run}, its report: {run / 'report.html'}"]
     worst = max(result["fit"]["residual_rms_ticks"])
     if worst <= GOOD_RESIDUAL_TICKS:
         lines.append("The model explains the motion down to the encoder's rounding. Estimate again from the recording:")

@@ -4,7 +4,9 @@ config.toml     copied byte for byte
 run.json        versions, start time, and the few facts that the samples need to be read again
 events.jsonl    what happened when, one JSON object a line, written as it happens
 samples.npy     every sample (hil.recording)
+lateness.json   how many samples were how late (hil.timing)
 result.json     parameters with error bars, fit, validation, timing
+period.npz      the settled periods as measured and as the model has them (hil.period_file)
 """
 
 import json

@@ -28,7 +28,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
             f"them no {experiment.periods} settled ones; {wanted * count} samples are the least. Record again."
         )
     used = periods[first : first + experiment.periods]
-    constants = np.array([joint.torque_constant for joint in config.joints])
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
     torque = np.moveaxis(used["goal_current"] * constants, 2, 1).mean(axis=0)
     angle = np.moveaxis(used["position"], 2, 1)
     return SettledPeriod(

@@ -10,9 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.bus import ServoBus, State
+from drivers.bus import ServoBus
+from drivers.errors import ServoFault
+from drivers.rate import FixedRate
+from drivers.state import State
 from hil.config import Config
-from hil.errors import ExperimentError, NotSettled
+from hil.errors import ExperimentError, NotSettled, SafetyStop
 from hil.guard import Guard
 from hil.plan import Plan, Segment
 from hil.recording import Phase, Recorder, missed
@@ -55,7 +58,7 @@ class Stream:
         self._watch = watch
         self._note = note
         self._interval = 1 / plan.rate
-        self._start = 0.0
+        self._ticks = FixedRate(bus.port.clock, plan.rate)
         self._index = 0
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
         self._goal = [0.0] * len(bus.joints)
@@ -63,7 +66,6 @@ class Stream:
 
     def run(self) -> None:
         """Play the whole plan; raises ExperimentError, SafetyStop, StopRequested, PortLost."""
-        self._start = self._clock.now() + self._interval
         self._rest()
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
@@ -126,10 +128,7 @@ class Stream:
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
-        deadline = self._start + self._index * self._interval
-        self._clock.wait_until(deadline)
-        now = self._clock.now()
-        late = now - deadline >= self._interval
+        deadline, now, late = self._ticks.wait()
         if late:
             # Skipped, never caught up in a burst: the servos keep the former goal.
             state = missed(self._goal, now)
@@ -139,12 +138,20 @@ class Stream:
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
         if not late:
-            self._guard.look(state)
+            self._look(state)
         self._stop.check()
         if self._index % self._watch_every == 0:
             role = self._plan.segments[self._segment].role
             self._watch(Progress(self._index, self._plan.expected, phase, role, state))
         return state
+
+    def _look(self, state: State) -> None:
+        if any(state.error):
+            try:
+                self._bus.check_alerts(state)
+            except ServoFault as fault:
+                raise SafetyStop(str(fault)) from fault
+        self._guard.look(state)
 
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))

@@ -75,9 +75,9 @@ def _view(config: Config, bar: Progress, progress: StreamProgress) -> Table:
             f"{state.position[index]:+7.2f} rad",
             _gauge(state.position[index], low, high),
             f"{low:+.2f} .. {high:+.2f}",
-            f"{state.current[index]:+7.3f} A",
-            _gauge(state.current[index], -joint.current_limit, joint.current_limit),
-            f"limit {joint.current_limit:g}",
+            f"{state.current[index]:+7.3f} {joint.drive_mode.goal_unit}",
+            _gauge(state.current[index], -joint.goal_limit, joint.goal_limit),
+            f"limit {joint.goal_limit:g}",
         )
     view = Table.grid()
     view.add_row(bar)

@@ -5,13 +5,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+SERVO_CLOCK_WRAP_S = 32.768
+"""Realtime Tick counts milliseconds from 0 to 32767."""
+
+_FEWEST_READINGS = 5
+_EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6)
+
 
 def timing(samples: NDArray[np.void], rate: float) -> dict[str, Any]:
-    """Rate held, lateness of the writes, round trips, missed ticks and lost replies of a recording."""
-    sent = samples[samples["time_after_read"] > samples["time_before_write"]]
-    lateness_us = 1e6 * (sent["time_before_write"] - sent["deadline"])
+    """Rate held, lateness of the writes, round trips, missed ticks, lost replies and clock drifts of a recording.
+
+    drift_us: how much later the last tenth of the writes was than the first, against the deadlines.
+    servo_clock_ppm: how much faster each servo's own clock runs than the computer's; None where it was read too seldom.
+    """
+    sent = _sent(samples)
+    lateness_us = _lateness_us(sent)
     round_trip_us = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
     span = float(samples["deadline"][-1] - samples["deadline"][0]) + 1 / rate
+    tenth = max(1, len(sent) // 10)
     return {
         "samples": len(samples),
         "seconds": round(span, 6),
@@ -20,9 +31,44 @@ def timing(samples: NDArray[np.void], rate: float) -> dict[str, Any]:
         "round_trip_us": _quantiles(round_trip_us),
         "missed_ticks": int(len(samples) - len(sent)),
         "lost_replies": int(sent["missing"].sum()),
+        "drift_us": round(float(np.median(lateness_us[-tenth:]) - np.median(lateness_us[:tenth])), 1),
+        "servo_clock_ppm": _servo_clock_ppm(sent),
     }
 
 
+def lateness_histogram(samples: NDArray[np.void]) -> dict[str, Any]:
+    """How many writes were how late: `counts[i]` between `edges_us[i]` and `edges_us[i + 1]`, the last one open."""
+    counts, _ = np.histogram(_lateness_us(_sent(samples)), [*_EDGES_US, np.inf])
+    return {"edges_us": list(_EDGES_US), "counts": counts.tolist()}
+
+
+def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:
+    """The samples whose deadline was not missed."""
+    sent: NDArray[np.void] = samples[samples["time_after_read"] > samples["time_before_write"]]
+    return sent
+
+
+def _lateness_us(sent: NDArray[np.void]) -> NDArray[np.float64]:
+    # A clock that stands still while the program computes gives rounding errors of either sign.
+    late: NDArray[np.float64] = np.maximum(0.0, 1e6 * (sent["time_before_write"] - sent["deadline"]))
+    return late
+
+
 def _quantiles(values: NDArray[np.float64]) -> dict[str, float]:
-    p50, p99 = np.quantile(values, [0.5, 0.99])
-    return {"p50": round(float(p50), 1), "p99": round(float(p99), 1), "max": round(float(values.max()), 1)}
+    p50, p99, p999 = np.quantile(values, [0.5, 0.99, 0.999])
+    numbers = {"p50": p50, "p99": p99, "p99_9": p999, "max": values.max()}
+    return {name: round(float(value), 1) for name, value in numbers.items()}
+
+
+def _servo_clock_ppm(sent: NDArray[np.void]) -> list[float | None]:
+    drifts: list[float | None] = []
+    for joint in range(sent["servo_clock"].shape[1]):
+        read = np.isfinite(sent["servo_clock"][:, joint])
+        computer, servo = sent["time_before_write"][read], sent["servo_clock"][read, joint].astype(np.float64)
+        if len(servo) < _FEWEST_READINGS:
+            drifts.append(None)
+            continue
+        ahead = np.unwrap(servo - np.mod(computer, SERVO_CLOCK_WRAP_S), period=SERVO_CLOCK_WRAP_S)
+        slope = np.polyfit(computer - computer[0], ahead, 1)[0]
+        drifts.append(round(float(slope) * 1e6, 1) + 0.0)
+    return drifts

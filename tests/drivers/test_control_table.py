@@ -4,7 +4,7 @@ import pytest
 
 from drivers.control_table import load_control_table, model_names
 from drivers.errors import UnknownModel
-from drivers.servo_model import CURRENT_MODELS, servo_model
+from drivers.servo_model import SERVO_MODELS, Mode, servo_model
 
 
 def test_registers_of_the_xm430_stand_where_the_manual_has_them() -> None:
@@ -39,16 +39,33 @@ def test_unknown_model_lists_the_known_ones() -> None:
         load_control_table("XM430-W351")
 
 
-def test_a_model_without_current_mode_is_not_offered() -> None:
-    with pytest.raises(UnknownModel, match="XL430-W250"):
-        servo_model("XL430-W250")
+def test_an_unknown_servo_model_lists_what_is_possible() -> None:
+    with pytest.raises(UnknownModel, match=r"AX-12.*XM430-W350"):
+        servo_model("AX-12")
 
 
-@pytest.mark.parametrize("model", sorted(CURRENT_MODELS))
-def test_every_current_model_has_the_registers_of_the_exchange_together(model: str) -> None:
+@pytest.mark.parametrize("model", sorted(SERVO_MODELS))
+def test_every_model_has_the_registers_of_the_exchange_together(model: str) -> None:
     table = load_control_table(model)
-    current, velocity, position = (table[f"Present {name}"] for name in ("Current", "Velocity", "Position"))
-    assert current.address + current.size == velocity.address
+    pwm = servo_model(model).default_mode is Mode.PWM
+    velocity, position = table["Present Velocity"], table["Present Position"]
+    drive = table["Present PWM" if pwm else "Present Current"]
+    # Under PWM the two bytes of Present Load lie between.
+    assert drive.address + drive.size == velocity.address - (2 if pwm else 0)
     assert velocity.address + velocity.size == position.address
-    assert "Goal Current" in table
+    assert ("Goal PWM" if pwm else "Goal Current") in table
     assert "Bus Watchdog" in table
+
+
+@pytest.mark.parametrize("model", sorted(SERVO_MODELS))
+def test_published_torque_constants_have_a_spread_around_them(model: str) -> None:
+    for published in (servo_model(model).torque_per_ampere, servo_model(model).torque_per_volt):
+        assert published.low <= published.value <= published.high
+        assert published.low < published.high
+
+
+def test_torque_constants_are_the_manuals() -> None:
+    assert servo_model("XM430-W350").torque_per_ampere.low == pytest.approx(4.8 / 2.7)
+    assert servo_model("XM430-W350").torque_per_ampere.high == pytest.approx(2.48, abs=0.01)
+    assert servo_model("XL330-M288").torque_per_ampere.value == pytest.approx(0.354, abs=1e-3)
+    assert servo_model("XL430-W250").torque_per_volt.value == pytest.approx(0.125, abs=1e-3)

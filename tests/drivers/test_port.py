@@ -6,7 +6,8 @@ import time
 import pytest
 
 from drivers.errors import PortLost, PortNotOpened
-from drivers.port import Port, SdkPort
+from drivers.port import open_port
+from drivers.sdk_port import SdkPort
 
 
 @pytest.fixture
@@ -19,17 +20,17 @@ def pty() -> tuple[int, str]:
 
 def test_a_port_that_does_not_exist_is_named() -> None:
     with pytest.raises(PortNotOpened, match=r"/dev/no-such-port.*No such file"):
-        Port("/dev/no-such-port", 1_000_000)
+        open_port("/dev/no-such-port", 1_000_000)
 
 
 def test_an_unknown_url_scheme_is_not_opened() -> None:
     with pytest.raises(PortNotOpened, match="nonsense"):
-        Port("nonsense://x", 1_000_000)
+        open_port("nonsense://x", 1_000_000)
 
 
 def test_a_read_is_bounded_and_gives_what_came(pty: tuple[int, str]) -> None:
     master, name = pty
-    port = Port(name, 1_000_000)
+    port = open_port(name, 1_000_000)
     os.write(master, b"abc")
     started = time.monotonic()
     assert port.read(10, 0.05) == b"abc"
@@ -40,7 +41,7 @@ def test_a_read_is_bounded_and_gives_what_came(pty: tuple[int, str]) -> None:
 
 def test_input_can_be_discarded(pty: tuple[int, str]) -> None:
     master, name = pty
-    port = Port(name, 1_000_000)
+    port = open_port(name, 1_000_000)
     os.write(master, b"stale")
     time.sleep(0.01)
     port.discard_input()
@@ -52,7 +53,7 @@ def test_input_can_be_discarded(pty: tuple[int, str]) -> None:
 @pytest.mark.parametrize("action", ["read", "write", "discard"])
 def test_a_pulled_cable_is_port_lost_whatever_was_being_done(pty: tuple[int, str], action: str) -> None:
     master, name = pty
-    port = Port(name, 1_000_000)
+    port = open_port(name, 1_000_000)
     os.close(master)
     with pytest.raises(PortLost, match="cable"):
         {
@@ -66,7 +67,7 @@ def test_a_pulled_cable_is_port_lost_whatever_was_being_done(pty: tuple[int, str
 
 def test_the_sdk_can_never_leave_the_port_marked_as_in_use(pty: tuple[int, str]) -> None:
     master, name = pty
-    sdk_port = SdkPort(Port(name, 1_000_000))
+    sdk_port = SdkPort(open_port(name, 1_000_000))
     sdk_port.is_using = True
     assert not sdk_port.is_using
     os.close(master)

@@ -11,7 +11,8 @@ from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2
 
 import fakes
 from drivers.packet import encode, encode_status
-from drivers.port import Port, SdkPort
+from drivers.port import open_port
+from drivers.sdk_port import SdkPort
 from fakes.clock import VirtualClock
 from fakes.description import load_fake
 from fakes.protocol_fake import FakeSerial, open_fake
@@ -181,7 +182,7 @@ def test_import_is_cheap() -> None:
 @pytest.fixture
 def sdk() -> tuple[Protocol2PacketHandler, SdkPort, FakeSerial]:
     fakes.register()
-    port = Port(URL, 1_000_000)
+    port = open_port(URL, 1_000_000)
     fake = port._serial
     assert isinstance(fake, FakeSerial)
     return Protocol2PacketHandler(), SdkPort(port), fake

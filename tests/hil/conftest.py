@@ -1,5 +1,6 @@
 """A fake arm with a short experiment, and the ports that a test opened, to look at the servos themselves."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,9 @@ import pytest
 import serial
 
 from hil.config import Config, load_config
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
+from hil.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -47,3 +51,28 @@ def arm_file(tmp_path: Path) -> Callable[..., Path]:
 def arm(arm_file: Callable[..., Path]) -> Callable[..., Config]:
     """The same as a checked configuration."""
     return lambda *changes, **options: load_config(arm_file(*changes, **options))
+
+
+def _identify(path: Path, folder: Path) -> Path:
+    config = load_config(path)
+    run = RunFolder.create(folder, config)
+    run_experiment(config, run, path, lambda _: None)
+    estimate_run(run)
+    return run.path
+
+
+@pytest.fixture(scope="session")
+def identified_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of the ideal fake arm with a short period, shared by all tests: only to be read."""
+    folder = tmp_path_factory.mktemp("identified")
+    text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
+    text = text.replace("period = 10.0 ", "period = 2.0 ").replace("band = [0.1, 5.0]", "band = [0.5, 6.0]")
+    path = folder / "arm.toml"
+    path.write_text(text, encoding="utf-8")
+    return _identify(path, folder / "run")
+
+
+@pytest.fixture
+def identified(identified_once: Path, tmp_path: Path) -> Path:
+    """A copy of that run folder for one test."""
+    return Path(shutil.copytree(identified_once, tmp_path / "identified"))

@@ -18,6 +18,13 @@ from hil.recording import load_samples
 
 ArmFile = Callable[..., Path]
 
+LONG = (
+    ("period = 2.0", "period = 100.0"),
+    ("band = [0.5, 6.0]", "band = [0.1, 0.3]"),
+    ("peak_torque = [0.80, 0.42]", "peak_torque = [0.2, 0.1]"),  # so slow a motion would go over the top with more
+)
+"""Changes that make an experiment long enough to be interrupted."""
+
 
 def hil(*arguments: object) -> int:
     """Run the command in this process; its exit code."""
@@ -80,7 +87,8 @@ def test_the_run_folder_is_named_after_time_and_arm(arm_file: ArmFile) -> None:
     (folder,) = Path("runs").iterdir()
     assert folder.name.endswith("-arm")
     assert {file.name for file in folder.iterdir()} == {
-        "config.toml", "run.json", "events.jsonl", "samples.npy", "result.json",
+        "config.toml", "run.json", "events.jsonl", "samples.npy", "lateness.json", "result.json", "period.npz",
+        "report.html",
     }  # fmt: skip
     assert (folder / "config.toml").read_bytes() == Path("arm.toml").read_bytes()
     events = [json.loads(line)["event"] for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
@@ -136,7 +144,7 @@ def test_a_recording_cut_short_is_said(arm_file: ArmFile, capsys: pytest.Capture
 
 
 def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path: Path) -> None:
-    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 0.3]"))
+    path = arm_file(*LONG)
     with subprocess.Popen([sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]) as process:
         samples = tmp_path / "run" / "samples.npy"
         for _ in range(600):
@@ -151,7 +159,7 @@ def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path
 
 
 def test_sigterm_ends_in_a_message_and_exit_code_1(arm_file: ArmFile, tmp_path: Path) -> None:
-    path = arm_file(("period = 2.0", "period = 100.0"), ("band = [0.5, 6.0]", "band = [0.1, 0.3]"))
+    path = arm_file(*LONG)
     command = [sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         for _ in range(600):

@@ -47,7 +47,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("band = [0.1, 5.0]", "lines = [[1, 2], [2, 3]]", r"two joints share a line"),
         ("band = [0.1, 5.0]", "", r"give either band or lines"),
         ("baud = 1_000_000", "baud = 1234", r"port\.baud = 1234: must be one of 9600"),
-        ("torque_constant = 1.80 ", "", r"joints\[1\]\.torque_constant is missing"),
+        ("torque_constant = 1.80 ", "", r"joints\[1\]: torque_constant is missing; current"),
         ("mass = 0.180 ", "mass = -1.0 ", r"fake\.arm\.links\[1\]\.mass = -1\.0: must be at least 0"),
         ("mass = 0.180 ", 'mass = "0.18" ', r"fake\.arm\.links\[1\]\.mass = '0\.18': must be a number"),
         ("gear_ratio = 353.5", "gear = 353.5", r"fake\.arm\.drives\[1\]\.gear is not a known key; .*gear_ratio"),

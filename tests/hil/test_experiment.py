@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import serial
 
-from drivers.errors import DriverError, NoReply, PortLost, TorqueNotOff, WrongModel, WrongSetting
+from drivers.errors import DriverError, NoReply, PortLost, ServoFault, TorqueNotOff, WrongModel, WrongSetting
 from fakes.protocol_fake import FakeSerial
 from hil.config import Config
 from hil.errors import ExperimentError, NotSettled, RunFolderError, SafetyStop, StopRequested
@@ -182,7 +182,7 @@ def test_a_motion_that_never_settles_is_said(arm: Arm, tmp_path: Path, ports: li
         (('model = "XM430-W350"', 'model = "XM540-W270"'), WrongModel, r"a XM430-W350 answers at ID 1"),
         (("rest_pose = [-1.5707963, 0.0]", "rest_pose = [-1.5707963, 0.5]"), ExperimentError, r"set zero_ticks = 1722"),
         ((SERVO_1, SERVO_1 + 'registers = { "Drive Mode" = 8 }\n'), WrongSetting, r"'shoulder'.*Drive Mode is 8"),
-        ((SERVO_1, SERVO_1 + "input_voltage_v = 5.0\n"), WrongSetting, r"'shoulder' \(ID 1.*INPUT_VOLTAGE"),
+        ((SERVO_1, SERVO_1 + "input_voltage_v = 5.0\n"), ServoFault, r"'shoulder' \(ID 1.*input voltage"),
     ],
 )
 def test_what_forbids_an_experiment_is_found_before_torque(

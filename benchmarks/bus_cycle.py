@@ -1,0 +1,269 @@
+"""One control cycle, ours against others', over a pty with the same responder in C at its far end.
+
+    python benchmarks/bus_cycle.py            prints tables and ratios
+    python benchmarks/bus_cycle.py --json     one JSON object on standard output and nothing else there
+
+Each cycle is a Sync Write of 2 bytes and a Sync Read of 10 bytes with 2 servos (`--servos`). The clients take turns, a
+round each, so that the machine's moods hit all of them; medians of the rounds. A pty has no wire: "answered at once"
+shows what the client costs by itself, "1 Mbaud" has the responder wait as long as the bytes take at 1 Mbaud.
+Absolute figures are this machine's; compare the ratios.
+
+rustypot is optional (`pip install ".[bench]"`); its ratios are null without it.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
+
+from benchmarks.machine import machine
+from benchmarks.pty import responder_binary, served_pty
+from drivers.control_table import load_control_table
+from drivers.exchange import Exchange
+from drivers.joint import Joint
+from drivers.port import open_port
+from drivers.servo_model import Mode, servo_model
+from drivers.state import Converter, spans
+
+BAUD = 1_000_000
+BYTE_NS = 10_000
+GOAL_CURRENT, PRESENT = (102, 2), (126, 10)
+
+Cycle = Callable[[], object]
+
+
+class Round(NamedTuple):
+    """One client's round: us of CPU per cycle, median round trip [us], cycles per second."""
+
+    cpu_us: float
+    p50_us: float
+    rate: float
+
+
+@contextmanager
+def ours(name: str, servos: int, *, fast: bool = False) -> Iterator[Cycle]:
+    """The driver's exchange: raw ticks out and in, as the others do it."""
+    port = open_port(name, BAUD)
+    port.latency = 0.02  # a busy machine must not make lost replies of late ones here
+    exchange = make_exchange(port, servos, fast=fast)
+    goals = [100] * servos
+
+    def cycle() -> None:
+        assert None not in exchange.cycle(goals).servos
+
+    yield cycle
+    port.close()
+
+
+def make_exchange(port: Any, servos: int, *, fast: bool = False) -> Exchange:
+    tables = [load_control_table("XM430-W350")] * servos
+    every = spans(Mode.CURRENT, tables)
+    ids = range(1, servos + 1)
+    return Exchange(port, ids, tables[0]["Goal Current"], every, 0.0, fast=fast, slow_every=10**9)
+
+
+@contextmanager
+def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
+    """Everything that the experiment does for one sample: exchange in SI units, guard, recorder."""
+    from hil.guard import Guard
+    from hil.recording import Phase, Recorder
+
+    joints = [Joint(f"joint{index}", index + 1, servo_model("XM430-W350")) for index in range(servos)]
+    limits = [
+        SimpleNamespace(joint=joint, position_limit=[-1e9, 1e9], velocity_limit=1e9, goal_limit=1.2) for joint in joints
+    ]
+    guard = Guard(SimpleNamespace(joints=limits, safety=SimpleNamespace(max_missing=5)))  # type: ignore[arg-type]
+    port = open_port(name, BAUD)
+    port.latency = 0.02
+    exchange = make_exchange(port, servos)
+    converter = Converter(joints, [joint.drive_unit(12.0) for joint in joints])
+    goals = [0.25] * servos
+    with ExitStack() as stack:
+        folder = stack.enter_context(_temporary_folder())
+        recorder = stack.enter_context(Recorder(folder / "samples.npy", servos, 1_000_000))
+
+        def cycle() -> None:
+            ticks = converter.ticks(guard.clamp(goals))
+            state = converter.state(ticks, exchange.cycle(ticks))
+            recorder.keep(state.time_before_write, Phase.PERIODIC, 0, 0, state)
+            guard.look(state)
+
+        yield cycle
+    port.close()
+
+
+@contextmanager
+def _temporary_folder() -> Iterator[Path]:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+@contextmanager
+def sdk(name: str, servos: int) -> Iterator[Cycle]:
+    """dynamixel-sdk as its examples use it: GroupSyncWrite, then GroupSyncRead."""
+    port = PortHandler(name)
+    assert port.openPort() and port.setBaudRate(BAUD)
+    packets = PacketHandler(2.0)
+    write = GroupSyncWrite(port, packets, *GOAL_CURRENT)
+    read = GroupSyncRead(port, packets, *PRESENT)
+    ids = range(1, servos + 1)
+    for servo_id in ids:
+        read.addParam(servo_id)
+
+    def cycle() -> None:
+        for servo_id in ids:
+            write.addParam(servo_id, b"\x64\x00")
+        write.txPacket()
+        write.clearParam()
+        assert read.txRxPacket() == 0
+        for servo_id in ids:
+            read.getData(servo_id, 126, 2), read.getData(servo_id, 128, 4), read.getData(servo_id, 132, 4)
+
+    yield cycle
+    port.closePort()
+
+
+@contextmanager
+def rustypot(name: str, servos: int) -> Iterator[Cycle]:
+    """rustypot's raw sync write and sync read."""
+    from rustypot import Xl330PyController
+
+    controller = Xl330PyController(name, BAUD, 0.05)
+    ids = list(range(1, servos + 1))
+    data = [b"\x64\x00"] * servos
+
+    def cycle() -> None:
+        controller.sync_write_raw_data(ids, GOAL_CURRENT[0], data)
+        assert len(controller.sync_read_raw_data(ids, *PRESENT)) == servos
+
+    cycle()
+    yield cycle
+
+
+def play(cycle: Cycle, count: int) -> Round:
+    """One round of a client in this process."""
+    trips = np.empty(count)
+    clock = time.perf_counter
+    cpu, start = time.process_time(), clock()
+    for index in range(count):
+        before = clock()
+        cycle()
+        trips[index] = clock() - before
+    whole = clock() - start
+    return Round((time.process_time() - cpu) / count * 1e6, float(np.median(trips)) * 1e6, count / whole)
+
+
+def play_c(binary: Path, name: str, servos: int, count: int, writes: int) -> Round:
+    """One round of the client in C."""
+    words = [binary, "client", name, str(servos), str(count), str(writes)]
+    text = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+    cpu, p50, each = map(int, text.split())
+    return Round(cpu / 1e3, p50 / 1e3, 1e9 / each)
+
+
+def available() -> dict[str, Any]:
+    clients = {"ours": ours, "ours, Fast Sync Read": lambda *a: ours(*a, fast=True), "ours, whole sample": whole_sample}
+    clients["dynamixel-sdk"] = sdk
+    try:
+        import rustypot as _  # noqa: F401
+    except ImportError:
+        return clients
+    return clients | {"rustypot": rustypot}
+
+
+def measure(binary: Path, servos: int, byte_ns: int, rounds: int, count: int) -> dict[str, Round]:
+    """All clients by turns; the median of each figure over the rounds."""
+    results: dict[str, list[Round]] = {}
+    with ExitStack() as stack:
+        cycles = {}
+        for name, client in available().items():
+            device = stack.enter_context(served_pty(binary, byte_ns))
+            cycles[name] = stack.enter_context(client(device, servos))
+            play(cycles[name], 50)
+        device = stack.enter_context(served_pty(binary, byte_ns))
+        for _ in range(rounds):
+            for name, cycle in cycles.items():
+                results.setdefault(name, []).append(play(cycle, count))
+            for writes in (1, 2):
+                name = f"C, {'one write' if writes == 1 else 'two writes'}"
+                results.setdefault(name, []).append(play_c(binary, device, servos, count, writes))
+    return {name: Round(*map(statistics.median, zip(*many, strict=True))) for name, many in results.items()}
+
+
+def report(at_once: dict[str, Round], wired: dict[str, Round], samples_cpu: dict[str, float]) -> dict[str, Any]:
+    """The figures that are held against the targets."""
+
+    def ratio(results: dict[str, Round], other: str, field: str) -> float | None:
+        if other not in results:
+            return None
+        return round(getattr(results["ours"], field) / getattr(results[other], field), 3)
+
+    return {
+        "cpu_over_sdk": ratio(wired, "dynamixel-sdk", "cpu_us"),
+        "cpu_over_rustypot": ratio(wired, "rustypot", "cpu_us"),
+        "p50_above_c_us": round(wired["ours"].p50_us - wired["C, one write"].p50_us, 2),
+        "rate_over_sdk": ratio(at_once, "dynamixel-sdk", "rate"),
+        "rate_over_rustypot": ratio(at_once, "rustypot", "rate"),
+        "whole_sample_cpu_us": samples_cpu,
+        "at_once": {name: _rounded(each) for name, each in at_once.items()},
+        "wired": {name: _rounded(each) for name, each in wired.items()},
+        "machine": machine(),
+    }
+
+
+def _rounded(each: Round) -> dict[str, float]:
+    return {name: round(value, 2) for name, value in each._asdict().items()}
+
+
+def show(figures: dict[str, Any], servos: int) -> None:
+    print(f"Sync Write + Sync Read, {servos} servos, over a pty. {figures['machine']}.\n")
+    for title, key in (("answered at once", "at_once"), ("1 Mbaud", "wired")):
+        print(f"{title:<24}{'CPU us':>10}{'p50 us':>10}{'cycles/s':>12}{'CPU / sdk':>12}")
+        base = figures[key]["dynamixel-sdk"]["cpu_us"]
+        for name, each in figures[key].items():
+            shares = each["cpu_us"] / base
+            print(f"  {name:<22}{each['cpu_us']:>10.1f}{each['p50_us']:>10.1f}{each['rate']:>12.0f}{shares:>12.3f}")
+        print()
+    for key in ("cpu_over_sdk", "cpu_over_rustypot", "p50_above_c_us", "rate_over_sdk", "rate_over_rustypot"):
+        print(f"{key:<22}{figures[key]}")
+    for count, cpu_us in figures["whole_sample_cpu_us"].items():
+        print(f"whole sample, {count} servos: {cpu_us} us of CPU at 1 Mbaud")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="one JSON object and nothing else")
+    parser.add_argument("--servos", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--cycles", type=int, default=400, help="in each round at 1 Mbaud; five times as many at once")
+    options = parser.parse_args()
+    with responder_binary() as binary:
+        at_once = measure(binary, options.servos, 0, options.rounds, 5 * options.cycles)
+        wired = measure(binary, options.servos, BYTE_NS, options.rounds, options.cycles)
+        samples_cpu = {str(options.servos): round(wired["ours, whole sample"].cpu_us, 1)}
+        with served_pty(binary, BYTE_NS) as device, whole_sample(device, 6) as cycle:
+            each = [play(cycle, options.cycles).cpu_us for _ in range(options.rounds)]
+        samples_cpu["6"] = round(statistics.median(each), 1)
+    figures = report(at_once, wired, samples_cpu)
+    if options.json:
+        print(json.dumps(figures))
+    else:
+        show(figures, options.servos)
+
+
+if __name__ == "__main__":
+    main()

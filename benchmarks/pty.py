@@ -1,0 +1,41 @@
+"""A pty with responder.c at its far end."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+SOURCE = Path(__file__).with_name("responder.c")
+
+
+@contextmanager
+def responder_binary() -> Iterator[Path]:
+    """responder.c, compiled into a folder that goes away again."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        sys.exit("The benchmark needs a C compiler called cc (Debian: apt install gcc).")
+    with tempfile.TemporaryDirectory() as folder:
+        binary = Path(folder) / "responder"
+        subprocess.run([compiler, "-O2", "-o", binary, SOURCE], check=True)
+        yield binary
+
+
+@contextmanager
+def served_pty(binary: Path, byte_ns: int) -> Iterator[str]:
+    """The name of a pty whose far end is answered by the responder. byte_ns: what a byte takes on the wire."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    server = subprocess.Popen([binary, "serve", str(master), str(byte_ns)], pass_fds=[master])
+    os.close(master)
+    try:
+        # The slave stays open here, so that the responder outlives a client that closes its own.
+        yield os.ttyname(slave)
+    finally:
+        os.close(slave)
+        server.terminate()
+        server.wait()

@@ -1,0 +1,43 @@
+"""A fixed rate from absolute deadlines: what runs late once does not shift what comes after it."""
+
+from typing import NamedTuple
+
+from drivers.clock import Clock
+
+
+class Tick(NamedTuple):
+    """One deadline [s, on the clock], the time at which its wait ended, and whether it was missed.
+
+    Missed means a whole interval or more late: nothing should be done for it any more.
+    """
+
+    deadline: float
+    now: float
+    missed: bool
+
+
+class FixedRate:
+    """Deadlines at `rate` per second, the first one interval after the first wait.
+
+    After a stall the missed deadlines come at once, one by one and marked, so that whoever plays samples stays in step
+    with the clock without sending a burst. `missed` counts them.
+    """
+
+    def __init__(self, clock: Clock, rate: float) -> None:
+        self._clock = clock
+        self._interval = 1 / rate
+        self._start: float | None = None
+        self._index = 0
+        self.missed = 0
+
+    def wait(self) -> Tick:
+        """Wait for the next deadline."""
+        if self._start is None:
+            self._start = self._clock.now() + self._interval
+        deadline = self._start + self._index * self._interval
+        self._index += 1
+        self._clock.wait_until(deadline)
+        now = self._clock.now()
+        missed = now - deadline >= self._interval
+        self.missed += missed
+        return Tick(deadline, now, missed)

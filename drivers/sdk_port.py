@@ -1,0 +1,54 @@
+"""The port that `dynamixel-sdk`'s packet handler works on, in place of its own PortHandler."""
+
+from drivers.port import Port
+
+PATIENCE_S = 0.018
+"""How long set-up work waits for a reply beyond its wire time, whatever the adapter: writing EEPROM takes a servo
+some ms."""
+
+
+class SdkPort:
+    """`dynamixel-sdk` on our open port.
+
+    Against its own: reads wait instead of polling, time is the port's clock, and a failure cannot leave the port marked
+    as in use, after which torque could never be switched off. Method names are the SDK's.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self._deadline = 0.0
+
+    @property
+    def is_using(self) -> bool:
+        return False
+
+    @is_using.setter
+    def is_using(self, value: bool) -> None:
+        """The SDK sets it around each exchange and leaves it set after an exception: not kept."""
+
+    def getBaudRate(self) -> int:  # noqa: N802
+        return self._port.baud
+
+    def clearPort(self) -> None:  # noqa: N802
+        self._port.discard_input()
+
+    def writePort(self, packet: list[int]) -> int:  # noqa: N802
+        self._port.write(bytes(packet))
+        return len(packet)
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        remaining = self._deadline - self._port.clock.now()
+        return self._port.read(length, max(0.0, remaining))
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        # Twice the reply's wire time: once for the instruction before it, once for the reply.
+        self._set_timeout(2 * self._port.wire_time(packet_length) + max(PATIENCE_S, self._port.latency + 2e-3))
+
+    def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
+        self._set_timeout(msec / 1000)
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        return self._port.clock.now() >= self._deadline
+
+    def _set_timeout(self, timeout: float) -> None:
+        self._deadline = self._port.clock.now() + timeout

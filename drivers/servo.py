@@ -1,0 +1,110 @@
+"""One servo on a port, for set-up work: ping, and registers by name; each exchange is tried up to three times.
+
+Everything goes through `dynamixel-sdk`'s packet handler. What is written is read back: a Sync Write has no status at
+all, and a status says that the packet was understood, not what the register holds now.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TypeVar
+
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
+
+from drivers.control_table import ControlTable
+from drivers.errors import NoReply, ServoRefused, WrongReply
+from drivers.packet import ALERT, HardwareError, StatusError
+from drivers.port import Port
+from drivers.sdk_port import SdkPort
+
+_T = TypeVar("_T")
+
+_ATTEMPTS = 3
+"""How often a set-up exchange is tried before a damaged or missing reply is believed."""
+
+
+class Servo:
+    """A servo by its ID. `title` begins the error messages, e.g. "Joint 'elbow' (ID 2, XM430-W350)"."""
+
+    def __init__(self, port: Port, servo_id: int, table: ControlTable, title: str = "") -> None:
+        self.port = port
+        self.id = servo_id
+        self.table = table
+        self.title = title or f"The {table.model} with ID {servo_id}"
+        self._sdk_port = SdkPort(port)
+        self._sdk = PacketHandler(2.0)
+
+    def ping(self, attempts: int = _ATTEMPTS) -> int:
+        """The model number that answers at this ID; raises NoReply, WrongReply, PortLost."""
+
+        def ask() -> tuple[int, int, int]:
+            number, result, error = self._sdk.ping(self._sdk_port, self.id)
+            return number, result, error
+
+        return self._try("ping", ask, attempts)
+
+    def read(self, register: str) -> int:
+        """The value of a register, in ticks; raises NoReply, WrongReply, ServoRefused, PortLost."""
+        entry = self.table[register]
+
+        def ask() -> tuple[list[int], int, int]:
+            data, result, error = self._sdk.readTxRx(self._sdk_port, self.id, entry.address, entry.size)
+            return data, result, error
+
+        return entry.decode(bytes(self._try(f"reading {register}", ask)))
+
+    def write(self, register: str, value: int) -> None:
+        """Write a register and read it back; raises as `read`, and ServoRefused when it reads back otherwise."""
+        # A status may be lost, or switched off (Status Return Level 1): what counts is what the register holds.
+        with suppress(NoReply):
+            self.write_only(register, value)
+        actual = self.read(register)
+        if actual != value:
+            raise ServoRefused(f"{self.title}: {register} was written as {value} but reads back as {actual}.")
+
+    def write_only(self, register: str, value: int) -> None:
+        """Write a register whose new value cannot be read back under the old ID or baud; raises as `read`."""
+        entry = self.table[register]
+        data = list(entry.encode(value))
+
+        def send() -> tuple[None, int, int]:
+            result, error = self._sdk.writeTxRx(self._sdk_port, self.id, entry.address, entry.size, data)
+            return None, result, error
+
+        self._try(f"writing {value} to {register}", send)
+
+    def hardware_error(self) -> HardwareError:
+        """Why the servo raised its alert bit; raises as `read`."""
+        return HardwareError(self.read("Hardware Error Status"))
+
+    def _try(self, what: str, action: Callable[[], tuple[_T, int, int]], attempts: int = _ATTEMPTS) -> _T:
+        """Run one SDK exchange until it succeeds, at most `attempts` times; turn result codes into exceptions."""
+        for _ in range(attempts):
+            value, result, error = action()
+            if result == COMM_SUCCESS:
+                break
+        if result == COMM_RX_TIMEOUT:
+            raise NoReply(
+                f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "
+                "and its cable; `hil scan` finds it at another ID or baud."
+            )
+        if result != COMM_SUCCESS:
+            text = self._sdk.getTxRxResult(result)
+            raise WrongReply(f"{self.title}: {what} failed: {text} Do two servos share ID {self.id}?")
+        refused = error & ~ALERT
+        if refused:
+            raise ServoRefused(f"{self.title} refused {what}: {_status_error(refused)}.")
+        return value
+
+
+def describe_error(error: HardwareError) -> str:
+    """Hardware errors in words, e.g. "overload, overheating"."""
+    known = [bit.name.replace("_", " ").lower() for bit in HardwareError if bit in error and bit.name]
+    rest = int(error) & ~sum(HardwareError)
+    return ", ".join(known + ([f"unknown bits {rest:#04x}"] if rest else [])) or "none"
+
+
+def _status_error(code: int) -> str:
+    try:
+        return StatusError(code).name.replace("_", " ").lower() + " error"
+    except ValueError:
+        return f"error {code}"

@@ -1,0 +1,165 @@
+"""Sync Read and Fast Sync Read: one request for the same contiguous registers of several servos, and their answers.
+
+A servo's answer is a plain tuple: the ERR byte, then the registers' values in ticks; the ERR byte alone where the servo
+refused; None where it did not answer. ERR holds a StatusError in its low bits and the Alert in bit 7.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from struct import Struct
+from typing import Protocol
+
+from fastcrc import crc16
+
+from drivers.control_table import ControlTable
+from drivers.packet import ALERT, BROADCAST_ID, HEADER, Framer, Instruction, Packet, encode
+
+Answer = tuple[int, ...] | None
+
+_ERROR_BITS = 0xFF & ~ALERT
+_FORMATS = {(1, False): "B", (2, False): "H", (4, False): "I", (1, True): "b", (2, True): "h", (4, True): "i"}
+
+
+@dataclass(frozen=True)
+class Span:
+    """Registers that are read together: everything from the first to the last of them. `format` is struct's."""
+
+    registers: tuple[str, ...]
+    address: int
+    size: int
+    format: str
+
+    @classmethod
+    def of(cls, tables: Sequence[ControlTable], registers: Sequence[str]) -> "Span":
+        """The span of these registers, in ascending order of address, which must be the same in all tables.
+
+        Raises ValueError where two models have them at different places, KeyError where one has not got one.
+        """
+        spans = {cls._in(table, registers) for table in tables}
+        if len(spans) != 1:
+            models = ", ".join(sorted({table.model for table in tables}))
+            raise ValueError(f"{models} do not have {', '.join(registers)} at the same addresses: no common Sync Read.")
+        return spans.pop()
+
+    @classmethod
+    def _in(cls, table: ControlTable, registers: Sequence[str]) -> "Span":
+        entries = [table[name] for name in registers]
+        start = end = entries[0].address
+        code = ""
+        for entry in entries:
+            code += "x" * (entry.address - end) + _FORMATS[entry.size, entry.signed]
+            end = entry.address + entry.size
+        return cls(tuple(registers), start, end - start, code)
+
+
+class GroupRead(Protocol):
+    """What the exchange needs of a group read. `request` and `reply_size` bytes go over the wire."""
+
+    request: bytes
+    reply_size: int
+
+    def unpack(self, received: bytes) -> list[Answer] | None:
+        """The usual case: every servo answered and nothing was stuffed. None when it is not that case."""
+        ...
+
+    def search(self, received: bytes) -> tuple[list[Answer], bool]:
+        """What is to be found among stuffed, damaged, foreign or missing answers; whether nothing more is to come."""
+        ...
+
+
+class SyncRead:
+    """Each servo answers with a status packet of its own, in the order of `ids`."""
+
+    def __init__(self, ids: Sequence[int], span: Span) -> None:
+        self._ids = tuple(ids)
+        self._values = Struct(f"<B{span.format}")
+        self._size = span.size
+        self.request = _request(Instruction.SYNC_READ, ids, span)
+        # A damaged LEN must not swallow the answers behind it; stuffing adds at most a byte for every three.
+        self._longest = span.size + 4 + (span.size + 2) // 3
+        length = span.size + 11  # header, ID, LEN, INST, ERR, data, CRC
+        self.reply_size = length * len(self._ids)
+        behind_id = (span.size + 4).to_bytes(2, "little") + bytes((Instruction.STATUS,))
+        self._parts = [
+            (HEADER + bytes((servo_id,)) + behind_id, index * length, index * length + 8, (index + 1) * length - 2)
+            for index, servo_id in enumerate(self._ids)
+        ]
+
+    def unpack(self, received: bytes) -> list[Answer] | None:
+        if len(received) != self.reply_size:
+            return None
+        answers: list[Answer] = []
+        for front, start, values, end in self._parts:
+            if not received.startswith(front, start):
+                return None
+            if crc16.umts(received[start:end]) != received[end] | received[end + 1] << 8:
+                return None
+            answers.append(self._values.unpack_from(received, values))
+        return answers
+
+    def search(self, received: bytes) -> tuple[list[Answer], bool]:
+        found = {}
+        for packet in Framer(longest=self._longest).feed(received):
+            if packet.is_status and packet.id in self._ids and (answer := self._answer(packet)):
+                found[packet.id] = answer
+        # They answer in turn, so nobody speaks after the last one.
+        return [found.get(servo_id) for servo_id in self._ids], self._ids[-1] in found
+
+    def _answer(self, packet: Packet) -> Answer:
+        if len(packet.data) == self._size:
+            return self._values.unpack(packet.body)
+        # An answer of another length is one to an earlier request, or a refusal.
+        return (packet.error,) if packet.error & _ERROR_BITS and not packet.data else None
+
+
+class FastSyncRead:
+    """All servos append to one status packet, which is never stuffed: `ERR ID data CRC` each.
+
+    Each CRC is taken over everything from the packet's header on, so the last one vouches for the whole.
+    """
+
+    def __init__(self, ids: Sequence[int], span: Span) -> None:
+        self._ids = tuple(ids)
+        self._values = Struct(f"<Bx{span.format}")
+        self.request = _request(Instruction.FAST_SYNC_READ, ids, span)
+        part = span.size + 4  # ERR, ID, data, CRC
+        length = 1 + part * len(self._ids)
+        self._front = HEADER + bytes((BROADCAST_ID,)) + length.to_bytes(2, "little") + bytes((Instruction.STATUS,))
+        self._parts = [
+            (servo_id, len(self._front) + index * part, len(self._front) + (index + 1) * part)
+            for index, servo_id in enumerate(self._ids)
+        ]
+        self.reply_size = self._parts[-1][2]
+
+    def unpack(self, received: bytes) -> list[Answer] | None:
+        end = self.reply_size - 2
+        if len(received) != end + 2 or not received.startswith(self._front):
+            return None
+        if crc16.umts(received[:end]) != received[end] | received[end + 1] << 8:
+            return None
+        answers: list[Answer] = []
+        for servo_id, start, _ in self._parts:
+            answer = self._values.unpack_from(received, start)
+            if received[start + 1] != servo_id or answer[0] & _ERROR_BITS:
+                return None
+            answers.append(answer)
+        return answers
+
+    def search(self, received: bytes) -> tuple[list[Answer], bool]:
+        at = received.find(self._front)
+        packet = received[at:] if at >= 0 else b""
+        answers: list[Answer] = []
+        for servo_id, start, end in self._parts:
+            whole = len(packet) >= end and packet[start + 1] == servo_id
+            if not whole or crc16.umts(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
+                break
+            answer = self._values.unpack_from(packet, start)
+            answers.append(answer[:1] if answer[0] & _ERROR_BITS else answer)
+        # Behind a servo that is silent or damaged the packet cannot be trusted.
+        answers += [None] * (len(self._ids) - len(answers))
+        return answers, len(packet) >= self.reply_size
+
+
+def _request(instruction: Instruction, ids: Sequence[int], span: Span) -> bytes:
+    place = span.address.to_bytes(2, "little") + span.size.to_bytes(2, "little")
+    return encode(BROADCAST_ID, instruction, place + bytes(ids))

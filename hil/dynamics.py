@@ -1,0 +1,178 @@
+"""An identified arm as a model to use: torques of a motion, gravity, friction, accelerations. Needs numpy only.
+
+Equations and names are those of docs/model.md. Every array has the joints on its last axis and any shape before it, so
+one pose, a trajectory and a batch of trajectories are all taken as they are.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_CHUNK = 16384  # samples worked on together: their temporaries stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class JointFacts:
+    """What a model knows of a joint beside its dynamics.
+
+    mode: "current", whose goals are A, or "pwm", whose goals are V. torque_per_goal: N m/A or N m/V at the output
+    shaft. goal_limit: A or V. position_limit: rad. velocity_limit: rad/s.
+    """
+
+    name: str
+    servo: str
+    mode: str
+    torque_per_goal: float
+    torque_per_goal_std: float
+    goal_limit: float
+    position_limit: tuple[float, float]
+    velocity_limit: float
+
+    @property
+    def goal_unit(self) -> str:
+        return "V" if self.mode == "pwm" else "A"
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """The dynamics of an identified arm of one or two joints.
+
+    values, stds: base parameters and the terms of friction and drive, by name [SI]. gravity: m/s^2 in the arm's plane.
+    """
+
+    values: Mapping[str, float]
+    stds: Mapping[str, float]
+    gravity: float
+    rest_pose: tuple[float, ...]
+    joints: tuple[JointFacts, ...]
+
+    def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
+        """Motor torques (..., joints) [N m] of a motion: inertia, Coriolis, gravity, friction, offset.
+
+        q [rad], dq [rad/s], ddq [rad/s^2]: (..., joints). Raises ValueError when their shapes differ or do not end in
+        the number of joints.
+        """
+        q, dq, ddq = self._motion(q=q, dq=dq, ddq=ddq)
+        flat = [values.reshape(-1, len(self.joints)) for values in (q, dq, ddq)]
+        torque = np.empty_like(flat[0])
+        for first in range(0, len(torque), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            torque[part] = self._inverse(*(values[part].T for values in flat)).T
+        return torque.reshape(q.shape)
+
+    def rigid_body_torque(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
+        """As `inverse_dynamics`, without friction and offset: what a simulator's links alone would need."""
+        q, dq, ddq = self._motion(q=q, dq=dq, ddq=ddq)
+        return np.asarray(np.moveaxis(self._rigid_body(*(_joints_first(x) for x in (q, dq, ddq))), 0, -1))
+
+    def gravity_torque(self, q: ArrayLike) -> Array:
+        """Torques (..., joints) [N m] that hold the pose q (..., joints) [rad] against gravity alone."""
+        (q,) = self._motion(q=q)
+        return np.asarray(np.moveaxis(self._gravity(_joints_first(q)), 0, -1))
+
+    def friction_torque(self, dq: ArrayLike) -> Array:
+        """Friction (..., joints) [N m] at velocities dq (..., joints) [rad/s], without offset and without what grows
+        with load.
+        """
+        (dq,) = self._motion(dq=dq)
+        velocity = _joints_first(dq)
+        steps = [self._step(joint, v) * self._level(joint, v) for joint, v in enumerate(velocity, start=1)]
+        viscous = [self.values[f"viscous_{joint}"] * v for joint, v in enumerate(velocity, start=1)]
+        return np.stack([step + slope for step, slope in zip(steps, viscous, strict=True)], axis=-1)
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """Mass matrices (..., joints, joints) [kg m^2] in the poses q (..., joints) [rad]."""
+        (q,) = self._motion(q=q)
+        p = self.values
+        matrix = np.empty((*q.shape, len(self.joints)))
+        if len(self.joints) == 1:
+            matrix[..., 0, 0] = p["inertia_1"]
+            return matrix
+        coupling = p["coupling"] * np.cos(q[..., 1])
+        matrix[..., 0, 0] = p["inertia_1"] + p["inertia_2"] + 2 * coupling
+        matrix[..., 0, 1] = matrix[..., 1, 0] = p["inertia_2"] + coupling
+        matrix[..., 1, 1] = p["inertia_2"] + p["armature_2"]
+        return matrix
+
+    def forward_dynamics(self, q: ArrayLike, dq: ArrayLike, torque: ArrayLike) -> Array:
+        """Accelerations (..., joints) [rad/s^2] under motor torques (..., joints) [N m] of joints that move.
+
+        At rest friction is what holds the joint, which a formula of velocity cannot tell: it counts as none there.
+        """
+        q, dq, torque = self._motion(q=q, dq=dq, torque=torque)
+        loaded = self.friction_torque(dq) + self._load_friction(dq, torque) + self._offsets()
+        free = torque - self.rigid_body_torque(q, dq, np.zeros_like(q)) - loaded
+        return np.asarray(np.linalg.solve(self.mass_matrix(q), free[..., None])[..., 0])
+
+    def goal(self, torque: ArrayLike) -> Array:
+        """Goals (..., joints) [A, or V in pwm mode] for motor torques (..., joints) [N m]; no limit is applied."""
+        (torque,) = self._motion(torque=torque)
+        return np.asarray(torque / np.array([joint.torque_per_goal for joint in self.joints]))
+
+    def _motion(self, **arrays: ArrayLike) -> list[Array]:
+        """The arguments as arrays of one shape; raises ValueError."""
+        taken = {name: np.asarray(values, dtype=np.float64) for name, values in arrays.items()}
+        shapes = {values.shape for values in taken.values()}
+        count = len(self.joints)
+        if len(shapes) != 1 or any(not shape or shape[-1] != count for shape in shapes):
+            found = ", ".join(f"{name} {values.shape}" for name, values in taken.items())
+            raise ValueError(f"{found}: all must have one shape (..., {count}), the joints last")
+        return list(taken.values())
+
+    def _inverse(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Motor torques, joints first."""
+        torque = self._rigid_body(q, dq, ddq)
+        for joint, v in enumerate(dq, start=1):
+            step = self._step(joint, v)
+            moving = self.values[f"viscous_{joint}"] * v + step * self._level(joint, v)
+            total = torque[joint - 1] + moving + self.values[f"offset_{joint}"]
+            load = self.values.get(f"load_{joint}", 0.0)
+            # total + step load |torque| = torque, whose sign is that of total while load < 1.
+            torque[joint - 1] = total / (1 - load * step * np.sign(total)) if load else total
+        return torque
+
+    def _rigid_body(self, q: Array, dq: Array, ddq: Array) -> Array:
+        p = self.values
+        if len(q) == 1:
+            return np.asarray(p["inertia_1"] * ddq + p["gravity_1"] * np.cos(q))
+        coupling, sine = p["coupling"] * np.cos(q[1]), p["coupling"] * np.sin(q[1])
+        both = p["inertia_2"] * (ddq[0] + ddq[1])
+        torque = self._gravity(q)
+        torque[0] += p["inertia_1"] * ddq[0] + both + coupling * (2 * ddq[0] + ddq[1])
+        torque[0] -= sine * (2 * dq[0] + dq[1]) * dq[1]
+        torque[1] += both + p["armature_2"] * ddq[1] + coupling * ddq[0] + sine * dq[0] * dq[0]
+        return torque
+
+    def _gravity(self, q: Array) -> Array:
+        p = self.values
+        if len(q) == 1:
+            return np.asarray(p["gravity_1"] * np.cos(q))
+        second = p["gravity_2"] * np.cos(q[0] + q[1])
+        return np.stack((p["gravity_1"] * np.cos(q[0]) + second, second))
+
+    def _step(self, joint: int, v: Array) -> Array:
+        width = self.values.get(f"coulomb_width_{joint}", 0.0)
+        return np.asarray(np.tanh(v / width) if width > 0 else np.sign(v))
+
+    def _level(self, joint: int, v: Array) -> Array | float:
+        level = self.values[f"coulomb_{joint}"]
+        rise = self.values.get(f"stribeck_rise_{joint}", 0.0)
+        if not rise:
+            return level
+        return np.asarray(level * (1 + rise * np.exp(-((v / self.values[f"stribeck_velocity_{joint}"]) ** 2))))
+
+    def _load_friction(self, dq: Array, torque: Array) -> Array:
+        loads = [self.values.get(f"load_{joint}", 0.0) for joint in range(1, len(self.joints) + 1)]
+        steps = [self._step(joint, dq[..., joint - 1]) for joint in range(1, len(self.joints) + 1)]
+        return np.asarray(np.stack(steps, axis=-1) * loads * np.abs(torque))
+
+    def _offsets(self) -> Array:
+        return np.array([self.values[f"offset_{joint}"] for joint in range(1, len(self.joints) + 1)])
+
+
+def _joints_first(values: Array) -> Array:
+    return np.moveaxis(values, -1, 0)

@@ -1,0 +1,42 @@
+"""What a robot description has no place for, in words: said on the terminal and in the file, never dropped silently."""
+
+from hil.dynamics import ArmModel
+
+MEANING = {
+    "armature": "inertia of the rotor through the gears, seen by its own joint only",
+    "offset": "constant torque",
+    "coulomb_width": "width of the Coulomb step",
+    "stribeck_rise": "friction at low speed above Coulomb, as a fraction of it",
+    "stribeck_velocity": "velocity where that rise has fallen off",
+    "load": "friction per motor torque",
+    "lag": "time constant of the current loop",
+    "delay": "delay of the torque",
+}
+UNITS = {
+    "armature": "kg m^2",
+    "offset": "N m",
+    "coulomb_width": "rad/s",
+    "stribeck_rise": "",
+    "stribeck_velocity": "rad/s",
+    "load": "",
+    "lag": "s",
+    "delay": "s",
+}
+
+
+def left_out(model: ArmModel, terms: tuple[str, ...]) -> list[str]:
+    """One sentence per parameter of the model whose kind is among `terms`."""
+    said = []
+    for name, value in model.values.items():
+        kind = name.rstrip("0123456789").rstrip("_")
+        if kind in terms:
+            amount = f"{value:.6g} {UNITS[kind]}".rstrip()
+            said.append(f"{name} = {amount} ({MEANING[kind]})")
+    return said
+
+
+def torque_constants(model: ArmModel) -> list[str]:
+    """One sentence per joint about its torque constant."""
+    return [
+        f"torque per goal of {joint.name} = {joint.torque_per_goal:.6g} N m/{joint.goal_unit}" for joint in model.joints
+    ]

@@ -1,0 +1,75 @@
+"""MJCF: bodies with masses, hinges with armature and friction, actuators commanded in the servo's own unit."""
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from hil.dynamics import ArmModel
+from hil.export.left_out import left_out
+from hil.export.mass_distribution import LinkMass, distribute
+from hil.export.source import Source, write_text
+from hil.export.xml_text import axis, comment, describe, numbers, to_text
+
+_MISSING = ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "delay")
+
+
+def export_mjcf(source: Source, path: Path) -> list[str]:
+    """Write `path`; what MJCF has no place for. Raises ExportError when no physical masses exist."""
+    model = source.model
+    links = distribute(model, source.link_length)
+    left = left_out(model, _MISSING)
+    root = ET.Element("mujoco", model="arm")
+    describe(root, model, left)
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    ET.SubElement(root, "option", gravity=numbers(0, 0, -model.gravity), timestep="0.001", integrator="implicitfast")
+    parent = ET.SubElement(root, "worldbody")
+    along = 0.0
+    for index, link in enumerate(links):
+        parent = _add_body(parent, model, index, link, along)
+        along = link.length
+    _add_actuators(root, model)
+    write_text(path, to_text(root))
+    return left
+
+
+def _add_body(parent: ET.Element, model: ArmModel, index: int, link: LinkMass, along: float) -> ET.Element:
+    facts, number = model.joints[index], index + 1
+    body = ET.SubElement(parent, "body", name=f"link_{number}", pos=numbers(along, 0, 0))
+    ET.SubElement(
+        body,
+        "joint",
+        name=facts.name,
+        type="hinge",
+        axis=axis(model),
+        range=numbers(*facts.position_limit),
+        # Joint 1's rotor is within the inertia of link 1.
+        armature=numbers(model.values.get(f"armature_{number}", 0.0)),
+        damping=numbers(model.values[f"viscous_{number}"]),
+        frictionloss=numbers(model.values[f"coulomb_{number}"]),
+    )
+    # Only the inertia across the plane was measured; the others are set equal, which every engine takes as physical.
+    inertia = numbers(*(link.inertia,) * 3)
+    ET.SubElement(body, "inertial", pos=numbers(link.centre, 0, 0), mass=numbers(link.mass), diaginertia=inertia)
+    seen = {"type": "capsule", "size": "0.01", "fromto": numbers(0, 0, 0, link.length, 0, 0)}
+    ET.SubElement(body, "geom", seen, contype="0", conaffinity="0")
+    return body
+
+
+def _add_actuators(root: ET.Element, model: ArmModel) -> None:
+    """Motors controlled by a goal [A, or V in pwm mode]: gain its torque, bias the offset, filter the drive's lag."""
+    actuators = ET.SubElement(root, "actuator")
+    units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)
+    comment(actuators, f"control is the servo's goal: {units}")
+    lag = model.values.get("lag", 0.0)
+    drive = {"dyntype": "filterexact", "dynprm": numbers(lag)} if lag > 0 else {}
+    for number, facts in enumerate(model.joints, start=1):
+        ET.SubElement(
+            actuators,
+            "general",
+            drive,
+            name=facts.name,
+            joint=facts.name,
+            gainprm=numbers(facts.torque_per_goal),
+            biastype="affine",
+            biasprm=numbers(-model.values[f"offset_{number}"], 0, 0),
+            ctrlrange=numbers(-facts.goal_limit, facts.goal_limit),
+        )

@@ -1,0 +1,65 @@
+"""TOML and JSON of the identified parameters; `hil.load_model` reads both back to the last digit."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from hil.export.source import Source, write_text
+
+_KEPT = ("schema", "method", "config", "joints", "arm", "parameters", "extra", "covariance", "fit", "validation")
+
+
+def export_json(source: Source, path: Path) -> list[str]:
+    """Write `path`; JSON holds all of it."""
+    write_text(path, json.dumps(_strict(_kept(source)), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    return []
+
+
+def export_toml(source: Source, path: Path) -> list[str]:
+    """Write `path`; TOML holds all of it."""
+    lines = ["# Base parameters of an identified arm [SI]; docs/model.md has the equations. Read by hil.load_model."]
+    _write_table(lines, (), _kept(source))
+    write_text(path, "\n".join(lines) + "\n")
+    return []
+
+
+def _kept(source: Source) -> dict[str, Any]:
+    return {key: source.result[key] for key in _KEPT if key in source.result}
+
+
+def _strict(value: Any) -> Any:
+    """Strict JSON has no infinity: an error bar that is infinite becomes null."""
+    if isinstance(value, dict):
+        return {key: _strict(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_strict(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _write_table(lines: list[str], path: tuple[str, ...], table: dict[str, Any]) -> None:
+    """A table's own values, then its tables, then its arrays of tables."""
+    tables = {key: value for key, value in table.items() if isinstance(value, dict)}
+    arrays = {key: value for key, value in table.items() if _is_array_of_tables(value)}
+    lines += [f"{key} = {_value(table[key])}" for key in table if key not in tables and key not in arrays]
+    for key, value in tables.items():
+        lines += ["", f"[{'.'.join((*path, key))}]"]
+        _write_table(lines, (*path, key), value)
+    for key, rows in arrays.items():
+        for row in rows:
+            lines += ["", f"[[{'.'.join((*path, key))}]]"]
+            _write_table(lines, (*path, key), row)
+
+
+def _is_array_of_tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(entry, dict) for entry in value)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    return repr(value)

@@ -1,0 +1,57 @@
+"""What an exporter works from: one run folder, read once."""
+
+import json
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.dynamics import ArmModel
+from hil.errors import RunFolderError
+from hil.model_file import model_of, read_result
+
+
+@dataclass(frozen=True)
+class Source:
+    """A run with a result. link_length: of link 1 [m], where the parameters do not say it (see `mass_distribution`)."""
+
+    run: Path
+    result: dict[str, Any]
+    model: ArmModel
+    link_length: float | None = None
+
+    @classmethod
+    def open(cls, run: Path, link_length: float | None = None) -> "Source":
+        """Read a run folder; raises ResultError."""
+        result = read_result(run)
+        return cls(run, result, model_of(result, run), link_length)
+
+    @cached_property
+    def samples(self) -> NDArray[np.void]:
+        """The recording's rows (hil.recording.sample_type); raises RunFolderError."""
+        from hil.recording import load_samples
+
+        return load_samples(self.run / "samples.npy", len(self.model.joints))
+
+    @cached_property
+    def started(self) -> float:
+        """When the run was started [s since 1970]; raises RunFolderError."""
+        path = self.run / "run.json"
+        try:
+            return datetime.fromisoformat(json.loads(path.read_text(encoding="utf-8"))["started"]).timestamp()
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RunFolderError(f"{path} cannot be read: {error!r}.") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all; raises RunFolderError."""
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error

@@ -1,0 +1,62 @@
+"""CSV, Parquet and MAT: the recording as columns, the result beside it where the format has a place."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from hil.errors import ExportError, RunFolderError
+from hil.export.columns import columns, unit
+from hil.export.source import Source, write_text
+
+
+def export_csv(source: Source, path: Path) -> list[str]:
+    """Write `path`, numbers to their last digit, missing values as nan."""
+    table = columns(source)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(table)
+    writer.writerows(zip(*(column.tolist() for column in table.values()), strict=True))
+    write_text(path, text.getvalue())
+    return ["the identified parameters (a CSV is one table; export toml or json for them)", "units (all are SI)"]
+
+
+def export_parquet(source: Source, path: Path) -> list[str]:
+    """Write `path`, with the unit in each column's metadata and result.json in the file's. Needs pyarrow."""
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ExportError("Parquet needs the package pyarrow: pip install 'hil[export]'.") from error
+    table = columns(source)
+    fields = [
+        pa.field(name, pa.from_numpy_dtype(col.dtype), metadata={"unit": unit(name)}) for name, col in table.items()
+    ]
+    schema = pa.schema(fields, metadata={"hil_result": json.dumps(source.result)})
+    arrays = [pa.array(np.ascontiguousarray(column)) for column in table.values()]
+    try:
+        parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), path)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error}.") from error
+    return []
+
+
+def export_mat(source: Source, path: Path) -> list[str]:
+    """Write `path` for MATLAB and Octave: structs `samples`, `units`, `parameters`, `std`; result.json as text."""
+    from scipy.io import savemat
+
+    table = columns(source)
+    content = {
+        "samples": dict(table),
+        "units": {name: unit(name) for name in table},
+        "parameters": dict(source.model.values),
+        "std": dict(source.model.stds),
+        "result_json": json.dumps(source.result),
+    }
+    try:
+        savemat(path, content, oned_as="column", do_compression=True, long_field_names=True)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error}.") from error
+    return []

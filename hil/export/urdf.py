@@ -1,0 +1,65 @@
+"""URDF: links with masses, joints with limits, viscous and Coulomb friction."""
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from hil.dynamics import ArmModel
+from hil.export.left_out import left_out, torque_constants
+from hil.export.mass_distribution import LinkMass, distribute
+from hil.export.source import Source, write_text
+from hil.export.xml_text import axis, describe, numbers, to_text
+
+STANDARD_GRAVITY = 9.81
+_MISSING = ("armature", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "lag", "delay")
+
+
+def export_urdf(source: Source, path: Path) -> list[str]:
+    """Write `path`; what URDF has no place for. Raises ExportError when no physical masses exist."""
+    model = source.model
+    links = distribute(model, source.link_length)
+    left = [*left_out(model, _MISSING), *torque_constants(model)]
+    if model.gravity not in (0.0, STANDARD_GRAVITY):
+        left.append(f"gravity = {model.gravity:g} m/s^2, with which the masses were computed: set it in the engine")
+    root = ET.Element("robot", name="arm")
+    describe(root, model, left)
+    ET.SubElement(root, "link", name="base")
+    for index, link in enumerate(links):
+        _add_link(root, index + 1, link)
+        _add_joint(root, model, index, links[index - 1].length if index else 0.0)
+    write_text(path, to_text(root))
+    return left
+
+
+def _add_link(root: ET.Element, number: int, link: LinkMass) -> None:
+    element = ET.SubElement(root, "link", name=f"link_{number}")
+    inertial = ET.SubElement(element, "inertial")
+    ET.SubElement(inertial, "origin", xyz=numbers(link.centre, 0, 0))
+    ET.SubElement(inertial, "mass", value=numbers(link.mass))
+    # Only the inertia across the plane was measured; the others are set equal, which every engine takes as physical.
+    moments = dict.fromkeys(("ixx", "iyy", "izz"), numbers(link.inertia))
+    products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+    ET.SubElement(inertial, "inertia", {**moments, **products})
+    visual = ET.SubElement(element, "visual")
+    ET.SubElement(visual, "origin", xyz=numbers(link.length / 2, 0, 0), rpy=numbers(0, 1.5707963267948966, 0))
+    geometry = ET.SubElement(visual, "geometry")
+    ET.SubElement(geometry, "cylinder", radius="0.01", length=numbers(link.length))
+
+
+def _add_joint(root: ET.Element, model: ArmModel, index: int, along: float) -> None:
+    facts, number = model.joints[index], index + 1
+    element = ET.SubElement(root, "joint", name=facts.name, type="revolute")
+    ET.SubElement(element, "parent", link=f"link_{index}" if index else "base")
+    ET.SubElement(element, "child", link=f"link_{number}")
+    ET.SubElement(element, "origin", xyz=numbers(along, 0, 0))
+    ET.SubElement(element, "axis", xyz=axis(model))
+    low, high = facts.position_limit
+    ET.SubElement(
+        element,
+        "limit",
+        lower=numbers(low),
+        upper=numbers(high),
+        velocity=numbers(facts.velocity_limit),
+        effort=numbers(facts.goal_limit * facts.torque_per_goal),
+    )
+    friction = {"damping": f"viscous_{number}", "friction": f"coulomb_{number}"}
+    ET.SubElement(element, "dynamics", {key: numbers(model.values[name]) for key, name in friction.items()})

@@ -1,0 +1,108 @@
+"""From a run folder, result.json or exported TOML/JSON to an `ArmModel`. Standard library and numpy only."""
+
+import json
+import math
+import tomllib
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from hil.dynamics import ArmModel, JointFacts
+from hil.errors import ResultError
+
+SCHEMA = 1
+
+_RIGID_BODY = {
+    1: ("inertia_1", "gravity_1"),
+    2: ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
+}
+_PER_JOINT = ("viscous", "coulomb", "offset")
+_OPTIONAL_PER_JOINT = ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load")
+_DRIVE = ("lag", "delay")
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """The result in a run folder, or in the JSON or TOML file `path`; raises ResultError."""
+    file = path / "result.json" if path.is_dir() else path
+    if path.is_dir() and not file.is_file():
+        raise ResultError(
+            f"{path} holds no result.json: its identification did not finish. If it holds samples.npy, run "
+            f"hil estimate {path}."
+        )
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise ResultError(f"{file}: cannot be read: {reason}.") from error
+    try:
+        result = tomllib.loads(text) if file.suffix == ".toml" else json.loads(text)
+    except ValueError as error:
+        raise ResultError(
+            f"{file}: is half written or damaged: {error}. Make it anew with hil estimate RUN."
+        ) from error
+    if not isinstance(result, dict) or "schema" not in result:
+        raise ResultError(f"{file}: is no result of hil: it has no schema.")
+    if result["schema"] != SCHEMA:
+        raise ResultError(
+            f"{file}: schema {result['schema']!r} is not {SCHEMA}, which this hil reads; it was written by "
+            f"{'a newer' if _newer(result['schema']) else 'another'} hil. Install that one, or estimate again."
+        )
+    return result
+
+
+def read_model(path: str | PathLike[str]) -> ArmModel:
+    """See `hil.load_model`."""
+    return model_of(read_result(Path(path)), Path(path))
+
+
+def model_of(result: dict[str, Any], path: Path) -> ArmModel:
+    """The model in a result that was read from `path`; raises ResultError."""
+    file = path / "result.json" if path.is_dir() else path
+    try:
+        joints = tuple(_joint(entry) for entry in result["arm"]["joints"])
+        gravity = float(result["arm"]["gravity"])
+        rest_pose = tuple(float(angle) for angle in result["arm"]["rest_pose"])
+        entries = {**result["parameters"], **result.get("extra", {})}
+        values = {name: float(entry["value"]) for name, entry in entries.items()}
+        # An error bar that is infinite (nothing was seen of the parameter) has no number in strict JSON.
+        stds = {name: math.inf if entry["std"] is None else float(entry["std"]) for name, entry in entries.items()}
+    except (KeyError, TypeError, ValueError) as error:
+        what = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ResultError(f"{file}: is damaged or from an older hil: it {what}. Run hil estimate again.") from error
+    _check_terms(values, len(joints), file)
+    return ArmModel(values, stds, gravity, rest_pose, joints)
+
+
+def _joint(entry: dict[str, Any]) -> JointFacts:
+    low, high = entry["position_limit"]
+    return JointFacts(
+        name=str(entry["name"]),
+        servo=str(entry["model"]),
+        mode=str(entry["mode"]),
+        torque_per_goal=float(entry["torque_per_goal"]),
+        torque_per_goal_std=float(entry["torque_per_goal_std"]),
+        goal_limit=float(entry["goal_limit"]),
+        position_limit=(float(low), float(high)),
+        velocity_limit=float(entry["velocity_limit"]),
+    )
+
+
+def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
+    """Every term must be there and known: a model that left one out would be wrong without a word."""
+    if joints not in _RIGID_BODY:
+        raise ResultError(f"{path}: an arm of {joints} joints; this hil has models of one and two.")
+    numbers = range(1, joints + 1)
+    needed = {*_RIGID_BODY[joints], *(f"{term}_{joint}" for term in _PER_JOINT for joint in numbers)}
+    possible = {*needed, *_DRIVE, *(f"{term}_{joint}" for term in _OPTIONAL_PER_JOINT for joint in numbers)}
+    missing, unknown = sorted(needed - values.keys()), sorted(values.keys() - possible)
+    if missing:
+        raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
+    if unknown:
+        raise ResultError(f"{path}: has {', '.join(unknown)}, which this hil does not know; a newer one wrote it.")
+    bad = [name for name, value in values.items() if not math.isfinite(value)]
+    if bad:
+        raise ResultError(f"{path}: {', '.join(bad)} is not a finite number. Run hil estimate again.")
+
+
+def _newer(schema: object) -> bool:
+    return isinstance(schema, int) and schema > SCHEMA

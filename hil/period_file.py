@@ -1,0 +1,72 @@
+"""period.npz: each multisine's settled period as it was measured and as the model has it, for pictures and other tools.
+
+Arrays are named ROLE_torque, ROLE_position, ROLE_predicted, ROLE_rate, with ROLE the multisine's: "identify", the one
+that was fitted, and "held_out", predicted from rest without its measurement.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.errors import RunFolderError
+
+FILE_NAME = "period.npz"
+_ARRAYS = ("torque", "position", "predicted")
+
+
+@dataclass(frozen=True)
+class PlayedPeriod:
+    """One settled period.
+
+    rate: samples per second. torque: commanded motor torque [N m], position: measured joint angle, NaN where a reply is
+    missing, predicted: the model's [rad]; each (joints, samples).
+    """
+
+    rate: float
+    torque: NDArray[np.float64]
+    position: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+
+    @property
+    def error(self) -> NDArray[np.float64]:
+        """Measured minus predicted position (joints, samples) [rad]."""
+        return np.asarray(self.position - self.predicted)
+
+    @property
+    def relative_error(self) -> NDArray[np.float64]:
+        """RMS error of the prediction over RMS of the motion about its mean (joints,)."""
+        motion = self.position - np.nanmean(self.position, axis=1, keepdims=True)
+        return np.asarray(np.sqrt(np.nanmean(self.error**2, axis=1) / np.nanmean(motion**2, axis=1)))
+
+
+def save_periods(run: Path, periods: Mapping[str, PlayedPeriod]) -> None:
+    """Write period.npz into a run folder; raises RunFolderError."""
+    arrays = {f"{role}_{name}": getattr(period, name) for role, period in periods.items() for name in _ARRAYS}
+    rates = {f"{role}_rate": np.array(period.rate) for role, period in periods.items()}
+    path = run / FILE_NAME
+    temporary = run / "period.partial.npz"
+    try:
+        np.savez(temporary, allow_pickle=False, **arrays, **rates)
+        temporary.replace(path)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def load_periods(run: Path) -> dict[str, PlayedPeriod]:
+    """The settled periods of a run by role; empty where the run has no period.npz. Raises RunFolderError."""
+    path = run / FILE_NAME
+    if not path.is_file():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            roles = [name.removesuffix("_rate") for name in file.files if name.endswith("_rate")]
+            return {
+                role: PlayedPeriod(float(file[f"{role}_rate"]), *(file[f"{role}_{name}"] for name in _ARRAYS))
+                for role in roles
+            }
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise RunFolderError(f"{path} cannot be read: {error}. Make it anew with hil estimate {run}.") from error

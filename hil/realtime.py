@@ -1,0 +1,121 @@
+"""What Linux offers a loop that must be on time: asked for, used where it is given, and reported either way.
+
+real-time scheduling   SCHED_FIFO: nothing but other real-time work may take the processor away
+locked memory          mlockall: no page of ours has to be fetched back in the middle of a cycle
+own core               the loop stays on one core and keeps its caches; asked for only together with SCHED_FIFO, since
+                       without it a loop that may not move waits for whoever holds its core
+timer slack            1 ns instead of 50 us by which the kernel may delay a wake-up
+no garbage collection  Python's collector is off inside the loop, and never looks at what was there before it
+short thread turns     another thread of this process (the progress bar) hands the interpreter back in 50 us, not 5 ms
+
+Only the calling thread gets the first and the third. Everything is taken back at the end.
+"""
+
+import ctypes
+import gc
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import NamedTuple
+
+PRIORITY = 20
+"""Of SCHED_FIFO's 1 to 99: above ordinary work, below the kernel's own threads (50), which serve the serial port."""
+
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
+_SWITCH_INTERVAL_S = 50e-6
+
+
+class Granted(NamedTuple):
+    """One thing asked for: whether it was given, and if not why and how to get it."""
+
+    name: str
+    given: bool
+    note: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name}: {'yes' if self.given else 'no'}{f' ({self.note})' if self.note else ''}"
+
+
+@contextmanager
+def real_time() -> Iterator[list[Granted]]:
+    """Ask for all of it; the block runs with what was given, which is listed."""
+    with ExitStack() as undo:
+        yield [step(undo) for step in (_fifo, _own_core, _lock_memory, _timer_slack, _no_collection, _short_turns)]
+
+
+def _fifo(undo: ExitStack) -> Granted:
+    name = "real-time scheduling"
+    before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        # RESET_ON_FORK: a child process must not inherit a priority that it does not know of.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+    except OSError as error:
+        return Granted(name, False, f"{error.strerror}; needs `ulimit -r {PRIORITY}` or root")
+    undo.callback(os.sched_setscheduler, 0, before & ~os.SCHED_RESET_ON_FORK, parameter)
+    return Granted(name, True, f"SCHED_FIFO, priority {PRIORITY}")
+
+
+def _own_core(undo: ExitStack) -> Granted:
+    name = "own core"
+    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
+        return Granted(name, False, "only together with real-time scheduling")
+    before = os.sched_getaffinity(0)
+    # The last one: interrupts mostly land on the first.
+    core = max(before)
+    try:
+        os.sched_setaffinity(0, {core})
+    except OSError as error:
+        return Granted(name, False, str(error.strerror))
+    undo.callback(os.sched_setaffinity, 0, before)
+    return Granted(name, True, f"core {core} of {len(before)}")
+
+
+def _lock_memory(undo: ExitStack) -> Granted:
+    name = "locked memory"
+    # ONFAULT: pages are kept once touched, instead of fetching everything that is mapped, LLVM and all.
+    refused = _libc("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    if refused:
+        return Granted(name, False, f"{refused}; needs `ulimit -l unlimited` or root")
+    undo.callback(_libc, "munlockall")
+    return Granted(name, True)
+
+
+def _timer_slack(undo: ExitStack) -> Granted:
+    name = "timer slack"
+    before = ctypes.CDLL(None).prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    refused = _libc("prctl", _PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    if refused:
+        return Granted(name, False, refused)
+    undo.callback(_libc, "prctl", _PR_SET_TIMERSLACK, max(before, 1), 0, 0, 0)
+    return Granted(name, True, "1 ns")
+
+
+def _no_collection(undo: ExitStack) -> Granted:
+    was_on = gc.isenabled()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    undo.callback(_restore_collection, was_on)
+    return Granted("no garbage collection", True)
+
+
+def _restore_collection(was_on: bool) -> None:
+    gc.unfreeze()
+    if was_on:
+        gc.enable()
+
+
+def _short_turns(undo: ExitStack) -> Granted:
+    undo.callback(sys.setswitchinterval, sys.getswitchinterval())
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    return Granted("short thread turns", True, f"{_SWITCH_INTERVAL_S * 1e6:.0f} us")
+
+
+def _libc(function: str, *arguments: int) -> str:
+    """Call a function of the C library; why it failed, or nothing."""
+    call: Callable[..., int] = getattr(ctypes.CDLL(None, use_errno=True), function)
+    if call(*map(ctypes.c_ulong, arguments)) == 0:
+        return ""
+    return os.strerror(ctypes.get_errno())

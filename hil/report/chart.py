@@ -1,0 +1,65 @@
+"""Pictures as data: what a chart or a matrix shows, whoever draws it (hil.report.svg, hil.report.png)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito's colours, which colour-blind readers can tell apart.
+BLUE, ORANGE, GREEN, PURPLE, GREY = "#0072B2", "#D55E00", "#009E73", "#AA4499", "#8a8f98"
+
+Kind = Literal["line", "broad", "dashed", "points", "dots", "area", "steps"]
+
+
+@dataclass(frozen=True)
+class Series:
+    """One curve. x, y: (n,), a gap where NaN; `area` fills between y and `low`; `steps` has x as n + 1 edges."""
+
+    name: str
+    x: Array
+    y: Array
+    colour: str
+    kind: Kind = "line"
+    low: Array | None = None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart with one x and one y axis. name: file name without ending."""
+
+    name: str
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...]
+    log_y: bool = False
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """A square of values from -1 to 1 with the same labels down and across; NaN stays blank."""
+
+    name: str
+    title: str
+    labels: tuple[str, ...]
+    values: Array
+
+
+Figure = Chart | Matrix
+
+
+def thin(x: Array, y: Array, most: int) -> tuple[Array, Array]:
+    """At most about `most` points of a curve: of each run of points the lowest and the highest, in their order."""
+    if len(x) <= most:
+        return x, y
+    count = len(x) // (most // 2)
+    runs = len(x) // count
+    rows = y[: runs * count].reshape(runs, count)
+    filled = np.where(np.isfinite(rows), rows, np.nanmean(y))
+    ends = np.sort(np.stack((filled.argmin(axis=1), filled.argmax(axis=1)), axis=1), axis=1)
+    index = np.unique((ends + count * np.arange(runs)[:, None]).reshape(-1))
+    index = np.unique(np.concatenate((index, [len(x) - 1])))
+    return x[index], y[index]

@@ -1,0 +1,139 @@
+"use strict";
+// Hover reads a chart's curves at the pointer; dragging across zooms in time; double-click or the button goes back.
+(() => {
+  const SVG = "http://www.w3.org/2000/svg";
+  const text = (value) => Number(value.toPrecision(4)).toString().replace("-", "\u2212");
+
+  function element(name, attributes, parent) {
+    const made = document.createElementNS(SVG, name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    parent.append(made);
+    return made;
+  }
+
+  // Ticks at 1, 2 or 5 times a power of ten, about 70 pixels apart, as hil.report.scale has them.
+  function ticks(low, high, pixels) {
+    const raw = (high - low) / Math.max(2, pixels / 70);
+    const size = 10 ** Math.floor(Math.log10(raw));
+    const step = [1, 2, 5, 10].map((factor) => factor * size).find((one) => one >= raw * (1 - 1e-9));
+    const found = [];
+    for (let k = Math.ceil(low / step - 1e-9); k <= Math.floor(high / step + 1e-9); k++) found.push(k * step);
+    return found;
+  }
+
+  function enliven(svg) {
+    const [xLow, xHigh, xStart, xEnd] = svg.dataset.x.split(" ").map(Number);
+    const [yLow, yHigh, yStart, yEnd] = svg.dataset.y.split(" ").map(Number);
+    const log = svg.dataset.log === "1";
+    const plot = svg.querySelector(".plot");
+    const axis = svg.querySelector(".x-axis");
+    const originalAxis = axis.innerHTML;
+    const figure = svg.parentNode;
+    let shown = [xStart, xEnd]; // the part of the plot, in its own pixels, that fills the chart
+    let from = null;
+    let chosen = null;
+    let curves = null;
+
+    const value = (pixel) => xLow + ((pixel - xStart) / (xEnd - xStart)) * (xHigh - xLow);
+    const height = (pixel) => {
+      const part = (pixel - yStart) / (yEnd - yStart);
+      return log ? yLow * (yHigh / yLow) ** part : yLow + part * (yHigh - yLow);
+    };
+    const inPlot = (pixel) => shown[0] + ((pixel - xStart) / (xEnd - xStart)) * (shown[1] - shown[0]);
+    const onScreen = (pixel) => xStart + ((pixel - shown[0]) / (shown[1] - shown[0])) * (xEnd - xStart);
+
+    // Read from the paths when first needed, so that opening the page costs nothing.
+    function read() {
+      curves ??= [...plot.querySelectorAll('path:not([data-kind="area"])')].map((path) => ({
+        name: path.dataset.name,
+        points: [...path.getAttribute("d").matchAll(/(-?[\d.]+),(-?[\d.]+)/g)].map((pair) => [+pair[1], +pair[2]]),
+      }));
+      return curves;
+    }
+
+    function pointer(event) {
+      const box = svg.getBoundingClientRect();
+      const scale = svg.viewBox.baseVal.width / box.width;
+      return [(event.clientX - box.left) * scale, (event.clientY - box.top) * scale, scale];
+    }
+
+    function clear() {
+      svg.querySelector(".cursor")?.remove();
+      figure.querySelector(".reading")?.remove();
+    }
+
+    function hover(event) {
+      clear();
+      const [across, up, scale] = pointer(event);
+      if (across < xStart || across > xEnd || up > yStart || up < yEnd) return;
+      element("line", { class: "cursor", x1: across, x2: across, y1: yStart, y2: yEnd }, svg);
+      const at = inPlot(across);
+      const lines = [text(value(at))];
+      for (const { name, points } of read()) {
+        if (!name || !points.length) continue;
+        const near = points.reduce((best, point) => (Math.abs(point[0] - at) < Math.abs(best[0] - at) ? point : best));
+        lines.push(`${name}: ${text(height(near[1]))}`);
+      }
+      const reading = document.createElement("div");
+      reading.className = "reading";
+      for (const line of lines) reading.append(line, document.createElement("br"));
+      figure.append(reading);
+      const left = across / scale;
+      const room = figure.clientWidth - reading.offsetWidth;
+      reading.style.left = `${Math.max(0, Math.min(room, left + 12 > room ? left - reading.offsetWidth - 12 : left + 12))}px`;
+      reading.style.top = `${svg.offsetTop + yEnd / scale + 6}px`;
+    }
+
+    function show(low, high) {
+      shown = [low, high];
+      const factor = (xEnd - xStart) / (high - low);
+      plot.setAttribute("transform", `translate(${xStart - low * factor} 0) scale(${factor} 1)`);
+      figure.querySelector(".back")?.remove();
+      if (low === xStart && high === xEnd) {
+        axis.innerHTML = originalAxis;
+        return;
+      }
+      axis.replaceChildren();
+      for (const tick of ticks(value(low), value(high), xEnd - xStart)) {
+        const at = onScreen(xStart + ((tick - xLow) / (xHigh - xLow)) * (xEnd - xStart));
+        element("line", { x1: at, x2: at, y1: yStart, y2: yEnd, stroke: "#e3e6ea" }, axis);
+        element("text", { x: at, y: yStart + 16, "text-anchor": "middle" }, axis).textContent = text(tick);
+      }
+      const back = document.createElement("button");
+      back.className = "back";
+      back.textContent = "Whole range";
+      back.onclick = () => show(xStart, xEnd);
+      figure.append(back);
+    }
+
+    svg.addEventListener("pointermove", (event) => {
+      hover(event);
+      if (from === null) return;
+      const to = Math.min(xEnd, Math.max(xStart, pointer(event)[0]));
+      chosen ??= element("rect", { class: "chosen", y: yEnd, height: yStart - yEnd }, svg);
+      chosen.setAttribute("x", Math.min(from, to));
+      chosen.setAttribute("width", Math.abs(to - from));
+    });
+    svg.addEventListener("pointerdown", (event) => {
+      const [across] = pointer(event);
+      if (event.pointerType === "mouse" && across >= xStart && across <= xEnd) {
+        from = across;
+        svg.setPointerCapture(event.pointerId);
+        event.preventDefault();
+      } else hover(event);
+    });
+    svg.addEventListener("pointerup", (event) => {
+      if (from !== null) {
+        const to = Math.min(xEnd, Math.max(xStart, pointer(event)[0]));
+        if (Math.abs(to - from) > 8) show(inPlot(Math.min(from, to)), inPlot(Math.max(from, to)));
+      }
+      from = null;
+      chosen?.remove();
+      chosen = null;
+    });
+    svg.addEventListener("pointerleave", clear);
+    svg.addEventListener("dblclick", () => show(xStart, xEnd));
+  }
+
+  document.querySelectorAll("svg[data-x]").forEach(enliven);
+})();

@@ -1,0 +1,76 @@
+"""The page: its sections in their order, one template, one style sheet, one script, all in one file."""
+
+from collections.abc import Callable
+from datetime import datetime
+from importlib.resources import files
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from hil import __version__
+from hil.errors import RunFolderError
+from hil.report.chart import Figure
+from hil.report.run_data import RunData
+from hil.report.section import Section
+from hil.report.sections.correlation import correlation
+from hil.report.sections.friction import friction
+from hil.report.sections.limits import limits
+from hil.report.sections.parameters import parameters
+from hil.report.sections.prediction import prediction
+from hil.report.sections.provenance import provenance
+from hil.report.sections.spectra import spectra
+from hil.report.sections.timing import timing
+from hil.report.sections.verdict import verdict
+from hil.report.svg import NARROW, WIDE, draw_svg
+
+FILE_NAME = "report.html"
+SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
+    verdict,
+    parameters,
+    prediction,
+    friction,
+    spectra,
+    correlation,
+    limits,
+    timing,
+    provenance,
+)
+
+
+def write_report(data: RunData, path: Path) -> None:
+    """Write the report of a run; raises RunFolderError when it cannot be written."""
+    page = make_page(data)
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        temporary.write_text(page, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def make_page(data: RunData) -> str:
+    """The whole HTML document."""
+    folder = files("hil.report")
+    template = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).from_string(folder.joinpath("page.html.j2").read_text(encoding="utf-8"))
+    return template.render(
+        title=Path(str(data.facts["config"])).stem,
+        started=datetime.fromisoformat(data.facts["started"]).strftime("%Y-%m-%d %H:%M"),
+        version=__version__,
+        sections=sections(data),
+        style=Markup(folder.joinpath("page.css").read_text(encoding="utf-8")),
+        script=Markup(folder.joinpath("page.js").read_text(encoding="utf-8")),
+        draw=_draw,
+    )
+
+
+def sections(data: RunData) -> list[Section]:
+    """The sections whose data the run holds."""
+    return [section for make in SECTIONS if (section := make(data)) is not None]
+
+
+def _draw(figure: Figure) -> Markup:
+    """Both widths; the style sheet shows the one that fits."""
+    return Markup(draw_svg(figure, WIDE) + draw_svg(figure, NARROW))

@@ -1,0 +1,32 @@
+"""The report's pictures as files of their own."""
+
+from pathlib import Path
+
+from hil.errors import RunFolderError
+from hil.report.chart import Figure
+from hil.report.page import sections
+from hil.report.png import save_png
+from hil.report.run_data import RunData
+from hil.report.svg import WIDE, draw_svg
+
+
+def save_pictures(data: RunData, folder: Path, kind: str) -> list[Path]:
+    """Save every picture in `folder` as "png" or "svg"; their paths. Raises ExportError, RunFolderError."""
+    saved = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for figure in figures(data):
+            path = folder / f"{figure.name}.{kind}"
+            if kind == "png":
+                save_png(figure, path)
+            else:
+                path.write_text(draw_svg(figure, WIDE), encoding="utf-8")
+            saved.append(path)
+    except OSError as error:
+        raise RunFolderError(f"{folder} cannot be written: {error.strerror}.") from error
+    return saved
+
+
+def figures(data: RunData) -> list[Figure]:
+    """All figures of the report, in its order."""
+    return [picture.figure for section in sections(data) for picture in section.pictures]

@@ -1,0 +1,64 @@
+"""Charts as PNG, drawn by matplotlib from the same description as the SVG."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.errors import ExportError
+from hil.report.chart import Chart, Figure, Matrix, Series
+
+
+def save_png(figure: Figure, path: Path) -> None:
+    """Draw one picture; raises ExportError where matplotlib is not installed, OSError as writing does."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure as Canvas
+    except ImportError as error:
+        raise ExportError("PNG needs the package matplotlib: pip install 'hil[png]'.") from error
+    square = isinstance(figure, Matrix)
+    canvas = Canvas(figsize=(8.8, 8.2) if square else (8.8, 3.6), dpi=150, layout="constrained")
+    FigureCanvasAgg(canvas)
+    axes = canvas.subplots()
+    axes.set_title(figure.title, fontsize=11)
+    if isinstance(figure, Chart):
+        _draw_chart(axes, figure)
+    else:
+        _draw_matrix(axes, figure)
+    canvas.savefig(path)
+
+
+def _draw_chart(axes: Any, chart: Chart) -> None:
+    for series in chart.series:
+        _draw_series(axes, series)
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    axes.set_yscale("log" if chart.log_y else "linear")
+    axes.grid(color="#e3e6ea")
+    if any(series.name for series in chart.series):
+        axes.legend(fontsize=8, loc="upper right")
+
+
+def _draw_series(axes: Any, series: Series) -> None:
+    name = series.name or None
+    if series.kind == "steps":
+        axes.stairs(series.y, series.x, fill=True, alpha=0.4, color=series.colour, label=name)
+    elif series.low is not None:
+        axes.fill_between(series.x, series.low, series.y, alpha=0.18, color=series.colour, label=name, linewidth=0)
+    elif series.kind in ("points", "dots"):
+        axes.plot(
+            series.x, series.y, ".", markersize=4 if series.kind == "points" else 1.5, color=series.colour, label=name
+        )
+    elif series.kind == "broad":
+        axes.plot(series.x, series.y, linewidth=4, alpha=0.35, color=series.colour, label=name)
+    else:
+        style = "--" if series.kind == "dashed" else "-"
+        axes.plot(series.x, series.y, style, linewidth=1.1, color=series.colour, label=name)
+
+
+def _draw_matrix(axes: Any, matrix: Matrix) -> None:
+    places = np.arange(len(matrix.labels))
+    image = axes.imshow(matrix.values, cmap="RdBu_r", vmin=-1, vmax=1)
+    axes.set_xticks(places, matrix.labels, rotation=90, fontsize=8)
+    axes.set_yticks(places, matrix.labels, fontsize=8)
+    axes.figure.colorbar(image, ax=axes, shrink=0.7)

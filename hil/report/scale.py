@@ -1,0 +1,68 @@
+"""Axes: from data to pixels, and where the ticks are."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Maps low..high of the data to start..end in pixels, on a logarithm where `log`."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+    log: bool = False
+    spacing: float = 70  # px between ticks, about
+
+    def pixels(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixel coordinates of data (n,)."""
+        low, high = self._ends
+        shown = np.log10(np.maximum(values, 1e-300)) if self.log else values
+        return np.asarray(self.start + (shown - low) / (high - low) * (self.end - self.start))
+
+    @property
+    def ticks(self) -> list[float]:
+        """Round values between low and high."""
+        low, high = self._ends
+        if self.log:
+            return [10.0**power for power in range(math.ceil(low - 1e-9), math.floor(high + 1e-9) + 1)]
+        room = max(2.0, abs(self.end - self.start) / self.spacing)
+        raw = (high - low) / room
+        size = 10.0 ** math.floor(math.log10(raw))
+        step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= raw * (1 - 1e-9))
+        first = math.ceil(low / step - 1e-9)
+        return [round(k * step, 12) for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        return (math.log10(self.low), math.log10(self.high)) if self.log else (self.low, self.high)
+
+
+def span(values: NDArray[np.float64], log: bool, margin: float) -> tuple[float, float]:
+    """An axis's ends that hold all finite values with some margin; a fallback where there are none."""
+    finite = values[np.isfinite(values) & (values > 0)] if log else values[np.isfinite(values)]
+    if not finite.size:
+        return (0.1, 1.0) if log else (0.0, 1.0)
+    low, high = float(finite.min()), float(finite.max())
+    if log:
+        return 10 ** math.floor(math.log10(low)), 10 ** max(
+            math.ceil(math.log10(high)), math.floor(math.log10(low)) + 1
+        )
+    if high - low <= 1e-12 * max(1.0, abs(high)):
+        room = max(1.0, abs(high)) * 0.5
+        return low - room, high + room
+    room = margin * (high - low)
+    return low - room, high + room
+
+
+def label(value: float, log: bool = False) -> str:
+    """A tick's text; a power of ten on a logarithmic axis."""
+    if log and not 0.01 <= value <= 100:
+        return "10" + f"{round(math.log10(value))}".translate(_RAISED)
+    return f"{value:.6g}".replace("-", "\u2212")

@@ -1,0 +1,44 @@
+"""Which parameters the data can hardly tell apart."""
+
+import numpy as np
+
+from hil.report.chart import Array, Matrix
+from hil.report.run_data import RunData
+from hil.report.section import Picture, Section
+
+STRONG = 0.9
+
+
+def correlation(data: RunData) -> Section | None:
+    """Where the result has a covariance."""
+    kept = data.result.get("covariance")
+    if not kept:
+        return None
+    names = tuple(kept["names"])
+    values = correlations(np.array(kept["matrix"], dtype=np.float64))
+    strong = sorted(
+        (
+            (float(values[row, column]), names[row], names[column])
+            for row in range(len(names))
+            for column in range(row)
+            if abs(values[row, column]) >= STRONG
+        ),
+        key=lambda pair: -abs(pair[0]),
+    )
+    pairs = "; ".join(f"{first} and {second} ({value:+.2f})" for value, first, second in strong[:5])
+    said = (
+        f"Strongly correlated: {pairs}. Only their combination is well known; another motion would part them."
+        if strong
+        else f"No two parameters are correlated beyond {STRONG:g}: the motion tells all of them apart."
+    )
+    figure = Matrix("correlation", "Correlation of the parameters", names, values)
+    caption = "Red: they rise together without the fit noticing much; blue: one makes up for the other."
+    return Section("correlation", "What the data can tell apart", (said,), pictures=(Picture(figure, caption),))
+
+
+def correlations(covariance: Array) -> Array:
+    """Correlation matrix; NaN where a variance is zero or not finite."""
+    std = np.sqrt(np.diag(covariance))
+    std = np.where(np.isfinite(std) & (std > 0), std, np.nan)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.clip(covariance / np.outer(std, std), -1.0, 1.0))

@@ -1,0 +1,88 @@
+"""Friction against speed: the model's curve with its interval, and the torque that the measured motion leaves to it."""
+
+import numpy as np
+
+from estimator.fourier import cut_off, lines_of, motion_of
+from hil.dynamics import ArmModel
+from hil.period_file import PlayedPeriod
+from hil.report.chart import BLUE, GREY, Array, Chart, Series
+from hil.report.run_data import RunData
+from hil.report.section import Picture, Section
+
+_CURVE = 401  # speeds on the curve
+_DOTS = 700
+_DRAWS = 200  # of the parameters, for the interval
+
+
+def friction(data: RunData) -> Section | None:
+    """Where the run has its settled period."""
+    if data.fitted is None:
+        return None
+    speed, torque = _left_to_friction(data.model, data.fitted)
+    pictures = [_curve(data, joint, name, speed[joint], torque[joint]) for joint, name in enumerate(data.names)]
+    words = (
+        "Dots: commanded torque minus what inertia and gravity of the model need for the measured motion. They scatter "
+        "because the acceleration comes from a rounded position, and near standstill because friction there is "
+        "whatever holds the joint.",
+    )
+    return Section("friction", "Friction", words, pictures=tuple(pictures))
+
+
+def _left_to_friction(model: ArmModel, period: PlayedPeriod) -> tuple[Array, Array]:
+    """Speeds [rad/s] and torques [N m] (joints, dots), from the lines of the measured motion."""
+    filled = np.where(np.isfinite(period.position), period.position, period.predicted)
+    lines = lines_of(filled)
+    samples = filled.shape[1]
+    motion = motion_of(lines, cut_off(lines), 2 * np.pi * period.rate / samples, samples)
+    rigid = model.rigid_body_torque(motion.position.T, motion.velocity.T, motion.acceleration.T).T
+    offset = np.array([[model.values[f"offset_{joint + 1}"]] for joint in range(len(filled))])
+    # The command is held: at the middle between two commands the mean of both is in force.
+    held = 0.5 * (period.torque + np.roll(period.torque, 1, axis=1))
+    chosen = slice(None, None, max(1, samples // _DOTS))
+    return motion.velocity[:, chosen], (held - rigid - offset)[:, chosen]
+
+
+def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) -> Picture:
+    fastest = float(np.abs(speed).max())
+    # Denser where friction bends: cubes of an even grid.
+    at = fastest * np.linspace(-1, 1, _CURVE) ** 3
+    curve = _torque(data.model, at)[:, joint]
+    low, high = _interval(data, at, joint)
+    series = (
+        Series("what the measured motion leaves", speed, torque, GREY, "dots"),
+        Series("95 % interval", at, high, BLUE, "area", low),
+        Series("model", at, curve, BLUE),
+    )
+    chart = Chart(f"friction_{joint + 1}", f"Friction of {name}", "speed [rad/s]", "friction [N m]", series)
+    load = data.model.values.get(f"load_{joint + 1}")
+    more = f" It grows with torque besides: {load:.3g} N m per N m, not drawn." if load else ""
+    return Picture(chart, f"{name}: friction over speed, without the constant offset.{more}")
+
+
+def _torque(model: ArmModel, speed: Array) -> Array:
+    return model.friction_torque(np.repeat(speed[:, None], len(model.joints), axis=1))
+
+
+def _interval(data: RunData, speed: Array, joint: int) -> tuple[Array, Array]:
+    """The curve's 2.5 and 97.5 percentiles under the parameters' covariance."""
+    kept = data.result["covariance"]
+    names = [name for name in kept["names"] if name.endswith(f"_{joint + 1}")]
+    index = [kept["names"].index(name) for name in names]
+    covariance = np.array(kept["matrix"], dtype=np.float64)[np.ix_(index, index)]
+    seen = np.isfinite(np.diag(covariance))
+    covariance = np.where(seen[:, None] & seen, covariance, 0.0)
+    value = np.array([data.model.values[name] for name in names])
+    size, turn = np.linalg.eigh(covariance)
+    random = np.random.default_rng(0)
+    draws = value + random.normal(size=(_DRAWS, len(value))) @ (turn * np.sqrt(np.maximum(size, 0.0))).T
+    floor = np.array([1e-6 if name.startswith(("coulomb_width", "stribeck_velocity")) else -np.inf for name in names])
+    curves = [
+        _torque(_with(data.model, dict(zip(names, np.maximum(draw, floor).tolist(), strict=True))), speed)[:, joint]
+        for draw in draws
+    ]
+    low, high = np.percentile(curves, [2.5, 97.5], axis=0)
+    return low, high
+
+
+def _with(model: ArmModel, values: dict[str, float]) -> ArmModel:
+    return ArmModel({**model.values, **values}, model.stds, model.gravity, model.rest_pose, model.joints)

@@ -1,0 +1,67 @@
+"""Parameters with their intervals, what each is, and on a fake arm the truth."""
+
+import math
+from typing import Any
+
+from hil.report.run_data import RunData
+from hil.report.section import Section, Table
+from hil.report.words import number, percent
+
+TWO_SIDED_95 = 1.96
+_MEANING = {
+    "inertia": "all that the joint turns",
+    "coupling": "how link 2's weight hangs on link 1",
+    "armature": "rotor through the gears",
+    "gravity": "weight, arm level",
+    "viscous": "friction per speed",
+    "coulomb": "dry friction",
+    "offset": "constant torque",
+    "coulomb_width": "width of the dry friction's step",
+    "stribeck_rise": "more dry friction at low speed",
+    "stribeck_velocity": "speed where that has fallen off",
+    "load": "friction per torque",
+    "lag": "of the current loop",
+    "delay": "of the torque",
+}
+
+
+def parameters(data: RunData) -> Section:
+    """Always there."""
+    truth = data.result.get("truth", {})
+    tables = [
+        _table(data.result[key], truth if key == "parameters" else {}, caption)
+        for key, caption in (("parameters", "Base parameters"), ("extra", "What the model needed beside them"))
+        if data.result[key]
+    ]
+    words = (
+        "The interval is what the noise of this one recording leaves open. It holds neither the error of the torque "
+        "constants, with which all values of a joint scale, nor what the model lacks.",
+    )
+    return Section("parameters", "Parameters", words, tuple(tables))
+
+
+def _table(entries: dict[str, Any], truth: dict[str, float], caption: str) -> Table:
+    head = ("parameter", "what it is", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
+    return Table(head, tuple(_row(name, entry, truth) for name, entry in entries.items()), 3, caption, 1)
+
+
+def _row(name: str, entry: dict[str, Any], truth: dict[str, float]) -> tuple[str, ...]:
+    value, std = entry["value"], entry["std"]
+    known = (number(truth[name]) if name in truth else "",) if truth else ()
+    unit = "" if entry["unit"] == "1" else entry["unit"].replace("^2", "²")
+    meaning = _MEANING.get(name.rstrip("0123456789").rstrip("_"), "")
+    if not math.isfinite(std):
+        return (name, meaning, unit, number(value), "not determined", "", *known)
+    relative = percent(std / abs(value)) if value else ""
+    return (name, meaning, unit, *_interval(value, std), relative, *known)
+
+
+def _interval(value: float, std: float) -> tuple[str, str]:
+    """Value and half-width with as many decimals as the width has two digits that count."""
+    width = TWO_SIDED_95 * std
+    if width <= 0:
+        return number(value), "exact"
+    decimals = max(0, 1 - math.floor(math.log10(width)))
+    if decimals > 9:
+        return number(value), f"± {width:.1e}".replace("-", "\u2212")
+    return f"{value:.{decimals}f}".replace("-", "\u2212"), f"± {width:.{decimals}f}"

@@ -1,0 +1,55 @@
+"""Measured against predicted position, and what is left in encoder steps."""
+
+import numpy as np
+
+from hil.period_file import PlayedPeriod
+from hil.report.chart import BLUE, GREEN, ORANGE, Chart, Series
+from hil.report.run_data import RunData
+from hil.report.section import Picture, Section
+from hil.report.words import percent, steps
+
+
+def prediction(data: RunData) -> Section | None:
+    """Where the run has its settled periods."""
+    if data.fitted is None:
+        return None
+    pictures = []
+    for joint, name in enumerate(data.names):
+        pictures.append(_position(data.fitted, joint, name, "fitted", "the model was fitted to this motion"))
+        pictures.append(_residual(data, joint, name))
+    if data.held_out is not None:
+        for joint, name in enumerate(data.names):
+            error = percent(float(data.held_out.relative_error[joint]))
+            said = f"the model never saw this motion; its error is {error} of the motion's RMS"
+            pictures.append(_position(data.held_out, joint, name, "held out", said))
+    words = (
+        "The first pictures show the settled period that the model was fitted to. A residual that looks like noise of "
+        "one step is the encoder's rounding; one that looks like a motion is a part of the arm that the model lacks.",
+    )
+    return Section("prediction", "Measured and predicted motion", words, pictures=tuple(pictures))
+
+
+def _position(period: PlayedPeriod, joint: int, name: str, role: str, said: str) -> Picture:
+    time = np.arange(period.position.shape[1]) / period.rate
+    measured = Series("measured", time, period.position[joint], BLUE, "broad")
+    predicted = Series("predicted", time, period.predicted[joint], ORANGE)
+    key = f"position_{joint + 1}_{role.replace(' ', '_')}"
+    chart = Chart(
+        key, f"Position of {name}, {role} motion", "time in the period [s]", "position [rad]", (measured, predicted)
+    )
+    return Picture(chart, f"{name}, {role}: {said}.")
+
+
+def _residual(data: RunData, joint: int, name: str) -> Picture:
+    assert data.fitted is not None  # the caller looked
+    left = data.fitted.error[joint] / abs(float(data.facts["position_step"][joint]))
+    time = np.arange(len(left)) / data.fitted.rate
+    series = [Series("measured minus predicted", time, left, BLUE, "dots")]
+    for level in (-0.5, 0.5):
+        ends = np.array([0.0, len(left) / data.fitted.rate])
+        series.append(Series("rounding alone" if level > 0 else "", ends, np.full(2, level), GREEN, "dashed"))
+    chart = Chart(
+        f"residual_{joint + 1}", f"Residual of {name}", "time in the period [s]", "encoder steps", tuple(series)
+    )
+    rms = steps(data.result["fit"]["residual_rms_ticks"][joint])
+    return Picture(chart, f"{name}: {rms} steps RMS are left; half a step either way is what rounding alone leaves.")

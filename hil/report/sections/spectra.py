@@ -1,0 +1,76 @@
+"""Excitation and response, line by line, against what was not excited and the noise."""
+
+import numpy as np
+
+from estimator.fourier import lines_of, noise_power
+from hil.period_file import PlayedPeriod
+from hil.plan import IDENTIFY
+from hil.report.chart import BLUE, GREEN, GREY, ORANGE, Array, Chart, Series
+from hil.report.run_data import RunData
+from hil.report.section import Picture, Section
+
+_COLOURS = (BLUE, ORANGE)
+_BEYOND = 3.0  # times the highest excited line are shown
+
+
+def spectra(data: RunData) -> Section | None:
+    """Where the run has its settled period."""
+    if data.fitted is None:
+        return None
+    excited = _excited(data)
+    words = (
+        "Each joint has lines of its own, so that what one joint does to the other can be told apart. What answers "
+        "between and above the excited lines is the arm's nonlinearity, friction above all: the model must explain it "
+        "too, and it helps. It should stand well above the noise.",
+    )
+    pictures = [_excitation(data, data.fitted, excited)]
+    pictures += [_response(data.fitted, joint, name, excited) for joint, name in enumerate(data.names)]
+    return Section("spectra", "Excitation and response", words, pictures=tuple(pictures))
+
+
+def _excited(data: RunData) -> list[list[int]]:
+    """Excited harmonics per joint."""
+    entry = next(entry for entry in data.facts["excitation"] if entry["role"] == IDENTIFY)
+    return [list(map(int, lines)) for lines in entry["lines"]]
+
+
+def _excitation(data: RunData, period: PlayedPeriod, excited: list[list[int]]) -> Picture:
+    amplitude = 2 * np.abs(lines_of(period.torque))
+    series = [
+        _points(f"torque of {name}", amplitude[joint], np.array(excited[joint]), period, _COLOURS[joint % 2])
+        for joint, name in enumerate(data.names)
+    ]
+    chart = Chart("excitation", "Excitation", "frequency [Hz]", "torque amplitude [N m]", tuple(series))
+    peaks = ", ".join(f"{name} {np.abs(period.torque[joint]).max():.3g} N m" for joint, name in enumerate(data.names))
+    return Picture(chart, f"The lines of the commanded torque. Its peaks in time: {peaks}.")
+
+
+def _response(period: PlayedPeriod, joint: int, name: str, excited: list[list[int]]) -> Picture:
+    filled = np.where(np.isfinite(period.position), period.position, period.predicted)
+    lines = lines_of(filled)
+    amplitude = 2 * np.abs(lines[joint])
+    own = np.array(excited[joint])
+    others = np.array([line for other, found in enumerate(excited) if other != joint for line in found], dtype=int)
+    shown = np.arange(1, min(len(amplitude), int(_BEYOND * max(map(max, excited)))))
+    silent = np.setdiff1d(shown, np.concatenate((own, others)))
+    noise = 2 * np.sqrt(noise_power(lines)[joint])
+    ends = np.array([0.0, shown[-1] * _fundamental(period)])
+    series = [
+        _points("not excited", amplitude, silent, period, GREY),
+        _points("excited in the other joint", amplitude, others, period, GREEN),
+        _points("excited in this joint", amplitude, own, period, BLUE),
+        Series("noise", ends, np.full(2, noise), ORANGE, "dashed"),
+    ]
+    kept = tuple(one for one in series if one.x.size)
+    chart = Chart(
+        f"response_{joint + 1}", f"Response of {name}", "frequency [Hz]", "position amplitude [rad]", kept, log_y=True
+    )
+    return Picture(chart, f"{name}: the lines of its motion. Noise is the level of the upper half of all lines.")
+
+
+def _points(name: str, amplitude: Array, index: Array, period: PlayedPeriod, colour: str) -> Series:
+    return Series(name, index * _fundamental(period), amplitude[index], colour, "points")
+
+
+def _fundamental(period: PlayedPeriod) -> float:
+    return period.rate / float(period.position.shape[1])

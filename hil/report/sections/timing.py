@@ -1,0 +1,56 @@
+"""How the stream kept its ticks."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.report.chart import BLUE, GREEN, Chart, Series
+from hil.report.run_data import RunData
+from hil.report.section import Picture, Section, Table
+from hil.report.words import number
+
+_BINS = 60
+
+
+def timing(data: RunData) -> Section:
+    """Always there."""
+    samples = data.samples
+    sent = samples[samples["time_after_read"] > samples["time_before_write"]]
+    lateness = 1e6 * (sent["time_before_write"] - sent["deadline"])
+    round_trip = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
+    kept = data.result["timing"]
+    rows = [
+        ("rate asked for", f"{data.config.experiment.rate:g} Hz"),
+        ("rate held", f"{kept['rate_held']:g} Hz"),
+        ("ticks missed", f"{kept['missed_ticks']} of {kept['samples']}"),
+        ("replies lost", f"{kept['lost_replies']}"),
+        ("lateness p50, p99, most", _quantiles(kept["lateness_us"])),
+        ("round trip p50, p99, most", _quantiles(kept["round_trip_us"])),
+        ("estimation took", f"{kept['estimation_seconds']:.2f} s"),
+    ]
+    virtual = ("On the fake bus this is virtual time: its own wire and adapter, not this machine.",)
+    return Section(
+        "timing",
+        "Timing",
+        virtual if data.config.is_fake else (),
+        (Table(("", ""), tuple(rows)),),
+        (
+            _histogram("lateness", "From the deadline to the write", lateness, BLUE),
+            _histogram("round_trip", "From the write to the last reply", round_trip, GREEN),
+        ),
+    )
+
+
+def _quantiles(values: dict[str, float]) -> str:
+    return ", ".join(number(values[key], 4) for key in ("p50", "p99", "max")) + " µs"
+
+
+def _histogram(name: str, title: str, values: NDArray[np.float64], colour: str) -> Picture:
+    # All but the last permille: one stall of the machine would squeeze the rest into one bar.
+    most = float(np.quantile(values, 0.999))
+    low = float(values.min())
+    high = most if most > low else low + 1.0
+    counts, edges = np.histogram(values[values <= high], bins=_BINS, range=(low, high))
+    series = Series("", edges, counts.astype(np.float64), colour, "steps")
+    beyond = int((values > high).sum())
+    more = f" {beyond} of {len(values)} are later than shown." if beyond else ""
+    return Picture(Chart(name, title, "time [µs]", "samples", (series,)), f"{title}.{more}")

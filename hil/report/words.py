@@ -1,0 +1,28 @@
+"""Numbers and lists as a person writes them."""
+
+from collections.abc import Sequence
+
+
+def listed(words: Sequence[str]) -> str:
+    """a, b and c."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""
+
+
+def percent(share: float) -> str:
+    """A share with two digits that count."""
+    return f"{float(f'{100 * share:.2g}'):g} %"
+
+
+def steps(value: float) -> str:
+    """Encoder steps with three digits that count."""
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def number(value: float, digits: int = 5) -> str:
+    """A value with so many digits that count."""
+    return f"{value:.{digits}g}".replace("-", "\u2212")
+
+
+def plain(name: str) -> str:
+    """A snake_case word as text."""
+    return name.replace("_", " ")

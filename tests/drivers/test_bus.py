@@ -1,0 +1,173 @@
+"""ServoBus on the fake arm in virtual time: what it prepares, what it says, what a lost reply costs."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from drivers.bus import BusConfig, ServoBus
+from drivers.errors import ServoFault, WrongSetting
+from drivers.joint import Joint
+from drivers.packet import HardwareError
+from drivers.servo_model import Mode, servo_model
+
+from .conftest import JOINTS
+
+Make = Callable[..., BusConfig]
+File = Callable[..., str]
+
+
+def servos(bus: ServoBus) -> Any:
+    """The fake servos behind the bus, by ID."""
+    return bus.port._serial.bus.servos
+
+
+def test_opened_means_ready_for_an_exchange_and_without_torque(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        state = bus.exchange([0.0, 0.0])
+        assert state.missing == (False, False)
+        assert state.position == pytest.approx((-1.5708, 0.0), abs=2e-3)
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+    assert not bus.port.is_open
+
+
+def test_a_failed_opening_leaves_the_port_closed(
+    fake_config: Make, fake_file: File, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = []
+    monkeypatch.setattr(ServoBus, "close", lambda bus: (closed.append(bus), bus.port.close()))
+    url = fake_file(("[[fake.servos]]\nid = 1\n", '[[fake.servos]]\nid = 1\nregisters = { "Drive Mode" = 8 }\n'))
+    with pytest.raises(WrongSetting, match=r"'shoulder' \(ID 1.*Drive Mode is 8"):
+        ServoBus.open(fake_config(url))
+    assert len(closed) == 1 and not closed[0].port.is_open
+
+
+@pytest.mark.parametrize(("firmware", "fast"), [(44, False), (45, True)])
+def test_fast_sync_read_is_used_where_every_firmware_has_it(
+    fake_config: Make, fake_file: File, firmware: int, fast: bool
+) -> None:
+    url = fake_file(("[[fake.servos]]\nid = 2\n", f"[[fake.servos]]\nid = 2\nfirmware = {firmware}\n"))
+    with ServoBus.open(fake_config(url)) as bus:
+        assert bus.prepared.fast is fast
+        assert bus.exchange([0.0, 0.0]).missing == (False, False)
+
+
+def test_fast_sync_read_can_be_forbidden(fake_config: Make) -> None:
+    with ServoBus.open(fake_config(fast_sync_read=False)) as bus:
+        assert not bus.prepared.fast
+
+
+def test_a_firmware_that_should_have_it_and_does_not_answer_is_read_the_old_way(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from fakes.bus import FakeBus
+
+    monkeypatch.setattr(FakeBus, "_fast_sync_read", lambda *_: None)
+    with ServoBus.open(fake_config()) as bus:
+        assert not bus.prepared.fast
+        assert bus.exchange([0.0, 0.0]).missing == (False, False)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("one_write", [True, False])
+def test_every_way_of_sending_drives_the_arm(fake_config: Make, fast: bool, one_write: bool) -> None:
+    with (
+        ServoBus.open(fake_config(fast_sync_read=fast, one_write=one_write)) as bus,
+        bus.torque(watchdog=0.1),
+    ):
+        for _ in range(100):
+            state = bus.exchange([0.3, 0.0])
+        assert state.current[0] == pytest.approx(0.3, abs=0.01)
+        assert state.position[0] > -1.56
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_lost_reply_costs_three_milliseconds_one_sample_and_nothing_more(fake_config: Make, fast: bool) -> None:
+    with ServoBus.open(fake_config(fast_sync_read=fast)) as bus:
+        for lost in (1, 2):
+            servos(bus)[lost].connected = False
+            state = bus.exchange([0.0, 0.0])
+            assert True in state.missing
+            assert state.time_after_read - state.time_before_write <= 3e-3
+            servos(bus)[lost].connected = True
+            for _ in range(3):
+                state = bus.exchange([0.0, 0.0])
+                assert state.missing == (False, False)
+                assert state.position == pytest.approx((-1.5708, 0.0), abs=2e-3)
+
+
+def test_tick_voltage_and_temperature_come_in_turn(fake_config: Make) -> None:
+    with ServoBus.open(fake_config(slow_every=5)) as bus:
+        states = [bus.exchange([0.0, 0.0]) for _ in range(20)]
+    slow = [state.slow for state in states if state.slow is not None]
+    (first, *_) = turns = [index for index, state in enumerate(states) if state.slow]
+    assert turns == [first, first + 5, first + 10, first + 15]
+    assert slow[0].tick[0] == pytest.approx(states[first].time_before_write, abs=2e-3)
+    assert slow[1].voltage == pytest.approx((12.0, 12.0))
+    assert slow[1].temperature == (35.0, 35.0)
+    assert all(state.position == pytest.approx((-1.5708, 0.0), abs=2e-3) for state in states)
+
+
+def test_an_alert_is_followed_up_by_its_cause(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        servos(bus)[2].fail(HardwareError.OVERLOAD | HardwareError.OVERHEATING)
+        state = bus.exchange([0.0, 0.0])
+        with pytest.raises(ServoFault, match=r"'elbow' \(ID 2, XM430-W350\) .*: overheating, overload\..*rebooted"):
+            bus.check_alerts(state)
+
+
+def test_no_alert_no_question(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        state = bus.exchange([0.0, 0.0])
+        before = bus.port.clock.now()
+        bus.check_alerts(state)
+        assert bus.port.clock.now() == before
+
+
+@pytest.mark.parametrize("goals", [[float("nan"), 0.0], [0.0, float("inf")], [0.0], [0.0, 0.0, 0.0]])
+def test_no_goal_that_is_no_number_is_sent(fake_config: Make, goals: list[float]) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        before = bus.port.clock.now()
+        with pytest.raises(ValueError, match="goal"):
+            bus.exchange(goals)
+        assert bus.port.clock.now() == before
+
+
+def test_servos_that_do_not_confirm_writes_are_driven_and_let_go_all_the_same(fake_config: Make) -> None:
+    with ServoBus.connect(fake_config()) as bus:
+        for joint in bus.joints:
+            bus.servo(joint).write("Status Return Level", 1)
+        bus.prepare()
+        with bus.torque(watchdog=0.5):
+            assert all(servo.torque_enabled for servo in servos(bus).values())
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
+# PWM
+
+
+def pwm(name: str, servo_id: int, zero: int) -> Joint:
+    return Joint(name, servo_id, servo_model("XL430-W250"), zero_ticks=zero, mode=Mode.PWM)
+
+
+def test_servos_without_a_current_sensor_are_driven_by_voltage(fake_config: Make, fake_file: File) -> None:
+    url = fake_file(('model = "XM430-W350"', 'model = "XL430-W250"'))
+    joints = (pwm("shoulder", 1, 3072), pwm("elbow", 2, 2048))
+    with ServoBus.open(fake_config(url, joints)) as bus, bus.torque(watchdog=0.1):
+        state = bus.exchange([3.0, -1.5])
+        assert state.goal_current == pytest.approx((3.0, -1.5), abs=11.1 / 885)
+        sent = {servo_id: servo.read(100, 2)[1] for servo_id, servo in servos(bus).items()}
+        # Goal PWM is a share of the supply, which is 11.1 V here.
+        assert int.from_bytes(sent[1], "little", signed=True) == round(3.0 / 11.1 * 885)
+        assert int.from_bytes(sent[2], "little", signed=True) == round(-1.5 / 11.1 * 885)
+        assert state.position == pytest.approx((-1.5708, 0.0), abs=2e-3)
+
+
+def test_a_servo_without_current_mode_is_not_driven_by_current() -> None:
+    with pytest.raises(ValueError, match=r"XL430-W250\) has no current mode; drive it in PWM mode"):
+        Joint("elbow", 2, servo_model("XL430-W250"))
+
+
+def test_one_bus_is_driven_one_way() -> None:
+    with pytest.raises(ValueError, match="all must be in current mode or all in PWM mode"):
+        BusConfig("fake://", 1_000_000, (JOINTS[0], pwm("elbow", 2, 0)))

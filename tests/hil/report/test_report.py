@@ -1,0 +1,159 @@
+"""The report's page: what it says and holds, its size and time, and runs that are not whole."""
+
+import json
+import re
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from hil.errors import ResultError, RunFolderError
+from hil.report.page import make_page, sections, write_report
+from hil.report.pictures import figures, save_pictures
+from hil.report.run_data import RunData
+from hil.report.sections.verdict import verdict
+
+MOST_BYTES = 3_000_000
+MOST_SECONDS = 5.0
+
+
+def test_it_is_one_file_without_requests_within_size_and_time(identified: Path) -> None:
+    started = time.perf_counter()
+    write_report(RunData.load(identified), identified / "report.html")
+    assert time.perf_counter() - started < MOST_SECONDS
+    page = (identified / "report.html").read_text(encoding="utf-8")
+    assert len(page.encode()) < MOST_BYTES
+    loads = [value for name, value in attributes(page) if name in ("src", "href", "srcset", "action", "data")]
+    assert all(value.startswith(("#", "data:")) for value in loads), loads
+    assert not re.findall(r"@import|url\((?!#)|fetch\(|XMLHttpRequest", page)
+
+
+def attributes(page: str) -> list[tuple[str, str]]:
+    found: list[tuple[str, str]] = []
+
+    class Parser(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            found.extend((name, value or "") for name, value in attrs)
+
+    Parser().feed(page)
+    return found
+
+
+def test_words_come_first_then_every_section_and_figure(identified: Path) -> None:
+    data = RunData.load(identified)
+    made = sections(data)
+    assert [section.key for section in made] == [
+        *("verdict", "parameters", "prediction", "friction", "spectra"),
+        *("correlation", "limits", "timing", "provenance"),
+    ]
+    page = make_page(data)
+    assert page.index("predicts another motion") < page.index("<table")
+    for figure in figures(data):
+        assert page.count(f'aria-label="{figure.title}') == 2
+    for said in ("inertia_1", "gravity_2", "coulomb_2", "XM430-W350, ID 1", "seed"):
+        assert said in page
+
+
+def test_names_and_events_cannot_break_out_of_the_page(identified: Path) -> None:
+    with (identified / "events.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps({"time": 99.0, "event": "<script>alert(1)</script>"}) + "\n")
+    page = make_page(RunData.load(identified))
+    assert "<script>alert(1)" not in page
+    assert "&lt;script&gt;alert(1)" in page
+
+
+def test_a_run_without_held_out_or_period_leaves_those_sections_out(identified: Path) -> None:
+    (identified / "period.npz").unlink()
+    path = identified / "result.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    result["validation"] = {}
+    del result["truth"]
+    path.write_text(json.dumps(result), encoding="utf-8")
+    data = RunData.load(identified)
+    keys = [section.key for section in sections(data)]
+    assert keys == ["verdict", "parameters", "correlation", "limits", "timing", "provenance"]
+    page = make_page(data)
+    assert "never saw" not in page and "truth" not in page
+
+
+@pytest.mark.parametrize(
+    ("residual", "held_out", "tone", "said"),
+    [
+        ([0.29, 0.28], [0.001, 0.002], "good", "can be trusted"),
+        ([2.0, 1.0], [0.001, 0.002], "good", "predicts well"),
+        ([2.0, 1.0], [0.001, 0.03], "fair", "Usable"),
+        ([9.0, 1.0], [0.3, 0.03], "poor", "Do not trust"),
+        ([9.0, 1.0], None, "fair", "nothing checked"),
+        ([0.29, 0.28], None, "good", "nothing else checked"),
+    ],
+)
+def test_the_verdict_follows_residual_and_prediction(
+    identified: Path, residual: list[float], held_out: list[float] | None, tone: str, said: str
+) -> None:
+    path = identified / "result.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    result["fit"]["residual_rms_ticks"] = residual
+    result["validation"] = {} if held_out is None else {"held_out_rms": held_out}
+    path.write_text(json.dumps(result), encoding="utf-8")
+    section = verdict(RunData.load(identified))
+    assert section.tone == tone
+    assert said in section.title
+    assert bool(section.words) == (tone != "good")
+
+
+def test_missing_replies_and_an_undetermined_parameter_are_drawn_and_said(identified: Path) -> None:
+    path = identified / "period.npz"
+    arrays = dict(np.load(path))
+    arrays["identify_position"][1, 50:60] = np.nan
+    np.savez(path, **arrays)
+    path = identified / "result.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    name = "coulomb_width_1"
+    result["extra"][name]["std"] = float("inf")
+    index = result["covariance"]["names"].index(name)
+    for other in range(len(result["covariance"]["names"])):
+        result["covariance"]["matrix"][index][other] = result["covariance"]["matrix"][other][index] = 0.0
+    result["covariance"]["matrix"][index][index] = float("inf")
+    path.write_text(json.dumps(result), encoding="utf-8")
+    page = make_page(RunData.load(identified))
+    assert "not determined" in page
+    assert "nan" not in "".join(re.findall(r' d="([^"]*)"', page)).lower()
+
+
+def test_pictures_stand_alone_as_svg_and_png(identified: Path, tmp_path: Path) -> None:
+    data = RunData.load(identified)
+    count = len(figures(data))
+    svgs = save_pictures(data, tmp_path / "pictures", "svg")
+    assert len(svgs) == len(set(svgs)) == count
+    for path in svgs:
+        assert ET.parse(path).getroot().tag.endswith("svg")
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
+    for path in save_pictures(data, tmp_path / "pictures", "png"):
+        assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_runs_that_are_not_whole_are_named(identified: Path, tmp_path: Path) -> None:
+    def said(kind: type[Exception], text: str) -> None:
+        with pytest.raises(kind, match=text):
+            RunData.load(identified)
+
+    def spoil(name: str, content: Any) -> None:
+        path = identified / name
+        kept = path.read_bytes()
+        path.write_text(content, encoding="utf-8") if content is not None else path.unlink()
+        said(ResultError if name == "result.json" else RunFolderError, rf"{re.escape(name)}")
+        path.write_bytes(kept)
+
+    spoil("result.json", None)
+    spoil("result.json", '{"schema": 1, "par')
+    spoil("result.json", '{"schema": 99}')
+    spoil("period.npz", "no zip")
+    spoil("samples.npy", "no npy")
+    spoil("run.json", '{"schema": 99}')
+    spoil("events.jsonl", "no json\n{}\n")
+    with pytest.raises(ResultError, match="nowhere: cannot be read"):
+        RunData.load(tmp_path / "nowhere")

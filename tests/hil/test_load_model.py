@@ -1,0 +1,121 @@
+"""The identified arm as a model: its equations against the estimator's, its speed, and files that are not right."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from estimator.arm_model import inverse_dynamics, parameter_names
+from hil import load_model
+from hil.dynamics import ArmModel
+from hil.errors import ResultError
+
+
+def motions(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    random = np.random.default_rng(3)
+    return tuple(random.normal(size=shape) * scale for scale in (1.0, 3.0, 20.0))
+
+
+def test_it_has_the_estimators_equations(identified: Path) -> None:
+    model = load_model(identified)
+    names = parameter_names(2)
+    sharp = dataclasses.replace(model, values={name: model.values[name] for name in names})
+    q, dq, ddq = motions((500, 2))
+    theta = np.array([model.values[name] for name in names])
+    expected = inverse_dynamics(theta, q.T, dq.T, ddq.T).T
+    np.testing.assert_allclose(sharp.inverse_dynamics(q, dq, ddq), expected, atol=1e-13)
+
+
+def full(model: ArmModel) -> ArmModel:
+    """With every term of friction."""
+    more = {"coulomb_width": 0.01, "stribeck_rise": 0.4, "stribeck_velocity": 0.15, "load": 0.05}
+    terms = {f"{term}_{joint}": value for term, value in more.items() for joint in (1, 2)}
+    return dataclasses.replace(model, values={**model.values, **terms})
+
+
+def test_forward_is_the_inverse_of_inverse(identified: Path) -> None:
+    model = full(load_model(identified))
+    q, dq, ddq = motions((300, 2))
+    torque = model.inverse_dynamics(q, dq, ddq)
+    np.testing.assert_allclose(model.forward_dynamics(q, dq, torque), ddq, atol=1e-9)
+
+
+def test_any_shape_and_its_parts_add_up(identified: Path) -> None:
+    model = load_model(identified)
+    q, dq, ddq = motions((4, 5, 2))
+    torque = model.inverse_dynamics(q, dq, ddq)
+    assert torque.shape == (4, 5, 2)
+    np.testing.assert_allclose(torque[2, 3], model.inverse_dynamics(q[2, 3], dq[2, 3], ddq[2, 3]))
+    offset = [model.values["offset_1"], model.values["offset_2"]]
+    np.testing.assert_allclose(torque, model.rigid_body_torque(q, dq, ddq) + model.friction_torque(dq) + offset)
+    zero = np.zeros_like(q)
+    np.testing.assert_allclose(model.gravity_torque(q), model.rigid_body_torque(q, zero, zero))
+    np.testing.assert_allclose(
+        (model.mass_matrix(q) @ ddq[..., None])[..., 0],
+        model.rigid_body_torque(q, zero, ddq) - model.gravity_torque(q),
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(model.goal(torque), torque / 1.8)
+
+
+def test_a_pendulum_is_an_arm_too(identified: Path) -> None:
+    two = load_model(identified)
+    values = {name: value for name, value in two.values.items() if name.endswith("_1")}
+    one = ArmModel(values, two.stds, two.gravity, two.rest_pose[:1], two.joints[:1])
+    q, dq, ddq = motions((50, 1))
+    torque = one.inverse_dynamics(q, dq, ddq)
+    expected = values["inertia_1"] * ddq + values["gravity_1"] * np.cos(q) + values["offset_1"]
+    np.testing.assert_allclose(torque, expected + one.friction_torque(dq))
+    np.testing.assert_allclose(one.forward_dynamics(q, dq, torque), ddq, atol=1e-9)
+
+
+def test_shapes_that_do_not_fit_are_named(identified: Path) -> None:
+    model = load_model(identified)
+    with pytest.raises(ValueError, match=r"q \(3, 2\), dq \(3, 2\), ddq \(2,\): all must have one shape \(\.\.\., 2\)"):
+        model.inverse_dynamics(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(2))
+    with pytest.raises(ValueError, match=r"q \(3,\)"):
+        model.gravity_torque(np.zeros(3))
+
+
+def damage(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
+def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, tmp_path: Path) -> None:
+    path = identified / "result.json"
+    good = path.read_text(encoding="utf-8")
+    result = json.loads(good)
+    del result["arm"]
+    cases = {
+        good[: len(good) // 2]: "half written or damaged",
+        "[]": "it has no schema",
+        json.dumps({**json.loads(good), "schema": 2}): "schema 2 is not 1.* a newer hil",
+        json.dumps(result): "it has no 'arm'",
+        good.replace('"gravity_2"', '"gravity_9"'): "lacks gravity_2",
+        good.replace(
+            '"extra": {', '"extra": {"backlash_1": {"value": 1, "std": 0, "unit": "rad"},'
+        ): "backlash_1, which",
+    }
+    for text, said in cases.items():
+        damage(path, text)
+        with pytest.raises(ResultError, match=rf"result\.json: .*{said}"):
+            load_model(identified)
+    path.unlink()
+    with pytest.raises(ResultError, match=r"holds no result\.json.* hil estimate"):
+        load_model(identified)
+    with pytest.raises(ResultError, match=r"nowhere: cannot be read: No such file"):
+        load_model(tmp_path / "nowhere")
+
+
+def test_it_needs_numpy_only_and_hil_itself_not_even_that(identified: Path) -> None:
+    code = (
+        "import sys, hil; assert 'numpy' not in sys.modules\n"
+        f"hil.load_model({str(identified)!r}).gravity_torque([0.0, 0.0])\n"
+        "heavy = {'scipy', 'numba', 'pydantic', 'typer', 'rich', 'serial', 'estimator', 'drivers'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,81 @@
+"""Arms driven by voltage: what their configuration says, and what is played."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.servo_model import Mode
+from hil.config import Config, load_config
+from hil.errors import ConfigError
+from hil.plan import make_plan
+
+ArmFile = Callable[..., Path]
+
+BY_CURRENT = (
+    ("torque_constant = 1.80         # N m/A at the output shaft", ""),
+    ("torque_constant_std = 0.15     # how well that is known; every parameter of the joint scales with it", ""),
+    ("current_limit = 1.2            # A", ""),
+    ("torque_constant = 1.80\n", ""),
+    ("torque_constant_std = 0.15\n", ""),
+    ("current_limit = 0.8\n", ""),
+)
+
+
+def by_voltage(arm_file: ArmFile) -> Path:
+    """The fake arm's file with both joints driven by voltage."""
+    path = arm_file()
+    head, fake = path.read_text(encoding="utf-8").split("\n[fake]\n")
+    for old, new in BY_CURRENT:
+        assert old in head
+        head = head.replace(old, new, 1)
+    joint = 'model = "XL430-W250"\ntorque_per_volt = 0.125\ntorque_per_volt_std = 0.01\nvoltage_limit = 8.0\n'
+    head = head.replace('model = "XM430-W350"\n', joint)
+    path.write_text(f"{head}\n[fake]\n{fake}".replace('model = "XM430-W350"', 'model = "XL430-W250"'), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def voltage_driven(arm_file: ArmFile) -> Config:
+    return load_config(by_voltage(arm_file))
+
+
+def test_the_model_decides_the_mode(voltage_driven: Config) -> None:
+    assert {joint.drive_mode for joint in voltage_driven.joints} == {Mode.PWM}
+    assert voltage_driven.bus.joints[0].mode is Mode.PWM
+
+
+def test_goals_are_volts(voltage_driven: Config) -> None:
+    (first, *_) = make_plan(voltage_driven).segments
+    assert np.abs(first.period_current).max(axis=0) == pytest.approx([0.80 / 0.125, 0.42 / 0.125], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("voltage_limit = 8.0", "current_limit = 0.8", r"joints\[1\]: voltage_limit is missing; pwm mode needs it"),
+        ("voltage_limit = 8.0", "voltage_limit = 8.0\ncurrent_limit = 0.8", r"current_limit = 0\.8: it means nothing"),
+        ("voltage_limit = 8.0", 'voltage_limit = 8.0\nmode = "current"', r"XL430-W250 has no current mode"),
+        ("voltage_limit = 8.0", "voltage_limit = 2.0", r"more than voltage_limit \* torque_per_volt = 0\.25 N m"),
+    ],
+)
+def test_a_fault_is_said(arm_file: ArmFile, old: str, new: str, said: str) -> None:
+    path = by_voltage(arm_file)
+    path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match=said):
+        load_config(path)
+
+
+def test_all_joints_are_driven_alike(arm_file: ArmFile) -> None:
+    path = by_voltage(arm_file)
+    text = path.read_text(encoding="utf-8")
+    at = text.rindex('model = "XL430-W250"\ntorque_per_volt')
+    mixed = text[:at] + text[at:].replace(
+        'model = "XL430-W250"\ntorque_per_volt = 0.125\ntorque_per_volt_std = 0.01\nvoltage_limit = 8.0',
+        'model = "XM430-W350"\ntorque_constant = 1.8\ncurrent_limit = 0.8',
+        1,
+    )
+    path.write_text(mixed, encoding="utf-8")
+    with pytest.raises(ConfigError, match="all in current mode or all in pwm mode"):
+        load_config(path)
