@@ -18,6 +18,7 @@ from fakes.description import FakeArm
 from fakes.table_errors import describe
 from hil.bundled import find_config
 from hil.errors import ConfigError
+from hil.known import KnownConfig
 
 FAKE_URL = "fake://"
 
@@ -183,6 +184,7 @@ class Config(_Table):
     experiment: ExperimentConfig
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
+    known: KnownConfig | None = None
     fake: FakeArm | None = None
 
     @model_validator(mode="after")
