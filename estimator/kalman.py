@@ -88,7 +88,13 @@ def fit_by_kalman(
 
 def _scales(names: tuple[str, ...], start: Array) -> Array:
     """The largest of each kind of parameter, as a unit for all of the kind."""
-    groups = {"coupling": "inertia", "armature": "inertia", "gravity": "torque", "coulomb": "torque", "offset": "torque"}
+    groups = {
+        "coupling": "inertia",
+        "armature": "inertia",
+        "gravity": "torque",
+        "coulomb": "torque",
+        "offset": "torque",
+    }
     kinds = [groups.get(name.split("_")[0], name.split("_")[0]) for name in names]
     largest = {kind: max(abs(v) for v, k in zip(start, kinds, strict=True) if k == kind) for kind in kinds}
     return np.array([max(largest[kind], 1e-9) for kind in kinds])

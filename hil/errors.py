@@ -2,6 +2,7 @@
 
 HilError                    exit code
 ├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
+├── CsvError                2   a CSV file lacks columns, or fields that should be numbers are none
 ├── MissingExtra            2   an optional package is not installed
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
 ├── ResultError             2   no result.json, half written, damaged, or from a newer hil
@@ -36,6 +37,12 @@ class ConfigError(HilError):
 
 class RunFolderError(HilError):
     """The run folder cannot be used. Example: `--out` names a folder that holds another run."""
+
+    exit_code = 2
+
+
+class CsvError(HilError):
+    """A CSV file cannot be read as a recording. Example: no column "q1", which [columns] names."""
 
     exit_code = 2
 

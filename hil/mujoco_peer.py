@@ -7,7 +7,9 @@ mujoco.sysid's own optimiser with its rollouts on all cores, and two integration
 its answer as it is.
 """
 
+import io
 import time
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,7 +50,8 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
         parameters.add(parameter)
     residual = sysid.build_residual_fn(models_sequences=[_sequences(mujoco, sysid, spec, period, linear)])
     began = time.perf_counter()
-    found, result = sysid.optimize(initial_params=parameters, residual_fn=residual, optimizer="mujoco", verbose=False)
+    with redirect_stdout(io.StringIO()):  # it prints its iterations, whatever `verbose` says
+        found, result = sysid.optimize(parameters, residual_fn=residual, optimizer="mujoco", verbose=False)
     seconds = time.perf_counter() - began
     left = residual(result.x, found)[0]
     covariance = sysid.calculate_intervals(left, np.asarray(result.jac).reshape(-1, result.x.size))[0]
@@ -66,7 +69,12 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
     std = np.sqrt(np.diag(slope @ covariance @ slope.T))
     settings = f"started within {100 * WITHIN:.0f} %, {values.size} parameters, {STEPS} steps a sample"
     return Peer(
-        "mujoco_sysid", base | {"delay": linear.delay}, dict(zip(names, std.tolist(), strict=True)), seconds, settings, 1
+        "mujoco_sysid",
+        base | {"delay": linear.delay},
+        dict(zip(names, std.tolist(), strict=True)),
+        seconds,
+        settings,
+        1,
     )
 
 
