@@ -19,12 +19,13 @@ import numpy as np
 
 from estimator.arm_model import parameter_names
 from estimator.arrays import Array
+from estimator.errors import ConvergenceError
 from estimator.physics import ABSENT, CONSTANTS
 from estimator.recording import Recording
 
 PASSES = 3
 LONGEST_STEP = 1.3e-3  # s
-SPREAD = 0.3  # of a parameter's start: its standard deviation before the first sample
+SPREAD = 0.1  # of a parameter at its start, as standard deviation; the UKF looks four times as far
 LEAST_SPREAD = 0.02  # of the largest parameter of its kind
 DIFFERENCE = 1e-6
 # The twelve slots that the compiled arm takes; a pendulum fills five of them.
@@ -55,7 +56,8 @@ def fit_by_kalman(
     """Run the filter over `recording` PASSES times.
 
     `start`: base parameters (parameters,) [SI]. `coulomb_width` [rad/s] of friction's step. `velocity_noise`
-    [rad/s per sqrt(s)]: the process noise, what the model may be wrong by. `delay` [s] of the torque.
+    [rad/s per sqrt(s)]: the process noise, what the model may be wrong by. `delay` [s] of the torque. Raises
+    ConvergenceError when the filter diverges.
     """
     joints = recording.joints
     names = parameter_names(joints)
@@ -77,8 +79,9 @@ def fit_by_kalman(
         padded = np.zeros((len(torque), 2))
         padded[:, :joints] = torque
         run(x, P, noise, recording.noise**2, position, padded, intervals, substeps, scale, slots, fixed, coulomb_width)
-        if np.all(np.isfinite(x)):
-            theta = x[2 * joints :]
+        if not np.all(np.isfinite(x)):
+            raise ConvergenceError(f"the {kind.upper()} diverged: raise its velocity noise or start it nearer")
+        theta = x[2 * joints :]
     std = np.sqrt(np.maximum(np.diag(P)[2 * joints :], 0.0))
     return Filtered(names, theta * scale, std * scale)
 

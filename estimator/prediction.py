@@ -5,12 +5,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from estimator.arrays import Array
+from estimator.drive import motor_torque
+from estimator.errors import PeriodicityError
 from estimator.model import Model
+from estimator.period import SettledPeriod
 from estimator.physics import Physics
 from estimator.recording import Recording
 from estimator.shooting import Shooting
+from estimator.simulation import simulate, steps_per_sample
 
 LEAST_WIDTH = 1e-3  # rad/s of a Coulomb step, where a method knows none
+MOST_PERIODS = 20  # simulated until the motion is periodic
+PERIODIC = 1e-6  # rad and rad/s, from one period's end to the next
 
 
 def prediction_rms(
@@ -23,7 +29,7 @@ def prediction_rms(
     off. A simulation that runs away counts as wrong by pi.
     """
     problem = Shooting(recordings, Model(joints), False, length)
-    known = {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)
+    known = _complete(parameters, joints)
     physics = Physics.of(known)
     zero = np.array([known.get(f"zero_{joint + 1}", 0.0) for joint in range(joints)])
     squares, samples = np.zeros(joints), 0
@@ -37,3 +43,31 @@ def prediction_rms(
         samples += error.shape[1]
     rms: Array = np.sqrt(squares / samples)
     return rms
+
+
+def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, float]) -> Array:
+    """RMS of measured less freely predicted position over the RMS of the motion (joints,) of a settled period.
+
+    The arm starts at rest where the period's positions lie on average and is simulated under the period's torque
+    until its motion repeats; no measurement enters. Raises PeriodicityError when it does not repeat.
+    """
+    physics = Physics.of(_complete(parameters, period.joints))
+    steps = steps_per_sample(period.rate)
+    step = 1.0 / (period.rate * steps)
+    motor = motor_torque(
+        period.torque, period.rate, period.command_to_sample, steps, delay=physics.delay, lag=physics.lag
+    )
+    filled = period.filled()
+    state = np.stack((filled.mean(axis=1), np.zeros(period.joints)))
+    for _ in range(MOST_PERIODS):
+        position, end = simulate(physics, state, motor, step)
+        if float(np.abs(end - state).max()) < PERIODIC:
+            error: Array = np.sqrt(np.nanmean((period.position - position) ** 2, axis=1)) / filled.std(axis=1)
+            return error
+        state = end
+    raise PeriodicityError(f"under these parameters the arm does not settle within {MOST_PERIODS} periods")
+
+
+def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:
+    """With a narrow Coulomb step where the method that found the parameters knows of no width."""
+    return {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)

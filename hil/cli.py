@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from hil import __version__, cli_dry_run, cli_init, cli_results
+from hil import __version__, cli_data, cli_dry_run, cli_init, cli_results
 
 if TYPE_CHECKING:
     from hil.config import Config
@@ -78,17 +78,25 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
 
 
 @app.command(epilog="Example: hil estimate runs/20261121-153000-fake_two_link")
-def estimate(run: RunPath, json_only: Json = False) -> None:
-    """Estimate again from a recording; writes its result.json anew."""
+def estimate(run: cli_data.Runs, config: cli_data.ArmPath = None, json_only: Json = False) -> None:
+    """Estimate again from a recording; writes its result.json anew. Or from CSV files of any motion."""
+    from hil.errors import RecordingCutShort
     from hil.estimate import estimate_run
     from hil.run_folder import RunFolder
     from hil.terminal import Terminal
 
-    folder = RunFolder.open(run)
+    if cli_data.are_csv(run):
+        cli_data.estimate_csv(run, config, json_only)
+        return
+    folder = RunFolder.open(run[0])
     terminal = Terminal(quiet=json_only)
-    with terminal.busy("Estimating"):
-        result = estimate_run(folder)
-        cli_results.write_report(folder.path)
+    try:
+        with terminal.busy("Estimating"):
+            result = estimate_run(folder)
+            cli_results.write_report(folder.path)
+    except RecordingCutShort as error:
+        cli_data.estimate_unsettled(folder, error, json_only)
+        return
     _show(result, folder.load_config(), folder.path, json_only)
 
 
@@ -184,6 +192,10 @@ app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --for
 )
 app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.init)
 app.command("dry-run", epilog="Example: hil dry-run configs/first_time.toml --picture dry_run.png")(cli_dry_run.dry_run)
+app.command(epilog="Example: hil compare runs/20261121-153000-fake_two_link")(cli_data.compare)
+app.command(epilog="Example: hil calibrate runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147")(
+    cli_data.calibrate
+)
 
 
 @app.command(epilog="Example: hil fake configs/fake_two_link.toml --pty --link /tmp/arm")

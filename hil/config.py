@@ -18,6 +18,7 @@ from fakes.description import FakeArm
 from fakes.table_errors import describe
 from hil.bundled import find_config
 from hil.errors import ConfigError
+from hil.known import KnownConfig
 
 FAKE_URL = "fake://"
 
@@ -229,6 +230,7 @@ class Config(_Table):
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
     stabiliser: StabiliserConfig | None = None
+    known: KnownConfig | None = None
     fake: FakeArm | None = None
 
     @model_validator(mode="after")

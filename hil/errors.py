@@ -2,6 +2,8 @@
 
 HilError                    exit code
 ├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
+├── CsvError                2   a CSV file lacks columns, or fields that should be numbers are none
+├── MissingExtra            2   an optional package is not installed
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
 ├── ResultError             2   no result.json, half written, damaged, or from a newer hil
 ├── ExportError             2   the format cannot hold this arm, or a package for it is not installed
@@ -59,6 +61,18 @@ class ConfigError(HilError):
 
 class RunFolderError(HilError):
     """The run folder cannot be used. Example: `--out` names a folder that holds another run."""
+
+    exit_code = 2
+
+
+class CsvError(HilError):
+    """A CSV file cannot be read as a recording. Example: no column "q1", which [columns] names."""
+
+    exit_code = 2
+
+
+class MissingExtra(HilError):
+    """An optional package is not installed. Example: `hil compare --peers mujoco` without the extra `peers`."""
 
     exit_code = 2
 

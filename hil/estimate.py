@@ -10,6 +10,7 @@ from estimator.identify import Estimate, identify, predict
 from estimator.model import Model
 from hil.config import Config
 from hil.period_file import PlayedPeriod, save_periods
+from hil.physical import physical_entries
 from hil.plan import HELD_OUT, IDENTIFY
 from hil.recording import load_samples
 from hil.result import make_result
@@ -33,6 +34,8 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
     kept_time = {**timing(samples, config.experiment.rate), "estimation_seconds": seconds}
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     result = make_result(config, facts.config, period, estimate, held_out, kept_time)
+    if config.known is not None:
+        result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
     save_periods(run.path, played)
     run.write_result(result)
     return result

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from drivers.servo_model import Mode
 from hil.config import Config
+from hil.physical import physical_lines
 
 GOOD_RESIDUAL_TICKS = 0.30
 """A residual up to here is the encoder's own rounding; what is above it the model has not explained."""
@@ -16,7 +17,8 @@ GOOD_RESIDUAL_TICKS = 0.30
 def print_result(result: dict[str, Any], config: Config, run: Path, console: Console) -> None:
     """The table, the fit and what to do next."""
     console.print(_parameters(result))
-    for line in (*_fit(result), *_torque_constants(config), *_next(result, run)):
+    physical = physical_lines(result["physical"]) if "physical" in result else []
+    for line in (*_fit(result), *_torque_constants(config), *physical, *_next(result, run)):
         console.print(line, soft_wrap=True, markup=False)
 
 

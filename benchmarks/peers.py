@@ -1,0 +1,73 @@
+"""Every method on the default demo recording: error, held-out prediction, time.
+
+    python benchmarks/peers.py [--json] [--seed N]
+
+`seconds`, `worst_relative_error` and `held_out_rms`, each by method. The worst relative error is over inertias,
+gravity, viscous and Coulomb friction. How each peer was tuned stands in estimator/peers.py and hil/mujoco_peer.py;
+mujoco.sysid takes part where it is installed (extra `peers`), started within 50 % of the truth. This project's own
+estimate is timed in the same process, after one run to compile and before the peers.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from machine import machine
+
+from hil.compare import OURS, compare_run
+from hil.config import load_config
+from hil.experiment import run_experiment
+from hil.run_folder import RunFolder
+
+CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
+
+
+def measure(seed: int, mujoco: bool) -> dict[str, Any]:
+    config = load_config(CONFIG)
+    experiment = config.experiment.model_copy(update={"seed": seed})
+    config = config.model_copy(update={"experiment": experiment})
+    with tempfile.TemporaryDirectory() as folder:
+        run = RunFolder.create(Path(folder) / "run", config)
+        run_experiment(config, run, config.path, lambda _: None)
+        compare_run(run, mujoco=False)  # compiles
+        return compare_run(run, mujoco)["methods"]
+
+
+def installed() -> bool:
+    try:
+        from mujoco import sysid
+    except ImportError:
+        return False
+    return hasattr(sysid, "optimize")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    methods = measure(options.seed, installed())
+    keys = ("seconds", "worst_relative_error", "held_out_rms")
+    if options.json:
+        print(json.dumps({key: {name: entry[key] for name, entry in methods.items()} for key in keys}))
+        return
+    print(f"{machine()}, load {os.getloadavg()[0]:.1f}; demo recording, seed {options.seed}")
+    print(f"{'method':14s} {'seconds':>8s} {'worst error':>12s} {'of':12s} {'held out':>9s}  settings")
+    for name, entry in methods.items():
+        held_out = entry["held_out_rms"]
+        shown = "-" if held_out is None else f"{100 * held_out:.3f} %"
+        print(
+            f"{name:14s} {entry['seconds']:8.3f} {100 * entry['worst_relative_error']:10.3f} % "
+            f"{entry['worst_parameter']:12s} {shown:>9s}  {entry['settings']}"
+        )
+    others = [entry["worst_relative_error"] for name, entry in methods.items() if name != OURS]
+    print(f"best of the others over ours: {min(others) / methods[OURS]['worst_relative_error']:.1f} in worst error")
+    if "mujoco_sysid" in methods:
+        print(f"mujoco.sysid over ours: {methods['mujoco_sysid']['seconds'] / methods[OURS]['seconds']:.1f} in time")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""Torque constants from a known mass: two settled periods, without and with it, in one likelihood.
+
+Every parameter of a joint scales with its torque constant, so one experiment cannot tell them apart. A mass M bolted
+to the last link at a known distance changes the arm by amounts that are known in kilograms and metres:
+
+    gravity_2 + M d g    inertia_2 + M d^2 + J    coupling + M l1 d    gravity_1 + M l1 g    inertia_1 + M l1^2
+    (one joint: gravity_1 + M d g, inertia_1 + M d^2 + J)
+
+Both periods are fitted at once, with the second's parameters the first's plus these, and each joint's torque as
+commanded times an unknown factor: true over supposed torque constant.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.arrays import Array
+from estimator.coordinates import Coordinates
+from estimator.drive import motor_torque
+from estimator.errors import ModelError
+from estimator.identify import Estimate
+from estimator.levenberg_marquardt import minimise
+from estimator.period import SettledPeriod
+from estimator.physics import Physics
+from estimator.simulation import simulate, steps_per_sample
+
+ANGLE_SCALE = 0.1  # rad
+FINE = 1e-6
+WIDTH_FLOOR = 3e-4  # rad/s
+STARTING_WIDTH = 0.005  # rad/s: under a wrong torque constant the first estimate's is worth nothing
+ADDED = {
+    1: ("gravity_1", "inertia_1"),
+    2: ("gravity_2", "inertia_2", "coupling", "gravity_1", "inertia_1"),
+}
+
+
+@dataclass(frozen=True)
+class KnownMass:
+    """What was bolted to the last link, on the line from its joint through its centre of mass."""
+
+    mass: float
+    """[kg]"""
+    distance: float
+    """Of its centre from the last joint [m]."""
+    inertia: float = 0.0
+    """About its own centre [kg m^2]."""
+    length: float = 0.0
+    """Of link 1, joint to joint [m]; of an arm of two joints."""
+
+    def change(self, gravity: float, joints: int) -> dict[str, float]:
+        """What it adds to the base parameters [SI]; raises ModelError for values that no mass has."""
+        if not (self.mass > 0.0 and self.distance > 0.0 and self.inertia >= 0.0):
+            raise ModelError(
+                f"a mass of {self.mass:g} kg at {self.distance:g} m with inertia {self.inertia:g} kg m^2: mass and "
+                "distance must be positive, inertia not negative"
+            )
+        M, d, g = self.mass, self.distance, gravity
+        about = self.inertia + M * d**2
+        if joints == 1:
+            return {"gravity_1": M * d * g, "inertia_1": about}
+        if self.length <= 0.0:
+            raise ModelError("the length of link 1 must be known: measure from joint to joint, give --length")
+        added = (M * d * g, about, M * self.length * d, M * self.length * g, M * self.length**2)
+        return dict(zip(ADDED[2], added, strict=True))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Torque constants and the arm's parameters in true units."""
+
+    factor: Array
+    """True over supposed torque constant of each joint (joints,)."""
+    factor_std: Array
+    names: tuple[str, ...]
+    value: Array
+    """Parameters of the arm without the mass (parameters,) [SI]."""
+    std: Array
+    residual_steps: Array
+    """RMS of the residual in encoder steps (runs, joints)."""
+    misfit: float
+    """Weighted sum of squares per sample: 1 is noise alone."""
+
+
+def calibrate(
+    without: SettledPeriod, with_mass: SettledPeriod, first: Estimate, known: KnownMass, gravity: float
+) -> Calibration:
+    """Torque constants of all joints from two settled periods.
+
+    `first`: the estimate of `without` under the supposed torque constants, its model used for both. Raises
+    ModelError when the periods differ in joints, ConvergenceError.
+    """
+    if without.joints != with_mass.joints:
+        raise ModelError(f"one run has {without.joints} joints and the other {with_mass.joints}: they must agree")
+    problem = _Problem((without, with_mass), first, known.change(gravity, without.joints))
+    minimum = minimise(problem.residual, problem.start(), FINE)
+    x, joints = minimum.x, without.joints
+    samples = sum(int(period.valid.sum()) for period in problem.periods)
+    variance = minimum.cost / max(1, samples - x.size)
+    norm = np.sqrt(np.maximum(np.diag(minimum.normal), 1e-300))
+    covariance = variance * np.linalg.pinv(minimum.normal / np.outer(norm, norm), rcond=1e-13, hermitian=True)
+    covariance /= np.outer(norm, norm)
+    factor = np.exp(x[:joints])
+    slope = problem.coordinates.slopes(x[joints : joints + problem.size])
+    of_values = slope @ covariance[joints : joints + problem.size, joints : joints + problem.size] @ slope.T
+    residual = problem.residual(x).reshape(-1)
+    steps, taken = [], 0
+    for period in problem.periods:
+        count = period.position.size
+        rows = residual[taken : taken + count].reshape(joints, -1) * period.noise[:, None]
+        steps.append(np.sqrt(np.sum(rows**2, axis=1) / period.valid.sum(axis=1)) / period.position_step)
+        taken += count
+    return Calibration(
+        factor,
+        factor * np.sqrt(np.diag(covariance)[:joints]),
+        first.model.names,
+        problem.coordinates.values(x[joints : joints + problem.size]),
+        np.sqrt(np.diag(of_values)),
+        np.stack(steps),
+        minimum.cost / samples,
+    )
+
+
+class _Problem:
+    """Residuals of both periods: log factors, the parameters' coordinates, the two starting states."""
+
+    def __init__(self, periods: tuple[SettledPeriod, SettledPeriod], first: Estimate, change: dict[str, float]) -> None:
+        self.periods = periods
+        self.size = len(first.names)
+        self._first = first
+        self._change = np.array([change.get(name, 0.0) for name in first.names])
+        scales = np.maximum(np.abs(first.value), 1e-6)
+        either = [name.startswith(("gravity", "offset", "delay")) for name in first.names]
+        scales[either] = np.maximum(scales[either], 1e-3)
+        self.coordinates = Coordinates(first.names, scales, WIDTH_FLOOR)
+        velocity = float(np.sqrt(np.mean(np.gradient(first.position, 1.0 / periods[0].rate, axis=1) ** 2)))
+        self._state_scale = np.repeat([ANGLE_SCALE, velocity], periods[0].joints)
+
+    def start(self) -> Array:
+        """From the first run's estimate; the second begins where it was measured to."""
+        joints, rate = self.periods[0].joints, self.periods[1].rate
+        filled = self.periods[1].filled()
+        value = self._first.value.copy()
+        for i, name in enumerate(self._first.names):
+            if name.startswith("coulomb_width"):
+                value[i] = STARTING_WIDTH
+        speed = (filled[:, 2] - filled[:, -2]) * rate / 4.0
+        return np.concatenate(
+            (
+                np.zeros(joints),
+                self.coordinates.coordinates(value),
+                self._first.start.reshape(-1) / self._state_scale,
+                np.concatenate((filled[:, 0], speed)) / self._state_scale,
+            )
+        )
+
+    def residual(self, x: Array) -> Array:
+        """Simulated less measured positions of both periods in units of their noise."""
+        joints = self.periods[0].joints
+        factor = np.exp(x[:joints])
+        value = self.coordinates.values(x[joints : joints + self.size])
+        rows = []
+        for run, period in enumerate(self.periods):
+            at = joints + self.size + 2 * joints * run
+            state = (x[at : at + 2 * joints] * self._state_scale).reshape(2, joints)
+            named = dict(zip(self._first.names, (value + run * self._change).tolist(), strict=True))
+            rows.append(_misfit(period, Physics.of(named), state, factor))
+        return np.concatenate(rows)
+
+
+def _misfit(period: SettledPeriod, physics: Physics, state: Array, factor: Array) -> Array:
+    steps = steps_per_sample(period.rate)
+    torque = motor_torque(
+        period.torque * factor[:, None],
+        period.rate,
+        period.command_to_sample,
+        steps,
+        delay=physics.delay,
+        lag=physics.lag,
+    )
+    position, _ = simulate(physics, state, torque, 1.0 / (period.rate * steps))
+    difference = np.where(period.valid, position - period.position, 0.0)
+    return np.asarray((difference / period.noise[:, None]).reshape(-1))

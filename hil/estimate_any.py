@@ -1,0 +1,92 @@
+"""Estimates from recordings that hold no settled period: CSV files, and runs that were cut short."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimator.idim import fit_inverse_dynamics
+from estimator.model import Model
+from estimator.recording import Recording
+from estimator.shooting import ShootingEstimate, estimate_by_shooting
+from hil.config import ModelConfig
+from hil.csv_config import load_csv_config
+from hil.csv_recording import read_csv
+from hil.physical import physical_entries
+from hil.recording import load_samples
+from hil.run_folder import RunFolder
+
+SCHEMA = 1
+START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
+START_WIDTH = 0.05  # rad/s
+FEWEST_ROWS = 32
+
+
+def estimate_csv(paths: Sequence[Path], config_path: Path) -> dict[str, Any]:
+    """The result of one or more CSV files of the same arm, recorded apart. Raises HilError, EstimationError."""
+    config = load_csv_config(config_path)
+    columns = config.columns
+    recordings = [read_csv(path, columns) for path in paths]
+    result = _estimate(recordings, config.model, columns.segment, columns.zeros_unknown and config.arm.gravity > 0.0)
+    result["config"] = str(config_path)
+    result["recordings"] = [str(path) for path in paths]
+    if config.known is not None:
+        result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
+    return result
+
+
+def estimate_unsettled(run: RunFolder) -> dict[str, Any]:
+    """The result of all samples of a run whose motion never became periodic, or that was stopped before it did."""
+    config, facts = run.load_config(), run.load_facts()
+    samples = load_samples(run.samples_path, len(config.joints))
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    recording = Recording(
+        samples["time_before_write"] - samples["time_before_write"][:1],
+        (samples["goal_current"] * constants).T,
+        samples["position"].T.copy(),
+        np.array(facts.position_step),
+        between="held",
+        command_to_sample=facts.command_to_sample,
+    )
+    result = _estimate([recording], config.model, 1.0, zeros=False)
+    result["config"] = facts.config
+    run.write_result(result)
+    return result
+
+
+def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool) -> dict[str, Any]:
+    began = time.perf_counter()
+    model = Model(recordings[0].joints, wanted.friction, wanted.drive)
+    start = fit_inverse_dynamics(recordings, START_CUTOFF, START_WIDTH).value
+    estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
+    return make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
+
+
+def make_shooting_result(estimate: ShootingEstimate, recordings: Sequence[Recording], seconds: float) -> dict[str, Any]:
+    """result.json of multiple shooting: as hil.result has it, without what only a settled period has."""
+    base = len(estimate.model.base_names)
+    entries = [
+        (name, {"value": float(value), "std": float(std), "unit": unit})
+        for name, value, std, unit in zip(estimate.names, estimate.value, estimate.std, estimate.units, strict=True)
+    ]
+    steps = np.max([recording.position_step for recording in recordings], axis=0)
+    return {
+        "schema": SCHEMA,
+        "method": f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
+        f"starting states; {estimate.model.friction} friction, {estimate.model.drive} drive; standard errors robust "
+        "against model error",
+        "joints": estimate.model.joints,
+        "parameters": dict(entries[:base]),
+        "extra": dict(entries[base:]),
+        "covariance": {"names": list(estimate.names), "matrix": estimate.covariance.tolist()},
+        "fit": {
+            "residual_rms_rad": estimate.residual_rms.tolist(),
+            "residual_rms_ticks": (estimate.residual_rms / steps).tolist(),
+            "samples": int(sum(recording.time.size for recording in recordings)),
+            "segments": estimate.segments,
+        },
+        "validation": {},
+        "timing": {"estimation_seconds": seconds},
+    }
