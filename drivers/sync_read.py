@@ -81,23 +81,29 @@ class SyncRead:
         length = span.size + 11  # header, ID, LEN, INST, ERR, data, CRC
         self.reply_size = length * len(self._ids)
         behind_id = (span.size + 4).to_bytes(2, "little") + bytes((Instruction.STATUS,))
-        # All answers in one unpacking: per servo its ERR, its values and its CRC.
-        self._whole = Struct("<" + f"8xB{span.format}H" * len(self._ids))
-        width = len(span.registers) + 2
+        # All answers in one unpacking: per servo the eight bytes up to INST as one number, ERR, the values, the CRC.
+        self._unpack = Struct("<" + f"QB{span.format}H" * len(self._ids)).unpack
+        width = len(span.registers) + 3
         self._parts = [
-            (HEADER + bytes((servo_id,)) + behind_id, n * length, (n + 1) * length - 2, n * width, (n + 1) * width - 1)
+            (
+                int.from_bytes(HEADER + bytes((servo_id,)) + behind_id, "little"),
+                slice(n * length, (n + 1) * length - 2),
+                n * width,
+                slice(n * width + 1, (n + 1) * width - 1),
+                (n + 1) * width - 1,
+            )
             for n, servo_id in enumerate(self._ids)
         ]
 
     def unpack(self, received: bytes) -> list[Answer] | None:
         if len(received) != self.reply_size:
             return None
-        fields = self._whole.unpack(received)
+        fields = self._unpack(received)
         answers: list[Answer] = []
-        for front, start, end, first, check in self._parts:
-            if fields[check] != _crc(received[start:end]) or not received.startswith(front, start):
+        for front, packet, first, answer, check in self._parts:
+            if fields[first] != front or fields[check] != _crc(received[packet]):
                 return None
-            answers.append(fields[first:check])
+            answers.append(fields[answer])
         return answers
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
