@@ -17,9 +17,10 @@ from drivers.packet import BROADCAST_ID, Framer, Instruction, encode
 from fakes.bus import FakeBus
 from fakes.clock import VirtualClock
 from fakes.registers import load_model
-from fakes.servo import BOOT_S, Servo
+from fakes.servo import Servo
 
 ASK_EVERY = 10
+PAUSE_S = 3.0  # then boots are over, and the longest reply at the slowest baud
 IDS = (1, 2, 7, BROADCAST_ID)
 
 
@@ -90,7 +91,7 @@ class NoiseRun:
             if servo.id == self.servos[2 - number].id:
                 servo.memory.set("ID", number)
                 servo.write(*_LED)
-        self.clock.wait_until(self.clock.now() + BOOT_S + 0.02)  # a slow packet begun, or a boot, is over
+        self.clock.wait_until(self.clock.now() + PAUSE_S)
         self.bus.read(100_000, 0.0)
         servo = self.random.choice(self.servos)
         self.bus.baud = servo.baud
