@@ -59,6 +59,8 @@ class FakeBus:
         self.pulls = 0
         """How often the adapter's cable was pulled. What was open then stays lost."""
         self.cable_is_out = False
+        self.pulled_at = -math.inf
+        """When the cable was pulled last."""
         self._servos = tuple(servos)
         self._supply = supply
         self._wire = Wire(baud, adapter_latency_us * 1e-6)
@@ -182,7 +184,8 @@ class FakeBus:
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:
             self.advance(now)
-            self._change_faults(now)
+            if now - self._origin >= self.faults.next_change:  # the bus was ahead of the clock already
+                self._change_faults(now)
 
     def advance(self, until: float) -> None:
         """Move plant, servos and faults on to `until`; nothing when that is past."""
@@ -246,7 +249,8 @@ class FakeBus:
         if fault.kind == FaultKind.CABLE_PULLED:
             self.cable_is_out = True
             self.pulls += 1
-            self._wire.cut(self._origin + fault.at)
+            self.pulled_at = max(self._origin + fault.at, self.clock.now())
+            self._wire.cut(self.pulled_at)
         else:
             begin(fault, self._servos, self.plant, self._now)
 

@@ -113,7 +113,7 @@ class FakeSerial(SerialBase):
             )
         taken = bus.read(size, math.inf if timeout is None else timeout)
         if len(taken) < size and self._pulls != bus.pulls:
-            raise _Unplugged
+            raise self._unplugged(bus)
         return taken
 
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
@@ -147,8 +147,13 @@ class FakeSerial(SerialBase):
             raise serial.PortNotOpenError
         self._bus.notice_faults()
         if self._pulls != self._bus.pulls:
-            raise _Unplugged
+            raise self._unplugged(self._bus)
         return self._bus
+
+    def _unplugged(self, bus: FakeBus) -> _Unplugged:
+        """The error of a pulled cable, raised when it is pulled: the bus may know of it a packet's length ahead."""
+        self.clock.wait_until(bus.pulled_at)
+        return _Unplugged()
 
     def _update_rts_state(self) -> None:
         """No such line on this port; pyserial calls this when the setting changes."""

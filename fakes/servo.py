@@ -95,6 +95,7 @@ class Servo:
         self._input_voltage_v = model.nominal_voltage_v if input_voltage_v is None else input_voltage_v
         self._sag_v = 0.0
         self._dip_v = 0.0
+        self._set_baud = baud
         self._registered: bytes | None = None
         self._backup = Backup()
         self._angle: Callable[[], float] = lambda: 0.0
@@ -416,8 +417,8 @@ class Servo:
         shadow = memory.get("Secondary(Shadow) ID", _NO_SHADOW_ID)
         self.shadow_id = shadow if shadow < _NO_SHADOW_ID else None
         """A second ID whose instructions it executes and does not answer; None when it has none."""
-        baud = memory.get("Baud Rate")
-        self.baud = BAUD_RATES[baud] if baud < len(BAUD_RATES) else BAUD_RATES[1]
+        baud = memory.get("Baud Rate", BAUD_RATES.index(self._set_baud))
+        self.baud = BAUD_RATES[baud] if baud < len(BAUD_RATES) else self._set_baud
         self.return_delay_s = 2e-6 * memory.get("Return Delay Time")
         self.status_return_level = memory.get("Status Return Level", 2)
         self.alert = ALERT if memory.get("Hardware Error Status") else 0

@@ -29,4 +29,5 @@ class Supply(BaseModel):
         for servo in servos:
             servo.sag_v = self.resistance_ohm * drawn
             if servo.supply_v < self.brownout_v and now >= servo.ready_at:
+                servo.sag_v = 0.0  # nothing draws any more when it boots
                 servo.reboot(now)

@@ -45,7 +45,7 @@ class Trajectory:
             self.velocity = before + max(-hardest, min(hardest, change))
         self.acceleration = self.velocity - before
         self.position += self.velocity
-        if abs(goal - self.position) < 1e-3 and abs(self.velocity) <= max(hardest, 1e-3):
+        if abs(goal - self.position) < 1e-3 and (not hardest or abs(before) <= hardest):
             self.position, self.velocity, self.acceleration = goal, 0.0, 0.0
 
 

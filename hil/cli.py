@@ -186,6 +186,30 @@ app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.
 app.command("dry-run", epilog="Example: hil dry-run configs/first_time.toml --picture dry_run.png")(cli_dry_run.dry_run)
 
 
+@app.command(epilog="Example: hil fake configs/fake_two_link.toml --pty --link /tmp/arm")
+def fake(
+    config: ConfigPath,
+    pty: Annotated[bool, typer.Option("--pty", help="Serve it on a terminal device until Ctrl-C or SIGTERM.")] = False,
+    link: Annotated[Path | None, typer.Option(metavar="PATH", help="Symbolic link to that device.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND[:KEY=VALUE,...]", help="Let this go wrong; may be repeated. See --list-faults."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of noise and faults, instead of the file's.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No status line.")] = False,
+    list_faults: Annotated[bool, typer.Option("--list-faults", help="Print the kinds of faults and exit.")] = False,
+) -> None:
+    """Serve the fake arm of a file to any program, in real time; without --pty, say what it is made of."""
+    from hil import fake_command
+
+    if list_faults:
+        fake_command.list_faults()
+    elif pty:
+        fake_command.serve_fake(config, link, fault or [], seed, quiet)
+    else:
+        fake_command.describe_fake(config, fault or [], seed)
+
+
 def main() -> NoReturn:
     """Run the command line; a foreseen error becomes its message on standard error and its exit code."""
     try:

@@ -1,0 +1,125 @@
+"""Random bytes and mutated packets on the fake bus: nothing may raise or hang, and the next good packet is answered.
+
+    python benchmarks/fake_noise.py [--json] [--packets N] [--seed N]
+
+After every tenth piece of noise, and a pause that ends what it began, a servo is pinged wherever the noise may have
+set its ID and baud rate to.
+"""
+
+import argparse
+import json
+import time
+from random import Random
+
+from machine import machine
+
+from drivers.packet import BROADCAST_ID, Framer, Instruction, encode
+from fakes.bus import FakeBus
+from fakes.clock import VirtualClock
+from fakes.registers import load_model
+from fakes.servo import BOOT_S, Servo
+
+ASK_EVERY = 10
+IDS = (1, 2, 7, BROADCAST_ID)
+
+
+class Still:
+    """Two joints that never move."""
+
+    joints = 2
+    position = velocity = current = (0.0, 0.0)
+
+    def advance(self, until: float, current: object) -> None:
+        pass
+
+
+class NoiseRun:
+    """A bus of two servos under noise; `asked` and `answered` count the pings between."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = Random(seed)
+        self.clock = VirtualClock()
+        self.servos = [Servo(load_model(name), number) for number, name in ((1, "XM430-W350"), (2, "XL330-M288"))]
+        self.bus = FakeBus(self.servos, Still(), self.clock)
+        self.sent = self.asked = self.answered = 0
+
+    def run(self, packets: int) -> None:
+        """Send so many pieces of noise."""
+        while self.sent < packets:
+            self.bus.write(self._piece())
+            self.bus.read(4096, 0.0005)
+            self.sent += 1
+            if self.sent % ASK_EVERY == 0:
+                self._ask()
+
+    def _piece(self) -> bytes:
+        random = self.random
+        kind = random.randrange(4)
+        if kind == 0:
+            return random.randbytes(random.randrange(40))
+        if kind == 1:  # rich in what headers are made of
+            return bytes(random.choices((0xFF, 0xFD, 0x00, 0x01, 0xFE, 0x03, 0x55, 0x82), k=random.randrange(40)))
+        instruction = random.choice(list(Instruction)) if random.random() < 0.8 else random.randrange(256)
+        body = random.randbytes(random.randrange(20))
+        if random.random() < 0.5:
+            body = random.randrange(700).to_bytes(2, "little") + body
+        packet = bytearray(encode(random.choice(IDS), instruction, body))
+        if kind == 3:
+            for _ in range(random.randrange(1, 4)):
+                self._mutate(packet)
+        return bytes(packet)
+
+    def _mutate(self, packet: bytearray) -> None:
+        random = self.random
+        if not packet:
+            return
+        at = random.randrange(len(packet))
+        match random.randrange(4):
+            case 0:
+                packet[at] ^= 1 << random.randrange(8)
+            case 1:
+                del packet[at]
+            case 2:
+                packet.insert(at, random.randrange(256))
+            case 3:
+                del packet[at + 1 :]
+
+    def _ask(self) -> None:
+        """Ping a servo where it is now. Two on one ID and baud cannot answer: they are told apart first."""
+        for number, servo in enumerate(self.servos, start=1):
+            if servo.id == self.servos[2 - number].id:
+                servo.memory.set("ID", number)
+                servo.write(*_LED)
+        self.clock.wait_until(self.clock.now() + BOOT_S + 0.02)  # a slow packet begun, or a boot, is over
+        self.bus.read(100_000, 0.0)
+        servo = self.random.choice(self.servos)
+        self.bus.baud = servo.baud
+        self.bus.write(encode(servo.id, Instruction.PING))
+        replies = list(Framer().feed(self.bus.read(1000, 0.1)))
+        self.asked += 1
+        self.answered += [reply.id for reply in replies] == [servo.id]
+
+
+_LED = (65, b"\x00")  # any write makes a servo take note of what its table says
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--packets", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    started = time.perf_counter()
+    noise = NoiseRun(options.seed)
+    noise.run(options.packets)
+    seconds = time.perf_counter() - started
+    figures = {"packets": noise.sent, "asked": noise.asked, "answered": noise.answered, "seconds": round(seconds, 1)}
+    if options.json:
+        print(json.dumps(figures))
+        return
+    print(machine())
+    print(f"{noise.sent} pieces of noise in {seconds:.0f} s, no exception; {noise.answered} of {noise.asked} answered")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+"""A fake arm behind a real terminal device, in real time: for any program in any language.
+
+The host opens `path` as it would open a serial adapter. Its baud rate is the one the host sets on the terminal. A
+pulled cable hangs the terminal up; put back it is another terminal, to which the link points again.
+"""
+
+import ctypes
+import fcntl
+import os
+import pty
+import select
+import struct
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from threading import Lock
+from typing import NamedTuple
+
+from fakes.bus import FakeBus
+from fakes.description import FakeArm, make_bus
+
+OVERRUN_S = 1e-3
+"""A reply handed over later than this after it was due counts as a real-time overrun [s]."""
+
+LONGEST_SLEEP_S = 0.05
+"""How long the server waits at most before it looks at faults, watchdogs and its own end [s]."""
+
+_TCGETS2 = 0x802C542A
+_PR_SET_TIMERSLACK = 29
+_CHUNK = 4096
+
+
+class LinkError(OSError):
+    """The link path cannot be used. The message says why and what to do."""
+
+
+class Clock:
+    """The machine's monotonic clock. Nothing here waits on it but the server itself."""
+
+    def now(self) -> float:
+        return time.monotonic()
+
+    def wait_until(self, deadline: float) -> None:
+        """Return at once: bytes are handed over when they are due."""
+
+
+class Counts(NamedTuple):
+    """What a server has done so far."""
+
+    packets: int
+    damaged: int
+    collisions: int
+    overruns: int
+    faults: int
+    late_max_s: float
+
+
+class PtyServer:
+    """Serves one fake arm on a pseudo terminal. `serve` runs until `stop` is called, from any thread or a signal.
+
+    link: a symbolic link to be made to the terminal; LinkError when there is something already.
+    `bus` may be looked at from another thread while `lock` is held.
+    """
+
+    def __init__(self, description: FakeArm, link: Path | None = None) -> None:
+        self.lock = Lock()
+        self.bus: FakeBus = make_bus(description, Clock())
+        self.path = ""
+        self._link = link
+        self._master = self._slave = -1
+        self._wake_read, self._wake_write = os.pipe()
+        self._stopped = False
+        self._overruns = 0
+        self._late_max_s = 0.0
+        if link is not None and (link.exists() or link.is_symlink()):
+            self._close_wake()
+            raise LinkError(f"{link} exists already; remove it or choose another --link")
+        self._plug_in()
+
+    def __enter__(self) -> "PtyServer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def counts(self) -> Counts:
+        bus = self.bus
+        return Counts(
+            bus.packets,
+            bus.damaged_packets,
+            bus.collisions,
+            self._overruns,
+            len(bus.faults.happened),
+            self._late_max_s,
+        )
+
+    def serve(self, watch: Callable[[Counts], None] | None = None, watch_every_s: float = 0.5) -> None:
+        """Answer until stopped. `watch` is called now and then with the counts."""
+        _wake_up_in_time()
+        now = time.monotonic
+        next_watch = now() + watch_every_s
+        while not self._stopped:
+            due = self.bus.next_reply_by
+            wait = min(due - now(), LONGEST_SLEEP_S)
+            readable = [self._wake_read] if self._master < 0 else [self._master, self._wake_read]
+            ready, _, _ = select.select(readable, [], [], max(0.0, wait))
+            with self.lock:
+                if self._master in ready:
+                    self._take()
+                if now() >= due:
+                    self._hand_over(due)
+                elif not ready:
+                    self.bus.advance(now())
+                self._mind_the_cable()
+            if watch is not None and now() >= next_watch:
+                watch(self.counts)
+                next_watch = now() + watch_every_s
+
+    def stop(self) -> None:
+        """Let `serve` return. Safe in a signal handler."""
+        self._stopped = True
+        os.write(self._wake_write, b"x")
+
+    def close(self) -> None:
+        """Take the terminal and the link away. May be called twice."""
+        self._unplug()
+        self._close_wake()
+
+    def _take(self) -> None:
+        try:
+            data = os.read(self._master, _CHUNK)
+        except OSError:
+            return  # the terminal is being hung up
+        self.bus.baud = _baud_of(self._master) or self.bus.baud
+        self.bus.write(data)
+
+    def _hand_over(self, due: float) -> None:
+        data = self.bus.read(self.bus.in_waiting, 0.0)
+        late = time.monotonic() - due
+        self._late_max_s = max(self._late_max_s, late)
+        self._overruns += late > OVERRUN_S
+        if data and self._master >= 0:
+            try:
+                os.write(self._master, data)
+            except BlockingIOError:
+                self._overruns += 1  # nobody reads: lost, as in a full adapter
+
+    def _mind_the_cable(self) -> None:
+        self.bus.notice_faults()
+        if self.bus.cable_is_out and self._master >= 0:
+            self._unplug()
+        elif not self.bus.cable_is_out and self._master < 0:
+            self._plug_in()
+
+    def _plug_in(self) -> None:
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)  # held open, so that the terminal outlives every host that closes it
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+            try:
+                self._link.symlink_to(self.path)
+            except OSError as error:
+                self.close()
+                raise LinkError(f"{self._link}: cannot be made: {error.strerror}") from error
+
+    def _unplug(self) -> None:
+        for descriptor in (self._master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._master = self._slave = -1
+        if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self.path:
+            self._link.unlink()
+
+    def _close_wake(self) -> None:
+        for descriptor in (self._wake_read, self._wake_write):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._wake_read = self._wake_write = -1
+
+
+def _baud_of(master: int) -> int:
+    """The baud rate that the host has set on the other end; 0 when it cannot be told.
+
+    termios gives standard rates only; this is Linux's own call, which knows 4.5 M too.
+    """
+    try:
+        settings = fcntl.ioctl(master, _TCGETS2, bytes(44))
+    except OSError:
+        return 0
+    return int(struct.unpack_from("<I", settings, 40)[0])
+
+
+def _wake_up_in_time() -> None:
+    """Ask Linux for timers to the microsecond; without it each wait ends some 50 us late."""
+    try:
+        ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    except (OSError, AttributeError):
+        return

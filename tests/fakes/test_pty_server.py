@@ -1,0 +1,196 @@
+"""The fake arm on a terminal: baud, link, cable, clocks; `hil fake` and what it says when it cannot."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Thread
+
+import pytest
+import serial
+
+from drivers.packet import BROADCAST_ID, Instruction, encode, encode_status
+from fakes.description import load_fake
+from fakes.faults import Fault
+from fakes.pty_server import LinkError, PtyServer
+from hil.cli import main
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "configs" / "fake_two_link.toml"
+PING = encode(1, Instruction.PING)
+PONG = encode_status(1, 0, b"\xfc\x03\x30")
+
+
+@pytest.fixture
+def serve() -> Callable[..., PtyServer]:
+    """Starts servers in threads; ends them after the test."""
+    running: list[tuple[PtyServer, Thread]] = []
+
+    def start(*faults: Fault, link: Path | None = None) -> PtyServer:
+        server = PtyServer(load_fake(CONFIG).model_copy(update={"faults": faults}), link)
+        thread = Thread(target=server.serve, daemon=True)
+        thread.start()
+        running.append((server, thread))
+        return server
+
+    yield start  # type: ignore[misc]
+    for server, thread in running:
+        server.stop()
+        thread.join(5.0)
+        assert not thread.is_alive()
+        server.close()
+
+
+def opened(path: str, baud: int = 1_000_000) -> serial.Serial:
+    return serial.Serial(path, baud, timeout=1.0)
+
+
+Serve = Callable[..., PtyServer]
+
+
+def test_a_real_terminal_answers(serve: Serve) -> None:
+    server = serve()
+    with opened(server.path) as port:
+        for _ in range(50):
+            port.write(PING)
+            assert port.read(14) == PONG
+        port.write(encode(BROADCAST_ID, Instruction.SYNC_READ, b"\x7e\0\x0a\0\x01\x02"))
+        assert len(port.read(42)) == 42
+    with opened(server.path) as port:  # and again, for the next program
+        port.write(PING)
+        assert port.read(14) == PONG
+    assert server.counts.packets == 52
+
+
+def test_the_terminals_baud_is_the_buss(serve: Serve) -> None:
+    server = serve()
+    with opened(server.path, 4_500_000) as port:
+        port.timeout = 0.05
+        port.write(PING)
+        assert port.read(14) == b""
+        assert server.bus.baud == 4_500_000
+        port.baudrate = 1_000_000
+        port.timeout = 1.0
+        port.write(PING)
+        assert port.read(14) == PONG
+
+
+def test_time_passes_by_itself(serve: Serve) -> None:
+    server = serve()
+    with opened(server.path) as port:
+        for body in (b"\x0b\0\0", b"\x66\0\0\0", b"\x62\0\x03", b"\x40\0\x01", b"\x66\0\x32\0"):
+            port.write(encode(1, Instruction.WRITE, body))
+            assert port.read(11)[8] == 0
+    deadline = time.monotonic() + 5.0
+    while time.monotonic() < deadline:
+        with server.lock:
+            if server.bus.servos[1].watchdog_tripped:
+                break
+        time.sleep(0.02)
+    with server.lock:
+        assert server.bus.servos[1].watchdog_tripped
+        assert server.bus.plant.position[0] > -1.5707963  # it was pushed before
+
+
+def test_link_is_made_and_taken_away(serve: Serve, tmp_path: Path) -> None:
+    link = tmp_path / "arm"
+    server = PtyServer(load_fake(CONFIG), link)
+    assert str(link.readlink()) == server.path
+    server.close()
+    server.close()
+    assert not link.is_symlink()
+
+
+def test_a_link_that_exists_or_cannot_be_made(tmp_path: Path) -> None:
+    taken = tmp_path / "arm"
+    taken.write_text("mine")
+    descriptors = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    with pytest.raises(LinkError, match="arm exists already; remove it or choose another"):
+        PtyServer(load_fake(CONFIG), taken)
+    with pytest.raises(LinkError, match="cannot be made: No such file or directory"):
+        PtyServer(load_fake(CONFIG), tmp_path / "nowhere" / "arm")
+    assert taken.read_text() == "mine"
+    assert len(os.listdir("/proc/self/fd")) == descriptors  # noqa: PTH208
+
+
+def test_a_pulled_cable_hangs_up_and_comes_back(serve: Serve, tmp_path: Path) -> None:
+    link = tmp_path / "arm"
+    server = serve(Fault(kind="cable_pulled", at=0.3, duration=0.5), link=link)
+    port = opened(str(link))
+    with pytest.raises((OSError, serial.SerialException)):
+        for _ in range(200):
+            port.write(PING)
+            port.read(14)
+            time.sleep(0.01)
+    port.close()
+    assert not link.exists()
+    deadline = time.monotonic() + 5.0
+    while not link.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    with opened(str(link)) as port:
+        port.write(PING)
+        assert port.read(14) == PONG
+    assert server.bus.pulls == 1
+
+
+# hil fake
+
+
+def exit_of(*arguments: str) -> int:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr(sys, "argv", ["hil", "fake", *arguments])
+        main()
+    return int(left.value.code or 0)
+
+
+def test_without_pty_it_says_what_the_arm_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_of(str(CONFIG), "--fault", "lost_reply:servo=2,probability=0.1", "--seed", "7") == 0
+    said = capsys.readouterr().out
+    assert "ID 1: XM430-W350, firmware 48, 1000000 baud" in said
+    assert "seed 7" in said
+    assert "fault: lost_reply at 0 s for inf s, probability 0.1" in said
+
+
+def test_list_of_faults(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_of(str(CONFIG), "--list-faults") == 0
+    assert "encoder_jump" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nowhere.toml", "--pty"), "nowhere.toml: cannot be read"),
+        ((str(CONFIG), "--pty", "--link", str(CONFIG)), "exists already"),
+        ((str(CONFIG), "--pty", "--fault", "gone"), "kinds: lost_reply"),
+        ((str(CONFIG), "--pty", "--fault", "overload:servo=9"), "servo = 9: the IDs in"),
+    ],
+)
+def test_wrong_input_is_one_message(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], said: str) -> None:
+    assert exit_of(*arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("hil: ")
+    assert said in captured.err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_a_signal_and_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
+    link = tmp_path / "arm"
+    command = [sys.executable, "-m", "hil", "fake", str(CONFIG), "--pty", "--link", str(link)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().decode().strip() == str(link)
+        with opened(str(link)) as port:
+            port.write(PING)
+            assert port.read(14) == PONG
+        process.send_signal(number)
+        _, err = process.communicate(timeout=10.0)
+    assert process.returncode == 0
+    assert err.decode().startswith("1 packets, 0 damaged, 0 collisions, 0 faults")
+    assert not link.is_symlink()

@@ -1,0 +1,52 @@
+"""The plugin as somebody else's tests use it: in another pytest, with nothing but the installed package."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+THEIR_TESTS = f"""
+from drivers.packet import encode, encode_status
+from fakes.faults import Fault
+import serial
+
+PONG = encode_status(1, 0, b"\\xfc\\x03\\x30")
+
+
+def test_default_arm(fake_arm):
+    port = fake_arm()
+    port.write(encode(1, 1))
+    assert port.read(14) == PONG
+    assert not port.bus.servos[2].torque_enabled
+
+
+def test_file_seed_and_faults(fake_arm):
+    port = fake_arm({str(ROOT / "configs" / "fake_two_link.toml")!r}, seed=3, faults=[Fault(kind="lost_reply")])
+    port.write(encode(1, 1))
+    assert port.read(14) == b""
+
+
+def test_terminal(fake_pty):
+    arm = fake_pty()
+    with serial.Serial(arm.path, 1_000_000, timeout=1.0) as port:
+        port.write(encode(1, 1))
+        assert port.read(14) == PONG
+    with arm.lock:
+        assert arm.bus.servos[1].hardware_error == 0
+"""
+
+
+def test_fixtures_for_other_peoples_tests(tmp_path: Path) -> None:
+    (tmp_path / "test_theirs.py").write_text(THEIR_TESTS, encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "fakes.pytest_plugin", "."]
+    done = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "3 passed" in done.stdout, done.stdout + done.stderr
