@@ -69,6 +69,8 @@ class Problem:
         """Simulated positions (joints, samples) [rad]."""
         period = self.period
         physics = self.physics(x)
+        if period.stabiliser is not None:
+            return period.stabiliser.positions(physics, self.start(x), period.rate, period.command_to_sample)
         steps = steps_per_sample(period.rate)
         torque = motor_torque(
             period.torque,

@@ -10,8 +10,8 @@ from estimator.optimal_excitation import Limits, Problem, design_optimal, smooth
 from estimator.physics import Physics
 from hil.amplitude import with_peaks
 from hil.config import Config
-from hil.dry_run import feedback_of
 from hil.plan import Plan, Segment, period_current
+from hil.stabiliser import feedback_of
 
 WAVES = 6
 """Seeds tried for each multisine: how evenly an arm swings to both sides depends on the phases."""
