@@ -2,8 +2,8 @@
 
     python benchmarks/faults.py [--json] [--seeds N]
 
-All in virtual time on the realistic fake arm with position limits 0.15 rad beyond its undisturbed motion. After each
-run the emulated servos themselves are asked. An injection is
+All in virtual time on the realistic fake arm with position limits 0.15 rad and velocity limits 30 % beyond its
+undisturbed motion. After each run the emulated servos themselves are asked. An injection is
 
 unsafe          torque neither off nor stopped by the watchdog, or current still flowing 100 ms after the fault (after
                 the guard's last look where no single sample shows it: a joint held, a sign turned, lost packets)
@@ -31,11 +31,9 @@ import serial
 
 from fakes.faults import Fault, FaultKind
 from hil.config import Config, parse_config
-from hil.dry_run import predict
 from hil.ensemble import prior_ensemble
 from hil.errors import HilError
 from hil.experiment import run_experiment
-from hil.plan import make_plan
 from hil.recording import Phase, load_samples
 from hil.run_folder import RunFolder
 from hil.stopping import stopping_distance
@@ -115,28 +113,36 @@ class Campaign:
 
 
 def prepare() -> Campaign:
-    """Run once undisturbed: the timetable, limits close to the motion, the stopping distances from a dry run."""
-    config = short_config([-4.2, 1.06], [-3.1, 3.1])
+    """Run once undisturbed: the timetable, limits close to the motion, the stopping distances by simulation.
+
+    They are from a limit outwards, at the sum of the joints' velocity limits: a joint that jams hands its speed on.
+    """
+    config = short_config(CONFIG.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
         _, _, samples, _ = play(config, Path(folder), lambda port, spy: None)
-    low, high = samples["position"].min(axis=0) - 0.15, samples["position"].max(axis=0) + 0.15
-    config = short_config([float(low[0]), float(high[0])], [float(low[1]), float(high[1])])
+    config = short_config(_with_close_limits(CONFIG.read_text(encoding="utf-8"), samples))
     with tempfile.TemporaryDirectory() as folder:
         error, port, samples, _ = play(config, Path(folder), lambda port, spy: None)
     assert error is None, error
-    ensemble = prior_ensemble(config, 48)
-    foreseen = predict(config, make_plan(config), ensemble)
-    reached = np.minimum(foreseen.quantile[2], foreseen.limits[2])
-    way = stopping_distance(config, ensemble, reached, foreseen.quantile[3]).worst
+    fastest = np.full(2, sum(joint.velocity_limit for joint in config.joints))
+    most = np.abs(samples["goal_current"]).max(axis=0)
+    way = stopping_distance(config, prior_ensemble(config, 48), fastest, most).worst
     return Campaign(config, _windows(samples, port.clock.now()), way)
 
 
-def short_config(first: Sequence[float], second: Sequence[float]) -> Config:
-    """A realistic arm with an experiment of some four seconds and these position limits [rad]."""
-    text = CONFIG.read_text(encoding="utf-8")
+def _with_close_limits(text: str, samples: np.ndarray) -> str:
+    """Position limits 0.15 rad, velocity limits 30 % beyond the undisturbed motion."""
+    low, high = samples["position"].min(axis=0) - 0.15, samples["position"].max(axis=0) + 0.15
+    fastest = 1.3 * np.abs(samples["velocity"]).max(axis=0)
+    for joint, (limit, velocity) in enumerate((("[-4.2, 1.06]", "15.0"), ("[-3.1, 3.1]", "20.0"))):
+        text = text.replace(limit, f"[{low[joint]:.3f}, {high[joint]:.3f}]", 1)
+        text = text.replace(f"velocity_limit = {velocity}", f"velocity_limit = {fastest[joint]:.2f}", 1)
+    return text
+
+
+def short_config(text: str) -> Config:
+    """The arm of this TOML text with an experiment of some four seconds."""
     for old, new in (
-        ("[-4.2, 1.06]", repr(list(first))),
-        ("[-3.1, 3.1]", repr(list(second))),
         ("rate = 400.0 ", "rate = 200.0 "),
         ("period = 10.0 ", "period = 1.0 "),
         ("band = [0.1, 5.0]", "band = [1.0, 6.0]"),

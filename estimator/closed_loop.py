@@ -17,6 +17,8 @@ from estimator.arrays import Array
 from estimator.physics import Physics
 from estimator.simulation import GAMMA, _forces, _pieces, steps_per_sample
 
+SETTLING_PERIODS = 4
+
 
 @dataclass(frozen=True)
 class Feedback:
@@ -50,6 +52,41 @@ class Response:
     state: Array
     """After the last sample: angles, velocities, motor torques, then angles and velocities at the last sample
     (5, joints) [rad, rad/s, N m, rad, rad/s]; what `respond` takes to go on."""
+
+
+@dataclass(frozen=True)
+class Stabilised:
+    """A period during which `feedback` gave part of the torque.
+
+    In the simulation the feedback acts on the simulated arm, as it did on the real one: the arm's instability is no
+    longer the simulation's, and where model and arm agree the torque is the one that was really commanded.
+    """
+
+    feedback: Feedback
+    excitation: Array
+    """Commanded torque less what the feedback gave of it (joints, samples) [N m]."""
+    former: Array
+    """Angles and velocities at the sample before the first (2, joints) [rad, rad/s]."""
+    former_torque: Array
+    """Commanded before the first command (joints,) [N m]."""
+
+    def positions(self, physics: Physics, start: Array, rate: float, command_to_sample: float) -> Array:
+        """Simulated angles (joints, samples) [rad] from `start` (2, joints) at the first sample."""
+        state = np.concatenate((start, self.former_torque[None], self.former))
+        return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
+
+    def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
+        """The same when nothing of the motion is known: from rest in `pose`, after some periods."""
+        state = resting(pose)
+        for _ in range(SETTLING_PERIODS):
+            response = respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback)
+            state = response.state
+        return response.position
+
+
+def _earlier(physics: Physics, command_to_sample: float) -> Physics:
+    """Commands take effect `command_to_sample` [s] before the sample of the same index: so much less lag."""
+    return Physics(physics.vector, physics.delay, max(physics.lag - command_to_sample, 1e-5))
 
 
 def resting(pose: Array) -> Array:

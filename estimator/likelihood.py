@@ -24,6 +24,9 @@ from estimator.period import SettledPeriod
 from estimator.physics import Physics
 from estimator.ripple import find_ripple
 from estimator.simulated_run import SimulatedRun
+from estimator.stabilised_run import StabilisedRun
+
+Run = SimulatedRun | StabilisedRun
 
 WIDTH_FLOOR = 3e-4  # rad/s: narrower cannot be told from friction that sticks
 # From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both.
@@ -62,7 +65,7 @@ class Fit:
 class Problem:
     """Residuals of several runs under one model, by coordinates: the parameters', then each run's first state."""
 
-    runs: tuple[SimulatedRun, ...]
+    runs: tuple[Run, ...]
     coordinates: Coordinates
     state_scale: Array
     """Of the state at the first sample (2 joints,) [rad, rad/s]."""
@@ -162,8 +165,12 @@ def _problem(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstim
     state_scale = np.repeat([ANGLE_SCALE, velocity], model.joints)
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
     weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0) for period in periods)
-    runs = tuple(SimulatedRun.of(period) for period in periods)
+    runs = tuple(_simulated(period) for period in periods)
     return Problem(runs, Coordinates(model.names, scales, WIDTH_FLOOR), state_scale, weights), np.concatenate(states)
+
+
+def _simulated(period: SettledPeriod) -> Run:
+    return SimulatedRun.of(period) if period.stabiliser is None else StabilisedRun.of(period, period.stabiliser)
 
 
 def _start(model: Model, linear: LinearEstimate, ripple: dict[str, float], width: float) -> Array:

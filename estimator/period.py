@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from estimator.arrays import Array, Mask
+from estimator.closed_loop import Stabilised
 from estimator.errors import RecordingError, ShapeError, StandstillError
 
 FEWEST_SAMPLES = 32
@@ -41,6 +42,8 @@ class SettledPeriod:
     """Settled periods averaged."""
     position_std: Array | None = None
     """Standard deviation of the mean angles by the scatter between periods (joints,) [rad], if known."""
+    stabiliser: Stabilised | None = None
+    """Where a software stabiliser gave part of `torque`: without it a simulated arm may not stay with the real one."""
     valid: Mask = field(init=False)
     """Where a sample was received (joints, samples)."""
 

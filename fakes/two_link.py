@@ -79,6 +79,7 @@ class TwoLink:
         """
         motor_1, motor_2 = self._motors
         plain = motor_1.is_plain and motor_2.is_plain
+        jammed = motor_1.jammed or motor_2.jammed
         kt_1, offset_1, coulomb_1, rise_1, per_v1 = motor_1.constants
         kt_2, offset_2, coulomb_2, rise_2, per_v2 = motor_2.constants
         amp_1, amp_2 = motor_1.current, motor_2.current
@@ -147,6 +148,8 @@ class TwoLink:
                 new_1, new_2 = _sticking((m11, m12, m22), (b1, b2), (dry_1, dry_2), (new_1, new_2))
             a1 = (new_1 - v1) / step
             a2 = (new_2 - v2) / step
+            if jammed:  # an impulse within a tiny step says nothing of the next one's middle
+                a1 = a2 = 0.0
             v1 = new_1
             v2 = new_2
             q1 = middle_q1 + half * new_1

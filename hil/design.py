@@ -10,8 +10,8 @@ from estimator.optimal_excitation import Limits, Problem, design_optimal, smooth
 from estimator.physics import Physics
 from hil.amplitude import with_peaks
 from hil.config import Config
-from hil.dry_run import feedback_of
 from hil.plan import Plan, Segment, period_current
+from hil.stabiliser import feedback_of
 
 WAVES = 6
 """Seeds tried for each multisine: how evenly an arm swings to both sides depends on the phases."""
@@ -23,7 +23,7 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     plan = with_peaks(config, _torque_limits(config))
     candidates = []
     for seed in range(config.experiment.seed, config.experiment.seed + WAVES):
-        segment = _plain(config, seed)
+        segment = _plain_segment(config, seed)
         wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
         candidates.append((_range_used(problem, wave), _with_wave(config, segment, wave)))
     best = sorted(candidates, key=lambda each: -each[0])
@@ -49,7 +49,12 @@ def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> 
     return Problem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
 
 
-def _plain(config: Config, seed: int) -> Segment:
+def plain_wave(config: Config, seed: int) -> Multisine:
+    """The low-crest multisine of this seed, at the torque limits."""
+    return _plain_segment(config, seed).multisine
+
+
+def _plain_segment(config: Config, seed: int) -> Segment:
     experiment = config.experiment.model_copy(update={"seed": seed, "held_out": False})
     return with_peaks(config.model_copy(update={"experiment": experiment}), _torque_limits(config)).segments[0]
 

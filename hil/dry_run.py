@@ -20,6 +20,7 @@ from hil.config import Config
 from hil.ensemble import Ensemble
 from hil.plan import Plan, Segment
 from hil.settled import settling_difference
+from hil.stabiliser import feedback_of
 
 Array = NDArray[np.float64]
 
@@ -148,15 +149,6 @@ def limits_of(config: Config) -> Array:
     constant = np.array([joint.torque_per_goal for joint in config.joints])
     torque = current * constant
     return np.stack((low, high, velocity, current, torque, torque * velocity))
-
-
-def feedback_of(config: Config) -> Feedback:
-    """The stabiliser, or nothing, and the clamp [N m]."""
-    limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
-    pose = np.array(config.arm.rest_pose)
-    if config.stabiliser is None:
-        return Feedback(np.zeros_like(pose), np.zeros_like(pose), pose, limit)
-    return Feedback(np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping), pose, limit)
 
 
 def peaks_of(config: Config, position: Array, velocity: Array, current: Array) -> Array:

@@ -8,14 +8,16 @@ from numpy.typing import NDArray
 
 from estimator.identify import Estimate, identify, predict
 from estimator.model import Model
+from estimator.physics import Physics
 from hil.config import Config
 from hil.period_file import PlayedPeriod, save_periods
 from hil.physical import physical_entries
 from hil.plan import HELD_OUT, IDENTIFY
-from hil.recording import load_samples
+from hil.recording import Phase, load_samples
 from hil.result import make_result
 from hil.run_folder import RunFacts, RunFolder
 from hil.settled import settled_period
+from hil.stabiliser import stabiliser_share
 from hil.timing import timing
 
 
@@ -36,6 +38,9 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
     result = make_result(config, facts.config, period, estimate, held_out, kept_time)
     if config.known is not None:
         result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
+    if config.stabiliser is not None:
+        chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(IDENTIFY))
+        result["stabiliser"] = stabiliser_share(config, samples[chosen]).as_json()
     save_periods(run.path, played)
     run.write_result(result)
     return result
@@ -44,5 +49,9 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
 def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void], estimate: Estimate) -> PlayedPeriod:
     """The held-out multisine beside the model's free prediction of it."""
     other = settled_period(config, facts, samples, HELD_OUT)
-    predicted = predict(estimate, other.torque, other.rate, other.command_to_sample)
+    if other.stabiliser is None:
+        predicted = predict(estimate, other.torque, other.rate, other.command_to_sample)
+    else:
+        arm, pose = Physics.of(estimate.parameters), np.array(config.arm.rest_pose)
+        predicted = other.stabiliser.settled_positions(arm, pose, other.rate, other.command_to_sample)
     return PlayedPeriod(other.rate, other.torque, other.position, predicted)

@@ -3,12 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.closed_loop import Stabilised
 from estimator.period import SettledPeriod
 from estimator.settling import period_difference
 from hil.config import Config
 from hil.errors import RecordingCutShort
 from hil.recording import Phase
 from hil.run_folder import RunFacts
+from hil.stabiliser import feedback_of, feedback_torque
 
 
 def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], role: str) -> SettledPeriod:
@@ -39,7 +41,20 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         position_step=np.array(facts.position_step),
         periods=experiment.periods,
         position_std=_scatter(angle),
+        stabiliser=None if config.stabiliser is None else _stabilised(config, rows, first * count, used.size),
     )
+
+
+def _stabilised(config: Config, rows: NDArray[np.void], first: int, count: int) -> Stabilised:
+    """What the stabiliser gave of the torque, from the samples that it acted on."""
+    with_former = rows[first - 1 : first + count]
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    given = np.nan_to_num(feedback_torque(config, with_former))
+    commanded = with_former["goal_current"] * constants
+    period = config.experiment.samples
+    excitation = (commanded[1:] - given).reshape(-1, period, len(constants)).mean(axis=0).T
+    former = np.nan_to_num(np.stack((with_former["position"][0], with_former["velocity"][0])))
+    return Stabilised(feedback_of(config), np.ascontiguousarray(excitation), former, commanded[0])
 
 
 def _scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:

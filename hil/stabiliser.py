@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.state import State
+from estimator.closed_loop import Feedback
 from hil.config import Config
 
 
@@ -41,6 +42,15 @@ class Stabiliser:
         return [wanted + more for wanted, more in zip(goal, added, strict=True)]
 
 
+def feedback_of(config: Config) -> Feedback:
+    """The stabiliser, or nothing, and the clamp [N m]."""
+    limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
+    pose = np.array(config.arm.rest_pose)
+    if config.stabiliser is None:
+        return Feedback(np.zeros_like(pose), np.zeros_like(pose), pose, limit)
+    return Feedback(np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping), pose, limit)
+
+
 @dataclass(frozen=True)
 class StabiliserShare:
     """What the stabiliser did during the periods, per joint [N m]: RMS and peak of its torque, RMS of all torque."""
@@ -48,6 +58,14 @@ class StabiliserShare:
     rms: NDArray[np.float64]
     peak: NDArray[np.float64]
     commanded_rms: NDArray[np.float64]
+
+    def as_json(self) -> dict[str, list[float]]:
+        """For result.json."""
+        return {
+            "rms_torque": self.rms.tolist(),
+            "peak_torque": self.peak.tolist(),
+            "commanded_rms_torque": self.commanded_rms.tolist(),
+        }
 
     def __str__(self) -> str:
         each = ", ".join(

@@ -9,8 +9,9 @@ from estimator.closed_loop import Feedback, respond, resting
 from estimator.physics import Physics
 from hil.config import Config
 from hil.damping import braking_gains
-from hil.dry_run import feedback_of, scaled_feedback
+from hil.dry_run import scaled_feedback
 from hil.ensemble import Ensemble
+from hil.stabiliser import feedback_of
 
 Array = NDArray[np.float64]
 

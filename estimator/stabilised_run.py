@@ -1,0 +1,59 @@
+"""One stabilised run as the likelihood simulates it: in closed loop, its derivatives by finite differences."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator.arrays import Array
+from estimator.closed_loop import Stabilised
+from estimator.period import SettledPeriod
+from estimator.physics import CONSTANTS, Physics
+
+RELATIVE, LEAST = 1e-5, 1e-7
+"""A difference is taken over this much of a parameter's value, and at least so much of its unit."""
+
+
+@dataclass(frozen=True)
+class StabilisedRun:
+    """What a run's simulation in closed loop takes from its recording."""
+
+    stabiliser: Stabilised
+    measured: Array
+    """Angles (joints, samples) [rad], the missing ones interpolated."""
+    rate: float
+    command_to_sample: float
+
+    @classmethod
+    def of(cls, period: SettledPeriod, stabiliser: Stabilised) -> "StabilisedRun":
+        """Of this period, during which `stabiliser` gave part of the torque."""
+        return cls(stabiliser, period.filled(), period.rate, period.command_to_sample)
+
+    def position(self, physics: Physics, start: Array) -> Array:
+        """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        return self.stabiliser.positions(physics, start, self.rate, self.command_to_sample)
+
+    def pieces(self, physics: Physics, start: Array, names: tuple[str, ...]) -> Iterator[tuple[slice, Array, Array]]:
+        """The whole run as one piece, as `SimulatedRun.pieces` gives them."""
+        position = self.position(physics, start)
+        derivatives = []
+        for name in names:
+            step = LEAST + RELATIVE * abs(_value(physics, name))
+            derivatives.append((self.position(_nudged(physics, name, step), start) - position) / step)
+        for index in np.ndindex(*start.shape):
+            nudged = start.copy()
+            nudged[index] += LEAST
+            derivatives.append((self.position(physics, nudged) - position) / LEAST)
+        yield slice(0, position.shape[1]), position, np.stack(derivatives, axis=-1)
+
+
+def _value(physics: Physics, name: str) -> float:
+    return float(physics.vector[CONSTANTS.index(name)]) if name in CONSTANTS else float(getattr(physics, name))
+
+
+def _nudged(physics: Physics, name: str, step: float) -> Physics:
+    if name not in CONSTANTS:
+        return replace(physics, **{name: _value(physics, name) + step})
+    vector = physics.vector.copy()
+    vector[CONSTANTS.index(name)] += step
+    return replace(physics, vector=vector)
