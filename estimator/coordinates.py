@@ -68,9 +68,10 @@ class Coordinates:
     def _shares(self) -> list[tuple[int, int, int]]:
         """Indices of what is bounded by the geometric mean of two others, and of the two."""
         bounds = {"coupling": ("inertia_1", "inertia_2")}
-        bounds |= {f"viscous_asymmetry_{joint}": (f"viscous_{joint}",) * 2 for joint in (1, 2)}
+        for joint in (1, 2):
+            bounds[f"viscous_asymmetry_{joint}"] = (f"viscous_{joint}", f"viscous_{joint}")
         index = self.names.index
-        return [(index(name), *map(index, two)) for name, two in bounds.items() if name in self.names]
+        return [(index(name), index(a), index(b)) for name, (a, b) in bounds.items() if name in self.names]
 
 
 def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: float) -> Array:

@@ -70,20 +70,24 @@ def autocorrelation(residual: Array, lags: int) -> Array:
     return rho
 
 
-def robust_covariance(at: Quadratic, scatter: Array, samples: int, count: int) -> Array:
+def robust_covariance(at: Quadratic, scatter: Array | None, samples: int, count: int) -> Array:
     """Covariance of the first `count` coordinates (count, count), the others unknown with them.
 
     The larger of the sandwich and of what independent errors would give, direction by direction: a short
-    recording cannot prove that its errors cancel. Infinite for a coordinate that leaves no trace.
+    recording cannot prove that its errors cancel. Without `scatter` that of independent errors of variance 1.
+    Infinite for a coordinate that leaves no trace.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen = norm > 1e-12 * norm.max()
     lengths = np.outer(norm[seen], norm[seen])
-    inverse = np.linalg.pinv(at.normal[np.ix_(seen, seen)] / lengths, hermitian=True)
+    inverse = np.asarray(np.linalg.pinv(at.normal[np.ix_(seen, seen)] / lengths, hermitian=True), dtype=np.float64)
     freedom = max(1, samples - int(seen.sum()))
-    robust = inverse @ (scatter[np.ix_(seen, seen)] / lengths) @ inverse * (samples / freedom)
     covariance = np.zeros_like(at.normal)
-    covariance[np.ix_(seen, seen)] = _larger(robust, at.cost / freedom * inverse) / lengths
+    found = inverse
+    if scatter is not None:
+        robust = inverse @ (scatter[np.ix_(seen, seen)] / lengths) @ inverse * (samples / freedom)
+        found = _larger(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
+    covariance[np.ix_(seen, seen)] = found / lengths
     hidden = np.flatnonzero(~seen)
     covariance[hidden, hidden] = np.inf
     return covariance[:count, :count]

@@ -1,7 +1,7 @@
 """The estimator's front door: a settled period in, parameters with standard errors and predictions out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,9 +25,10 @@ class Estimate:
 
     `std` and `covariance` hold what position errors leave open, scaled by the residual as it is and widened
     where it is correlated (`estimator.covariance`), so that rounding is in them as it came out (a residual of
-    0.2887 encoder steps RMS is rounding alone). They hold nothing of what repeats in every sample: an error of the torque constant, by which all parameters of a
-    joint scale, of the encoder's zero or linearity, or of the model. A residual well above 0.29 steps says
-    that the model lacks something and that the parameters are off by more than `std`.
+    0.2887 encoder steps RMS is rounding alone). They hold nothing of what repeats in every sample: an error of
+    the torque constant, by which all parameters of a joint scale, of the encoder's zero or linearity, or of the
+    model. A residual well above 0.29 steps says that the model lacks something and that the parameters may be
+    off by more than `std`.
     """
 
     model: Model
@@ -56,6 +57,8 @@ class Estimate:
     """Simulations with derivatives that the likelihood took."""
     outliers: int = 0
     """Samples left out or weighed down because they are far from their neighbours or from the model."""
+    white_std: Array = field(default_factory=lambda: np.zeros(0))
+    """What `std` would be if every sample's error were independent and of the known noise (parameters,)."""
     correlation_time: float = 1.0
     """Samples over which the residual is correlated, and over which `covariance` counts it as one."""
 
@@ -77,11 +80,12 @@ class Estimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
-def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model) -> Estimate:
+def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model, *, hasty: bool = False) -> Estimate:
     """Estimate the parameters of `model` from one settled period, or from several of one arm together:
     regression on their lines, then maximum likelihood.
 
-    The same periods give the same numbers to the last digit. Raises ModelError when `model` has another
+    The same periods give the same numbers to the last digit. `hasty` is for trying models: one that leaves much
+    more than the noise is not fitted to its last digits. Raises ModelError when `model` has another
     number of joints than a period, UnidentifiableError and ConvergenceError.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
@@ -90,7 +94,7 @@ def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model) -> 
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(*used)
-    fit = fit_runs(used, model, linear)
+    fit = fit_runs(used, model, linear, hasty=hasty)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
         model,
@@ -106,6 +110,7 @@ def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model) -> 
         used[0].position_step,
         fit.iterations,
         fit.outliers + spikes,
+        np.sqrt(np.diag(fit.white_covariance)),
         fit.correlation_time,
     )
 

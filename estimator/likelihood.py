@@ -33,11 +33,14 @@ WIDTH_FLOOR = 3e-4  # rad/s: narrower cannot be told from friction that sticks
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
 COARSE = 1e-3  # relative gain in the sum of squares at which each try ends
 FINE = 1e-6
+HASTY = 2e-2
+HOPELESS = 2.0  # sum of squares per sample in units of the noise from which a hasty fit gives up
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02}
 LEAST_LAG = 1e-4  # s, at the start
+VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 OUTLIER = 4.0  # standard deviations; rounding never leaves more than 1.7
 
 
@@ -49,6 +52,8 @@ class Fit:
     """In the order of `Model.names` [SI]."""
     covariance: Array
     """Of `value`, right for errors that are correlated too. Infinite for what leaves no trace."""
+    white_covariance: Array
+    """Of `value`, if every sample's error were independent and of the size that the noise has, model error or not."""
     starts: tuple[Array, ...]
     """Of each run, angles and velocities at the first sample (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]
@@ -139,21 +144,26 @@ class Problem:
         return transform
 
 
-def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate) -> Fit:
-    """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError."""
+def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate, *, hasty: bool = False) -> Fit:
+    """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError.
+
+    `hasty` is for trying a model: one that leaves much more than the noise is given up before its last digits.
+    """
     problem, states = _problem(periods, model, linear)
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
+    enough = HASTY if hasty else COARSE
     tries: list[Minimum] = []
     for width in STARTING_WIDTHS:
         x = np.concatenate((problem.coordinates.coordinates(_start(model, linear, ripple, width)), states))
-        tries.append(minimise(problem.evaluate, x, COARSE))
-        if tries[-1].at.cost < EXPLAINED * samples:
+        tries.append(minimise(problem.evaluate, x, enough))
+        if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
             break
     best = min(tries, key=lambda found: found.at.cost)
     weights, outliers = _weights(periods, problem.positions(best.x))
     problem = Problem(problem.runs, problem.coordinates, problem.state_scale, weights)
-    minimum = minimise(problem.evaluate, best.x, FINE)
+    hopeless = hasty and best.at.cost > HOPELESS * samples
+    minimum = minimise(problem.evaluate, best.x, HASTY if hopeless else FINE)
     return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, minimum)))
 
 
@@ -211,17 +221,33 @@ def _fit(periods: Sequence[SettledPeriod], problem: Problem, minimum: Minimum, o
     lags = correlation_time(residuals)
     count = problem.count
     samples = int(sum(period.valid.sum() for period in periods))
-    covariance = robust_covariance(minimum.at, problem.scatter(x, lags), samples, count)
     slopes = problem.coordinates.slopes(x[:count])
-    hidden = np.isinf(np.diag(covariance))
-    covariance = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T
-    covariance[hidden, hidden] = np.inf
+    robust = robust_covariance(minimum.at, problem.scatter(x, lags), samples, count)
+    # Weights are of the residual as it turned out; the noise that is known would give larger ones.
+    known = min(float(np.median(w[w > 0.0] * p.noise.min())) for w, p in zip(problem.weights, periods, strict=True))
+    white = known**2 * robust_covariance(minimum.at, None, samples, count)
+    value = problem.coordinates.values(x[:count])
     return Fit(
-        problem.coordinates.values(x[:count]),
-        covariance,
+        value,
+        _by_parameters(robust, slopes, value),
+        _by_parameters(white, slopes, value),
         tuple(problem.start(x, run) for run in range(len(periods))),
         positions,
         outliers,
         float(lags),
         iterations,
     )
+
+
+def _by_parameters(covariance: Array, slopes: Array, value: Array) -> Array:
+    """Covariance of the parameters (parameters, parameters) from that of their coordinates.
+
+    A positive parameter that leaves no trace is as good as zero: it is known to its own size. Its coordinate is
+    the logarithm of what is above its floor, so that the slope is that size.
+    """
+    hidden = np.isinf(np.diag(covariance))
+    finite: Array = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T
+    faint = hidden & (np.diag(slopes) < VANISHED * np.abs(value))
+    finite[hidden, hidden] = np.inf
+    finite[faint, faint] = value[faint] ** 2
+    return finite

@@ -28,11 +28,11 @@ def find_ripple(periods: Sequence[SettledPeriod], linear: LinearEstimate) -> dic
         ]
         Q = np.linalg.qr(np.concatenate([columns for columns, _, _, _ in each]))[0]
         goal = _without(Q, np.concatenate([torque for _, torque, _, _ in each]))
-        best = (-1.0, 0.0, np.zeros(2))
+        best: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(2))
         for cycles in CYCLES.tolist():
             waves = [_waves(torque, angle, cycles, size) for _, size, torque, angle in _parts(each)]
             extra = _without(Q, np.concatenate(waves))
-            share = np.linalg.lstsq(extra, goal, rcond=None)[0]
+            share = np.asarray(np.linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
             explained = float(goal @ goal - np.sum((goal - extra @ share) ** 2))
             best = max(best, (explained, cycles, share), key=lambda trial: trial[0])
         # Torque appears as measured = applied (1 + ripple), so what the columns explain is its opposite.

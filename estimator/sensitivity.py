@@ -178,7 +178,7 @@ def _arm(
     )
 
 
-def _step(
+def _step(  # noqa: PLR0915
     p: Any, x: Any, t1: float, t2: float, dt: Any, h: float, work: Any, change: Any, causes: Any
 ) -> tuple[float, float]:
     """One step of the state x (4,) and of `change` (causes, 4); the accelerations."""
@@ -289,7 +289,7 @@ def _loop(
 
 
 # Only the loop is called from Python; wrappers for the others would take a second more to compile.
-_inner = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_inner: Any = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)  # type: ignore[call-overload]
 _drive = _inner(_drive)
 _arm = _inner(_arm)
 _step = _inner(_step)

@@ -181,8 +181,19 @@ class ExperimentConfig(_Table):
 class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
-    friction: Literal["coulomb", "stribeck", "stribeck_load"] = "stribeck"
-    drive: Literal["delay", "lag"] = "lag"
+    friction: Literal["auto", "coulomb", "stribeck", "stribeck_load"] = Field(
+        "stribeck", description='"auto" tries them, and asymmetry and ripple, and keeps what predicts best'
+    )
+    drive: Literal["delay", "lag", "delay_lag"] = "lag"
+    asymmetry: bool = Field(False, description="viscous friction that differs with direction")
+    ripple: bool = Field(False, description="torque ripple over the joint's angle")
+    zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
+
+    @model_validator(mode="after")
+    def _auto_has_no_terms(self) -> Self:
+        if self.friction == "auto" and (self.asymmetry or self.ripple or self.zeros):
+            raise ValueError('friction = "auto" chooses asymmetry and ripple itself and leaves zeros out: give neither')
+        return self
 
 
 class SafetyConfig(_Table):

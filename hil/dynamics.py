@@ -81,7 +81,7 @@ class ArmModel:
         (dq,) = self._motion(dq=dq)
         velocity = _joints_first(dq)
         steps = [self._step(joint, v) * self._level(joint, v) for joint, v in enumerate(velocity, start=1)]
-        viscous = [self.values[f"viscous_{joint}"] * v for joint, v in enumerate(velocity, start=1)]
+        viscous = [self._viscous(joint, v) for joint, v in enumerate(velocity, start=1)]
         return np.stack([step + slope for step, slope in zip(steps, viscous, strict=True)], axis=-1)
 
     def mass_matrix(self, q: ArrayLike) -> Array:
@@ -92,7 +92,7 @@ class ArmModel:
         if len(self.joints) == 1:
             matrix[..., 0, 0] = p["inertia_1"]
             return matrix
-        coupling = p["coupling"] * np.cos(q[..., 1])
+        coupling = p["coupling"] * np.cos(q[..., 1] + p.get("zero_2", 0.0))
         matrix[..., 0, 0] = p["inertia_1"] + p["inertia_2"] + 2 * coupling
         matrix[..., 0, 1] = matrix[..., 1, 0] = p["inertia_2"] + coupling
         matrix[..., 1, 1] = p["inertia_2"] + p["armature_2"]
@@ -104,6 +104,7 @@ class ArmModel:
         At rest friction is what holds the joint, which a formula of velocity cannot tell: it counts as none there.
         """
         q, dq, torque = self._motion(q=q, dq=dq, torque=torque)
+        torque = torque * np.stack([self._ripple(j, q[..., j - 1]) for j in range(1, len(self.joints) + 1)], axis=-1)
         loaded = self.friction_torque(dq) + self._load_friction(dq, torque) + self._offsets()
         free = torque - self.rigid_body_torque(q, dq, np.zeros_like(q)) - loaded
         return np.asarray(np.linalg.solve(self.mass_matrix(q), free[..., None])[..., 0])
@@ -128,18 +129,20 @@ class ArmModel:
         torque = self._rigid_body(q, dq, ddq)
         for joint, v in enumerate(dq, start=1):
             step = self._step(joint, v)
-            moving = self.values[f"viscous_{joint}"] * v + step * self._level(joint, v)
+            moving = self._viscous(joint, v) + step * self._level(joint, v)
             total = torque[joint - 1] + moving + self.values[f"offset_{joint}"]
             load = self.values.get(f"load_{joint}", 0.0)
             # total + step load |torque| = torque, whose sign is that of total while load < 1.
-            torque[joint - 1] = total / (1 - load * step * np.sign(total)) if load else total
+            applied = total / (1 - load * step * np.sign(total)) if load else total
+            torque[joint - 1] = applied / self._ripple(joint, q[joint - 1])
         return torque
 
     def _rigid_body(self, q: Array, dq: Array, ddq: Array) -> Array:
         p = self.values
         if len(q) == 1:
-            return np.asarray(p["inertia_1"] * ddq + p["gravity_1"] * np.cos(q))
-        coupling, sine = p["coupling"] * np.cos(q[1]), p["coupling"] * np.sin(q[1])
+            return np.asarray(p["inertia_1"] * ddq + self._gravity(q))
+        elbow = q[1] + p.get("zero_2", 0.0)
+        coupling, sine = p["coupling"] * np.cos(elbow), p["coupling"] * np.sin(elbow)
         both = p["inertia_2"] * (ddq[0] + ddq[1])
         torque = self._gravity(q)
         torque[0] += p["inertia_1"] * ddq[0] + both + coupling * (2 * ddq[0] + ddq[1])
@@ -150,9 +153,22 @@ class ArmModel:
     def _gravity(self, q: Array) -> Array:
         p = self.values
         if len(q) == 1:
-            return np.asarray(p["gravity_1"] * np.cos(q))
-        second = p["gravity_2"] * np.cos(q[0] + q[1])
-        return np.stack((p["gravity_1"] * np.cos(q[0]) + second, second))
+            return np.asarray(p["gravity_1"] * np.cos(q + p.get("zero_1", 0.0)))
+        shoulder, elbow = q[0] + p.get("zero_1", 0.0), q[1] + p.get("zero_2", 0.0)
+        second = p["gravity_2"] * np.cos(shoulder + elbow)
+        return np.stack((p["gravity_1"] * np.cos(shoulder) + second, second))
+
+    def _viscous(self, joint: int, v: Array) -> Array:
+        """Friction that grows with speed, and differs with its direction where that was identified."""
+        moving = self.values[f"viscous_{joint}"] * v
+        asymmetry = self.values.get(f"viscous_asymmetry_{joint}", 0.0)
+        return np.asarray(moving + asymmetry * v * self._step(joint, v)) if asymmetry else moving
+
+    def _ripple(self, joint: int, q: Array) -> Array:
+        """Motor torque over what the current stands for, at the angles q."""
+        cycles = self.values.get(f"ripple_cycles_{joint}", 0.0) * q
+        sine, cosine = (self.values.get(f"ripple_{part}_{joint}", 0.0) for part in ("sin", "cos"))
+        return np.asarray(1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles))
 
     def _step(self, joint: int, v: Array) -> Array:
         width = self.values.get(f"coulomb_width_{joint}", 0.0)

@@ -6,19 +6,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.choice import Choice, choose
 from estimator.identify import Estimate, identify, predict
 from estimator.model import Model
+from estimator.period import SettledPeriod
 from estimator.physics import Physics
+from estimator.validation import validate
+from estimator.verdict import judge
 from hil.config import Config
 from hil.period_file import PlayedPeriod, save_periods
 from hil.physical import physical_entries
 from hil.plan import HELD_OUT, IDENTIFY
 from hil.recording import Phase, load_samples
 from hil.result import make_result
-from hil.run_folder import RunFacts, RunFolder
+from hil.result_checks import describe_choice, describe_validation, describe_verdict
+from hil.run_folder import RunFolder
 from hil.settled import settled_period
 from hil.stabiliser import stabiliser_share
 from hil.timing import timing
+from hil.warnings import warnings_of
 
 
 def estimate_run(run: RunFolder) -> dict[str, Any]:
@@ -27,15 +33,23 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
     samples = load_samples(run.samples_path, len(config.joints))
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)
-    model = Model(len(config.joints), config.model.friction, config.model.drive)
-    estimate = identify(period, model)
+    other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
+    estimate, choice = _estimate(config, period, other)
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
-    if HELD_OUT in facts.segments:
-        played[HELD_OUT] = _held_out(config, facts, samples, estimate)
+    if other is not None:
+        predicted = _predict(config, estimate, other)
+        played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
+    held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
+    validation = validate(period, estimate)
+    checked = {
+        **describe_validation(validation, held_out),
+        "verdict": describe_verdict(judge(estimate, validation, held_out)),
+        "warnings": warnings_of(config, facts, samples, period),
+        **({"model_choice": describe_choice(choice)} if choice else {}),
+    }
     seconds = round(time.perf_counter() - started, 3)
     kept_time = {**timing(samples, config.experiment.rate), "estimation_seconds": seconds}
-    held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
-    result = make_result(config, facts.config, period, estimate, held_out, kept_time)
+    result = make_result(config, facts.config, period, estimate, checked, kept_time)
     if config.known is not None:
         result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
     if config.stabiliser is not None:
@@ -46,12 +60,19 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
     return result
 
 
-def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void], estimate: Estimate) -> PlayedPeriod:
-    """The held-out multisine beside the model's free prediction of it."""
-    other = settled_period(config, facts, samples, HELD_OUT)
+def _estimate(config: Config, period: SettledPeriod, other: SettledPeriod | None) -> tuple[Estimate, Choice | None]:
+    """The estimate of the model that the configuration asks for, or of the one chosen, with how it was."""
+    wanted = config.model
+    if wanted.friction == "auto":
+        choice = choose([period], other, wanted.drive)
+        return choice.estimate, choice
+    terms = {"asymmetry": wanted.asymmetry, "ripple": wanted.ripple, "zeros": wanted.zeros}
+    return identify(period, Model(len(config.joints), wanted.friction, wanted.drive, **terms)), None
+
+
+def _predict(config: Config, estimate: Estimate, other: SettledPeriod) -> NDArray[np.float64]:
+    """The model's free prediction of another multisine, (joints, samples) [rad]."""
     if other.stabiliser is None:
-        predicted = predict(estimate, other.torque, other.rate, other.command_to_sample)
-    else:
-        arm, pose = Physics.of(estimate.parameters), np.array(config.arm.rest_pose)
-        predicted = other.stabiliser.settled_positions(arm, pose, other.rate, other.command_to_sample)
-    return PlayedPeriod(other.rate, other.torque, other.position, predicted)
+        return predict(estimate, other.torque, other.rate, other.command_to_sample)
+    arm, pose = Physics.of(estimate.parameters), np.array(config.arm.rest_pose)
+    return other.stabiliser.settled_positions(arm, pose, other.rate, other.command_to_sample)

@@ -17,7 +17,10 @@ _RIGID_BODY = {
     2: ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
 }
 _PER_JOINT = ("viscous", "coulomb", "offset")
-_OPTIONAL_PER_JOINT = ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load")
+_OPTIONAL_PER_JOINT = (
+    *("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry"),
+    *("ripple_sin", "ripple_cos", "ripple_cycles", "zero"),
+)
 _DRIVE = ("lag", "delay")
 
 

@@ -5,7 +5,11 @@ parameters   the base parameters: value, std, unit
 extra        what the model needed beside them (friction's shape, drive's lag): value, std, unit
 covariance   of parameters and extra together, rows in the order of `names`
 fit          residual of the settled period, in encoder steps, against the encoder's own rounding
-validation   free prediction of another multisine, as a fraction of the motion's RMS
+validation   free prediction of another multisine and of this one, as fractions of the motion's RMS; residual against
+             rounding, whiteness, conditioning; noise, distortion and model error in encoder steps
+verdict      trust it or not, the weakest parameter, and why, in sentences
+warnings     what looked wrong in the recording, in sentences
+model_choice with friction = "auto": the models tried, the one chosen, what it gained and cost
 timing       how the stream kept its ticks, and how long the estimation took
 arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, mode, limits, torque per
              goal [N m/A, or N m/V in pwm mode]
@@ -14,9 +18,6 @@ truth        only on a fake arm
 
 import math
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from estimator.identify import Estimate
 from estimator.period import SettledPeriod
@@ -32,15 +33,19 @@ def make_result(
     shown_path: str,
     period: SettledPeriod,
     estimate: Estimate,
-    held_out: NDArray[np.float64] | None,
+    checked: dict[str, Any],
     timing: dict[str, Any],
 ) -> dict[str, Any]:
-    """The result of one run. held_out: RMS error of the free prediction per joint, as a fraction of the motion's."""
+    """The result of one run. checked: what the validation found, and under keys of their own what goes beside it."""
+    checked = dict(checked)
+    beside: dict[str, Any] = {
+        key: checked.pop(key) for key in ("verdict", "warnings", "model_choice") if key in checked
+    }
     base = len(estimate.model.base_names)
     result: dict[str, Any] = {
         "schema": SCHEMA,
         "method": f"settled period, least squares on Fourier lines, then maximum likelihood; "
-        f"{config.model.friction} friction, {config.model.drive} drive",
+        f"{estimate.model.friction} friction, {estimate.model.drive} drive",
         "config": shown_path,
         "joints": len(config.joints),
         "parameters": _entries(estimate, 0, base),
@@ -51,8 +56,12 @@ def make_result(
             "quantisation_floor_ticks": round(QUANTISATION_FLOOR_TICKS, 4),
             "samples_per_period": period.position.shape[1],
             "periods": period.periods,
+            "model": estimate.model.description,
+            "outliers": estimate.outliers,
+            "correlation_time": estimate.correlation_time,
         },
-        "validation": {} if held_out is None else {"held_out_rms": [float(value) for value in held_out]},
+        "validation": checked,
+        **beside,
         "timing": timing,
         "arm": _arm(config),
     }

@@ -18,7 +18,8 @@ def print_result(result: dict[str, Any], config: Config, run: Path, console: Con
     """The table, the fit and what to do next."""
     console.print(_parameters(result))
     physical = physical_lines(result["physical"]) if "physical" in result else []
-    for line in (*_fit(result), *_torque_constants(config), *physical, *_next(result, run)):
+    told = (*_fit(result), *_choice(result), *_verdict(result), *_torque_constants(config), *physical)
+    for line in (*told, *_next(result, run)):
         console.print(line, soft_wrap=True, markup=False)
 
 
@@ -69,6 +70,24 @@ def _fit(result: dict[str, Any]) -> list[str]:
     return lines
 
 
+def _choice(result: dict[str, Any]) -> list[str]:
+    choice = result.get("model_choice")
+    if not choice:
+        return []
+    tried = ", ".join(trial["model"] for trial in choice["tried"])
+    gained, cost = choice["error_divided_by"], choice["standard_errors_times"]
+    return [
+        f"Chosen of {tried}: {choice['chosen']}. Against the first, it predicts {gained:.3g} times better and makes "
+        f"the standard errors {cost:.3g} times larger."
+    ]
+
+
+def _verdict(result: dict[str, Any]) -> list[str]:
+    verdict = result["verdict"]
+    said = [*verdict["sentences"], *(f"Warning: {warning}" for warning in result["warnings"])]
+    return [f"Trust it: {verdict['trust']}. " + " ".join(said)]
+
+
 def _torque_constants(config: Config) -> list[str]:
     unsure = [
         f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.0f} %"
@@ -85,14 +104,4 @@ def _torque_constants(config: Config) -> list[str]:
 
 def _next(result: dict[str, Any], run: Path) -> list[str]:
     lines = [f"Run folder: {run}, its report: {run / 'report.html'}"]
-    worst = max(result["fit"]["residual_rms_ticks"])
-    if worst <= GOOD_RESIDUAL_TICKS:
-        lines.append("The model explains the motion down to the encoder's rounding. Estimate again from the recording:")
-    else:
-        lines.append(
-            f"{worst / GOOD_RESIDUAL_TICKS:.1f} times more is left than the encoder explains: something moves that "
-            "the model does not have. Try a richer [model] friction or a larger peak_torque, or look for play. "
-            "Estimate again:"
-        )
-    lines.append(f"  hil estimate {run}")
-    return lines
+    return [*lines, f"Estimate again from the recording: hil estimate {run}"]

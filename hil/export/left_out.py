@@ -9,6 +9,11 @@ MEANING = {
     "stribeck_rise": "friction at low speed above Coulomb, as a fraction of it",
     "stribeck_velocity": "velocity where that rise has fallen off",
     "load": "friction per motor torque",
+    "viscous_asymmetry": "viscous friction that is more one way than the other",
+    "ripple_sin": "torque ripple over the angle, sine part",
+    "ripple_cos": "torque ripple over the angle, cosine part",
+    "ripple_cycles": "its cycles per turn",
+    "zero": "error of the joint's zero angle",
     "lag": "time constant of the current loop",
     "delay": "delay of the torque",
 }
@@ -19,6 +24,11 @@ UNITS = {
     "stribeck_rise": "",
     "stribeck_velocity": "rad/s",
     "load": "",
+    "viscous_asymmetry": "N m s/rad",
+    "ripple_sin": "",
+    "ripple_cos": "",
+    "ripple_cycles": "",
+    "zero": "rad",
     "lag": "s",
     "delay": "s",
 }

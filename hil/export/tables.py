@@ -20,7 +20,10 @@ def export_csv(source: Source, path: Path) -> list[str]:
     writer.writerow(table)
     writer.writerows(zip(*(column.tolist() for column in table.values()), strict=True))
     write_text(path, text.getvalue())
-    return ["the identified parameters (a CSV is one table; export toml or json for them)", "units (SI, temperature in degrees C)"]
+    return [
+        "the identified parameters (a CSV is one table; export toml or json for them)",
+        "units (SI, temperature in degrees C)",
+    ]
 
 
 def export_parquet(source: Source, path: Path) -> list[str]:

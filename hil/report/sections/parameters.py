@@ -20,6 +20,11 @@ _MEANING = {
     "stribeck_rise": "more dry friction at low speed",
     "stribeck_velocity": "speed where that has fallen off",
     "load": "friction per torque",
+    "viscous_asymmetry": "more friction one way",
+    "ripple_sin": "torque ripple over the angle",
+    "ripple_cos": "torque ripple over the angle",
+    "ripple_cycles": "of it per turn",
+    "zero": "error of the zero angle",
     "lag": "of the current loop",
     "delay": "of the torque",
 }

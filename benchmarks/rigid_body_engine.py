@@ -1,0 +1,123 @@
+"""An arm simulated by MuJoCo, not by equations like the estimator's, identified and predicted.
+
+    python benchmarks/rigid_body_engine.py [--json] [--seeds N]        (needs the package mujoco)
+
+The links, servos and friction of the fake arm as MuJoCo bodies; dry friction is a constraint there (frictionloss),
+solved with everything else, not a function of velocity. Positions are rounded to encoder steps, currents to theirs.
+The friction model is chosen by the tool. The worst of N seeds is printed.
+"""
+
+import argparse
+import json
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+from machine import machine
+from recorded_arm import BAND, COMMAND_TO_SAMPLE, CURRENT_STEP, DRIVES, LINKS, PERIOD, RATE, SERVO, STEP
+
+from estimator.choice import Choice, choose
+from estimator.excitation import design_multisine, zippered_lines
+from estimator.period import SettledPeriod
+from fakes.arm import Arm, base_parameters
+
+PEAK = (0.80, 0.42)  # N m
+TIMESTEP = 2e-5  # s: the engine steps to first order, which at 1e-4 s is ten times the standard errors
+GROUPS = {
+    "inertia": ("inertia_1", "coupling", "inertia_2", "armature_2"),
+    "gravity": ("gravity_1", "gravity_2"),
+    "friction": ("viscous_1", "viscous_2", "coulomb_1", "coulomb_2"),
+}
+TWO_SIDED_99 = 2.576
+
+
+def engine() -> mujoco.MjModel:
+    """The arm in MuJoCo's own terms: x forwards, z up, joints about -y, so that angles rise with z."""
+    rotor = SERVO["rotor_inertia"] * SERVO["gear_ratio"] ** 2
+    joint = (
+        '<joint name="j{n}" type="hinge" axis="0 -1 0" damping="{viscous}" frictionloss="{coulomb}" armature="'
+        + str(rotor)
+        + '" solreffriction="{time} 1"/>'
+    )
+    joints = [joint.format(n=n, time=2.0 * TIMESTEP, **drive) for n, drive in enumerate(DRIVES, start=1)]
+    bodies = [
+        '<inertial pos="{centre} 0 0" mass="{mass}" diaginertia="{inertia} {inertia} {inertia}"/>'.format(**link)
+        for link in LINKS
+    ]
+    length = LINKS[0]["length"]
+    elbow = f'<body pos="{length} 0 0"><inertial pos="0 0 0" mass="{SERVO["mass"]}" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    text = (
+        f'<mujoco><option timestep="{TIMESTEP}" gravity="0 0 -9.81" integrator="implicitfast" solver="Newton" '
+        'tolerance="1e-12" iterations="50"/><worldbody><body>'
+        f'{joints[0]}{bodies[0]}{elbow}<body pos="{length} 0 0">{joints[1]}{bodies[1]}</body>'
+        "</body></worldbody></mujoco>"
+    )
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def record(seed: int) -> SettledPeriod:
+    """One period to settle, the next kept."""
+    wave = design_multisine(RATE, PERIOD, zippered_lines(PERIOD, BAND, 2), PEAK, seed)
+    constant = SERVO["torque_constant"]
+    torque = np.round(wave.torque / constant / CURRENT_STEP) * CURRENT_STEP * constant
+    offset = np.array([drive["offset"] for drive in DRIVES])
+    model = engine()
+    data = mujoco.MjData(model)
+    data.qpos[:] = (-math.pi / 2, 0.0)
+    steps = round(1.0 / (RATE * TIMESTEP))
+    sample = round(COMMAND_TO_SAMPLE / TIMESTEP)
+    position = np.empty((2, wave.samples))
+    for _ in range(2):
+        for k in range(wave.samples):
+            data.qfrc_applied[:] = torque[:, k] - offset
+            mujoco.mj_step(model, data, sample)
+            position[:, k] = data.qpos
+            mujoco.mj_step(model, data, steps - sample)
+    rounded = np.round(position / STEP) * STEP
+    return SettledPeriod(RATE, torque, rounded, COMMAND_TO_SAMPLE, np.full(2, STEP))
+
+
+def figures(choice: Choice, truth: dict[str, float]) -> dict[str, Any]:
+    estimate = choice.estimate
+    std = dict(zip(estimate.names, estimate.std.tolist(), strict=True))
+    found = estimate.parameters
+    errors = {
+        f"{group}_error": max(abs(found[name] / truth[name] - 1) for name in names) for group, names in GROUPS.items()
+    }
+    in_std = {name: abs(found[name] - value) / std[name] for name, value in truth.items()}
+    outside = sum(value > TWO_SIDED_99 for value in in_std.values())
+    return {
+        **errors,
+        "worst_in_std": max(in_std.values()),
+        "outside_99": outside,
+        "residual_ticks": float(estimate.residual_steps.max()),
+        "held_out_rms": float(np.max(choice.chosen.held_out)),
+        "seconds": sum(trial.seconds for trial in choice.trials),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args()
+    drives = [{**SERVO, **drive} for drive in DRIVES]
+    arm = Arm.model_validate({"start": (-math.pi / 2, 0.0), "links": LINKS, "drives": drives})
+    truth = base_parameters(arm)
+    runs, chosen = [], []
+    for seed in range(1, options.seeds + 1):
+        choice = choose([record(seed)], record(seed + 100), "delay")
+        runs.append(figures(choice, truth))
+        chosen.append(choice.chosen.model.description)
+    worst = {key: max(run[key] for run in runs) for key in runs[0]}
+    if options.json:
+        print(json.dumps({**worst, "models": chosen, "seeds": options.seeds}))
+        return
+    print(f"{machine()}; MuJoCo {mujoco.__version__}; worst of {options.seeds} seeds; chosen: {', '.join(chosen)}")
+    for key, value in worst.items():
+        print(f"  {key:18s} " + (f"{100 * value:.3f} %" if key.endswith(("_error", "_rms")) else f"{value:.3g}"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Which friction model: fitted one after the other, from plain to rich, and judged by a motion none of them saw.
+
+A richer model always leaves less of the motion it was fitted to. What it predicts of another motion, freely, from
+rest, gets better only by what is true in it. Without such a motion the Bayesian information criterion judges
+(Schwarz, Annals of Statistics 6 (1978) 461), samples counted as far as the residual is not correlated.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.arrays import Array
+from estimator.errors import ConvergenceError, PeriodicityError
+from estimator.identify import Estimate, identify, predict
+from estimator.model import Drive, Model
+from estimator.period import SettledPeriod
+
+WORTH = 0.98  # of the score of the best so far: what another term must reach to be kept
+EXPLAINED = 1.05  # error of prediction in units of the noise: nothing is left for another term
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One model and how it did."""
+
+    model: Model
+    estimate: Estimate | None
+    """None where the fit or the prediction found no end."""
+    held_out: Array | None
+    """RMS error of the free prediction over the motion's RMS (joints,)."""
+    score: float
+    """RMS error of the free prediction in units of the noise, or without one what the criterion puts there."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The models tried, in order, and the one chosen."""
+
+    trials: tuple[Trial, ...]
+    chosen: Trial
+
+    @property
+    def estimate(self) -> Estimate:
+        """Of the chosen model."""
+        if self.chosen.estimate is None:
+            raise ConvergenceError(f"{self.chosen.model.description} could not be fitted to its last digits")
+        return self.chosen.estimate
+
+    @property
+    def gained(self) -> float:
+        """The plainest model's error over the chosen one's."""
+        return self.trials[0].score / self.chosen.score
+
+    @property
+    def cost(self) -> float:
+        """How much larger the base parameters' standard errors are than the plainest model's would be with the
+        chosen one's residual: what the terms that were added cost (geometric mean)."""
+        plain = self.trials[0].estimate
+        if plain is None:
+            return np.inf
+        base = len(plain.model.base_names)
+        sizes = [each.white_std[:base] for each in (self.estimate, plain)]
+        seen = np.isfinite(sizes[0]) & np.isfinite(sizes[1])
+        return float(np.exp(np.mean(np.log(sizes[0][seen] / sizes[1][seen]))))
+
+
+def choose(periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drive: Drive) -> Choice:
+    """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
+
+    Coulomb, Stribeck and load-dependent friction come first; then ripple over the angle and friction that differs
+    with direction, on top of the best. Ends when the prediction's error is the encoder's own noise. Raises
+    ConvergenceError when no model can be fitted.
+    """
+    trials: list[Trial] = []
+    best: Trial | None = None
+    joints = periods[0].joints
+    for model in _ladder(joints, drive):
+        trial = _try(model if best is None else _on_top(model, best.model), periods, held_out, hasty=True)
+        trials.append(trial)
+        if best is None or trial.score < WORTH * best.score:
+            best = trial
+        if best.score < EXPLAINED:
+            break
+    if best is None or best.estimate is None:
+        raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
+    if best.score >= EXPLAINED:
+        best = _try(best.model, periods, held_out, hasty=False)
+    return Choice(tuple(trials), best)
+
+
+def _ladder(joints: int, drive: Drive) -> Iterator[Model]:
+    yield Model(joints, "coulomb", drive)
+    yield Model(joints, "stribeck", drive)
+    yield Model(joints, "stribeck_load", drive)
+    yield Model(joints, "stribeck_load", drive, ripple=True)
+    yield Model(joints, "coulomb", drive, asymmetry=True)
+
+
+def _on_top(model: Model, best: Model) -> Model:
+    """Direction is added to the best so far; ripple only shows with all of friction in place."""
+    if model.asymmetry:
+        return Model(best.joints, best.friction, best.drive, asymmetry=True, ripple=best.ripple)
+    return model
+
+
+def _try(model: Model, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, *, hasty: bool) -> Trial:
+    started = time.perf_counter()
+    relative = None
+    try:
+        estimate = identify(periods, model, hasty=hasty)
+        if held_out is None:
+            score = _criterion(estimate, periods)
+        else:
+            predicted = predict(estimate, held_out.torque, held_out.rate, held_out.command_to_sample)
+            relative = relative_error(held_out, predicted)
+            score = float(np.sqrt(np.nanmean(((held_out.position - predicted) / held_out.noise[:, None]) ** 2)))
+    except (ConvergenceError, PeriodicityError):
+        return Trial(model, None, None, np.inf, time.perf_counter() - started)
+    return Trial(model, estimate, relative, score, time.perf_counter() - started)
+
+
+def relative_error(period: SettledPeriod, predicted: Array) -> Array:
+    """RMS of measured less predicted position over the RMS of the motion about its mean (joints,)."""
+    motion = period.position - np.nanmean(period.position, axis=1, keepdims=True)
+    error: Array = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1) / np.nanmean(motion**2, axis=1))
+    return error
+
+
+def _criterion(estimate: Estimate, periods: Sequence[SettledPeriod]) -> float:
+    """exp(BIC / 2n) of the residual in units of the noise, so that it compares like an error of prediction."""
+    noise = periods[0].noise
+    size = np.nanmean((estimate.residual / noise[:, None]) ** 2)
+    samples = sum(period.valid.sum() for period in periods) / estimate.correlation_time
+    return float(np.sqrt(size) * np.exp(0.5 * len(estimate.names) * np.log(samples) / samples))

@@ -1,0 +1,58 @@
+"""What the checks of an estimate found, as result.json keeps it."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.choice import Choice
+from estimator.validation import Validation
+from estimator.verdict import Verdict
+
+
+def describe_validation(validation: Validation, held_out: NDArray[np.float64] | None) -> dict[str, Any]:
+    """Per joint; `held_out_rms` and `free_run_rms` are fractions of the motion's RMS, `levels_ticks` encoder steps."""
+    levels = validation.levels
+    first, second, correlation = validation.confounded
+    described: dict[str, Any] = {} if held_out is None else {"held_out_rms": held_out.tolist()}
+    if validation.free_run is not None:
+        described["free_run_rms"] = validation.free_run.tolist()
+    return {
+        **described,
+        "residual_over_floor": validation.residual_over_floor.tolist(),
+        "correlated_lags": validation.correlated_lags.tolist(),
+        "condition": validation.condition,
+        "hardest_to_tell_apart": {"parameters": [first, second], "correlation": correlation},
+        "levels_ticks": {
+            "excited_lines": levels.excited.tolist(),
+            "odd_distortion": levels.odd.tolist(),
+            "even_distortion": levels.even.tolist(),
+            "noise": levels.noise.tolist(),
+            "period_scatter": levels.scatter.tolist(),
+            "model_error": levels.model_error.tolist(),
+        },
+    }
+
+
+def describe_verdict(verdict: Verdict) -> dict[str, Any]:
+    """`trust`: yes, with care or no; `weakest`: a parameter; `sentences`: why, for a person."""
+    return {"trust": verdict.trust, "weakest": verdict.weakest, "sentences": list(verdict.sentences)}
+
+
+def describe_choice(choice: Choice) -> dict[str, Any]:
+    """Which friction model was chosen of which, and what that gained and cost."""
+    return {
+        "chosen": choice.chosen.model.description,
+        "error_divided_by": choice.gained,
+        "standard_errors_times": choice.cost,
+        "tried": [
+            {
+                "model": trial.model.description,
+                "parameters": len(trial.model.names),
+                "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
+                "score": trial.score if np.isfinite(trial.score) else None,
+                "seconds": round(trial.seconds, 3),
+            }
+            for trial in choice.trials
+        ],
+    }
