@@ -69,7 +69,8 @@ def filtered_rows(recording: Recording, cutoff: float, coulomb_width: float, del
     keep = max(1, int(1.0 / (PER_CYCLE * cutoff * dt)))
     if cutoff >= 0.45 / dt or position.shape[1] < 3 * trim:
         raise RecordingError(
-            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {cutoff:g} Hz: record longer or faster"
+            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {cutoff:g} Hz: "
+            "record longer or faster"
         )
     filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
     smooth = sosfiltfilt(filter_, position, axis=1)

@@ -30,6 +30,7 @@ LEAST_SPREAD = 0.02  # of the largest parameter of its kind
 DIFFERENCE = 1e-6
 # The twelve slots that the compiled arm takes; a pendulum fills five of them.
 SLOTS = CONSTANTS[:12]
+TORQUES = ("gravity", "coulomb", "offset")
 
 Filter = Literal["ekf", "ukf"]
 
@@ -88,13 +89,7 @@ def fit_by_kalman(
 
 def _scales(names: tuple[str, ...], start: Array) -> Array:
     """The largest of each kind of parameter, as a unit for all of the kind."""
-    groups = {
-        "coupling": "inertia",
-        "armature": "inertia",
-        "gravity": "torque",
-        "coulomb": "torque",
-        "offset": "torque",
-    }
+    groups = dict.fromkeys(("coupling", "armature"), "inertia") | dict.fromkeys(TORQUES, "torque")
     kinds = [groups.get(name.split("_")[0], name.split("_")[0]) for name in names]
     largest = {kind: max(abs(v) for v, k in zip(start, kinds, strict=True) if k == kind) for kind in kinds}
     return np.array([max(largest[kind], 1e-9) for kind in kinds])

@@ -44,8 +44,8 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     if period.joints == 1:
         A = np.stack((s * s * Q[0], s * Q[0], Q[0]), axis=1)
         x, covariance = _solve(A, torque[0])
-        names = ("inertia_1", "viscous_1", "gravity_1")
-        return LinearisedEstimate(_named(names, x), _named(names, np.sqrt(np.diag(covariance))), remark)
+        single = ("inertia_1", "viscous_1", "gravity_1")
+        return LinearisedEstimate(_named(single, x), _named(single, np.sqrt(np.diag(covariance))), remark)
     if length is None:
         raise ModelError("the paper's method needs the length of link 1: give known.length_1")
     none = np.zeros_like(s)

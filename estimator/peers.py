@@ -31,6 +31,7 @@ SHORT = 0.5  # s of simulation by which settings are compared
 PERIODS = 3  # of the settled period joined end to end for the filters, which need time to settle
 
 Fit = InverseDynamics | Filtered
+Setting = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,11 @@ def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -
     recording = joined(period, 1)
     delay = fit_lines(period).delay
 
-    def inverse(setting: tuple[float, ...]) -> Fit:
-        return fit_inverse_dynamics([recording], *setting, delay)
+    def inverse(setting: Setting) -> Fit:
+        return fit_inverse_dynamics([recording], setting[0], setting[1], delay)
 
-    def recursive(setting: tuple[float, ...]) -> Fit:
-        return fit_recursively([recording], *setting, delay)
+    def recursive(setting: Setting) -> Fit:
+        return fit_recursively([recording], setting[0], setting[1], delay)
 
     filters = tuple(product(CUTOFFS, WIDTHS))
     words = "cut-off {:g} Hz, Coulomb width {:g} rad/s"
@@ -95,8 +96,8 @@ def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -
 
 
 def _best_filter(kind: Filter, long: Recording, start: Array, recording: Recording, delay: float) -> Peer:
-    def run(setting: tuple[float, ...]) -> Fit:
-        return fit_by_kalman(long, start, kind, *setting, delay)
+    def run(setting: Setting) -> Fit:
+        return fit_by_kalman(long, start, kind, setting[0], setting[1], delay)
 
     settings = tuple(product(WIDTHS[:2], VELOCITY_NOISES))
     words = "Coulomb width {:g} rad/s, velocity noise {:g} rad/s/sqrt(s)"
@@ -105,8 +106,8 @@ def _best_filter(kind: Filter, long: Recording, start: Array, recording: Recordi
 
 def _best(
     name: str,
-    fit: Callable[[tuple[float, ...]], Fit],
-    settings: tuple[tuple[float, ...], ...],
+    fit: Callable[[Setting], Fit],
+    settings: tuple[Setting, ...],
     words: str,
     recording: Recording,
     delay: float,

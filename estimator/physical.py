@@ -96,9 +96,8 @@ def physical_quantities(
     unknown = [name for name in QUANTITIES[joints] if name not in known or known[name].std > 0.0]
     exact = {name: item.value for name, item in known.items() if item.std == 0.0}
     measured = {name: item for name, item in known.items() if item.std > 0.0}
-    whiten = np.linalg.inv(
-        np.linalg.cholesky(covariance[np.ix_(rows, rows)] + np.diag(1e-18 + 1e-14 * goal[rows] ** 2))
-    )
+    floor = np.diag(1e-18 + 1e-14 * goal[rows] ** 2)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(rows, rows)] + floor))
 
     def misfit(x: Array, whitened: bool) -> Array:
         given = exact | dict(zip(unknown, x.tolist(), strict=True))

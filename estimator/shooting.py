@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.signal import lfilter
 
 from estimator.arrays import Array
@@ -23,6 +24,8 @@ from estimator.physics import Physics
 from estimator.recording import Recording
 from estimator.segmented_least_squares import Segmented, minimise_segmented
 from estimator.simulation import simulate
+
+Indices = npt.NDArray[np.int64]
 
 LONGEST_STEP = 1e-3  # s
 WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a second of motion
@@ -46,7 +49,7 @@ class Segment:
     """Grid point of its start."""
     steps: int
     """Grid steps that it takes."""
-    index: Array
+    index: Indices
     """Grid points around each of its samples (samples, 4), counted from `first`."""
     weight: Array
     """Of each of them: cubic interpolation (samples, 4)."""
@@ -255,7 +258,7 @@ def cut(recording: Recording, number: int, start: float, step: float, steps: int
     return segments
 
 
-def _cubic(place: Array, steps: int) -> tuple[Array, Array]:
+def _cubic(place: Array, steps: int) -> tuple[Indices, Array]:
     """Grid points around each place (samples, 4) and the weights of the cubic through them."""
     first = np.clip(np.floor(place).astype(np.int64) - 1, 0, steps - 3)
     index = first[:, None] + np.arange(4)

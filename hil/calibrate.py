@@ -22,9 +22,7 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
     config, other = without.load_config(), with_mass.load_config()
     _same_arm(config, other)
     if config.arm.gravity == 0.0:
-        raise ConfigError(
-            "arm.gravity = 0: a mass that nothing pulls at weighs nothing; calibrate in a vertical plane."
-        )
+        raise ConfigError("arm.gravity = 0: nothing pulls at the mass; calibrate in a vertical plane.")
     periods = [
         settled_period(each, run.load_facts(), load_samples(run.samples_path, len(each.joints)), IDENTIFY)
         for each, run in ((config, without), (other, with_mass))

@@ -1,12 +1,13 @@
 """mujoco.sysid on a settled period: the peer behind the extra `peers`.
 
-The arm is a MuJoCo model of one or two hinges. Unknown are first moment and inertia of each link, armature
-of joint 2, damping, friction loss and a constant torque of each joint, each as a multiple of what it shall find. It gets every advantage: a start within 50 % of what it shall find (nothing else finds its way from nothing),
-link 1's length, the state at the first sample from the period's Fourier lines, the delay that our first stage found,
-mujoco.sysid's own optimiser with its rollouts on all cores, and two integration steps a sample, the fewest that leave
-its answer as it is.
+The arm is a MuJoCo model of one or two hinges. Unknown are first moment and inertia of each link, armature of joint 2,
+damping, friction loss and a constant torque of each joint, each as a multiple of what it shall find. It gets every
+advantage: a start within 50 % of what it shall find (nothing else finds its way from nothing), link 1's length, the
+state at the first sample from the period's Fourier lines, the delay that our first stage found, mujoco.sysid's own
+optimiser with its rollouts on all cores, and two integration steps a sample, the fewest that leave its answer as it is.
 """
 
+import importlib
 import io
 import time
 from contextlib import redirect_stdout
@@ -32,8 +33,8 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
     `length` [m] of link 1, `gravity` [m/s^2]. Raises MissingExtra without mujoco[sysid].
     """
     try:
-        import mujoco
-        from mujoco import sysid
+        mujoco: Any = importlib.import_module("mujoco")
+        sysid: Any = importlib.import_module("mujoco.sysid")
     except ImportError as error:
         raise MissingExtra("mujoco.sysid is not installed: pip install 'hil[peers]'.") from error
     if not hasattr(sysid, "optimize"):

@@ -1,0 +1,167 @@
+"""The seed paper's arm: its method as printed beside the likelihood on the same data, and its figures 2 to 5 redrawn.
+
+    python benchmarks/paper.py [--json] [--seeds N] [--figures DIR]
+
+Table 1's arm, each joint with Table 2's amplitudes on lines of its own, the paper's noise, 100 s at 100 Hz, J = 5.
+`rmse_m1`, `rmse_m2` [kg] are the likelihood's over N seeds on the plant as printed (first order);
+`literal_rmse_m1`, `literal_rmse_m2` the method as printed. Beside them: the Cramer-Rao bound, the corrected plant
+(second order with friction), and 10 samples a second. The figures need matplotlib.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from machine import machine
+
+from estimator.paper import (
+    AMPLITUDES,
+    FUNDAMENTAL,
+    NOISE,
+    PaperArm,
+    coefficients,
+    fit_as_printed,
+    fit_likelihood,
+    own_lines,
+    record,
+    response,
+)
+
+PUBLISHED = (1.0568, 1.5420)
+ARM = PaperArm()
+DAMPED = PaperArm(viscous=4.0)
+GUESS = PaperArm(mass_1=3.5, mass_2=1.0, viscous=2.0)
+
+
+def rmse(rate, seeds, order):
+    excitation = own_lines()
+    literal, likely = [], []
+    for seed in range(seeds):
+        position = record(ARM if order == 1 else DAMPED, excitation, order, rate, seed)
+        lines = coefficients(position, excitation)
+        if order == 1:
+            literal.append(fit_as_printed(lines, excitation, ARM))
+        found = fit_likelihood(lines, excitation, GUESS, order)
+        likely.append((found.mass_1, found.mass_2))
+    true = np.array((ARM.mass_1, ARM.mass_2))
+    return [np.sqrt(np.mean((np.array(each) - true) ** 2, axis=0)) if each else None for each in (literal, likely)]
+
+
+def bound(rate):
+    """Cramer-Rao bound of m1 and m2 [kg] for the plant as printed and noise of the paper's variance."""
+    excitation = own_lines()
+    columns = []
+    for step in ({"mass_1": 1e-5}, {"mass_2": 1e-5}):
+        moved = PaperArm(**{name: getattr(ARM, name) + value for name, value in step.items()})
+        slope = (response(moved, excitation, 1) - response(ARM, excitation, 1)) / 1e-5
+        columns.append(np.concatenate((slope.real.ravel(), slope.imag.ravel())))
+    J = np.stack(columns, axis=1)
+    variance = NOISE**2 / 12.0 * 2.0 * FUNDAMENTAL / rate
+    return np.sqrt(variance * np.diag(np.linalg.inv(J.T @ J)))
+
+
+def figures(folder):
+    """Figures 2 to 5: the two torques, the angles as they settle, their steady state, the masses by seed."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    folder.mkdir(parents=True, exist_ok=True)
+    excitation, rate = own_lines(), 100.0
+    time = np.arange(round(rate / FUNDAMENTAL)) / rate
+    torque = excitation.torque @ np.cos(np.outer(excitation.frequency, time))
+    draw(
+        plt,
+        folder / "figure_2.png",
+        time,
+        torque,
+        "torque [N m]",
+        "Figure 2: torques, each on its own lines",
+    )
+    draw(plt, folder / "figure_3.png", *transient(excitation), "angle [rad]", "Figure 3: angles of the corrected arm")
+    noisy = record(ARM, excitation, 1, rate, 0)
+    draw(plt, folder / "figure_4.png", time, noisy, "angle [rad]", "Figure 4: steady state with the paper's noise")
+    masses = []
+    for seed in range(20):
+        lines = coefficients(record(ARM, excitation, 1, rate, seed), excitation)
+        found = fit_likelihood(lines, excitation, GUESS, 1)
+        masses.append((*fit_as_printed(lines, excitation, ARM), found.mass_1, found.mass_2))
+    figure, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5))
+    for axis, true, which in zip(axes, (ARM.mass_1, ARM.mass_2), (0, 1), strict=True):
+        axis.plot([row[which] for row in masses], "x", label="as printed")
+        axis.plot([row[which + 2] for row in masses], ".", label="likelihood")
+        axis.axhline(true, color="black", linewidth=0.8)
+        axis.set_ylabel(f"m{which + 1} [kg]")
+    axes[0].legend()
+    axes[0].set_title("Figure 5: estimates over 20 noise seeds")
+    axes[1].set_xlabel("seed")
+    figure.savefig(folder / "figure_5.png", dpi=120)
+    plt.close(figure)
+
+
+def transient(excitation):
+    """The corrected arm from rest under the excitation: angles (2, samples), by the exponential of its matrix."""
+    from scipy.linalg import expm
+
+    rate, D, K = 20.0, DAMPED.mass_matrix(), DAMPED.stiffness()
+    inverse = np.linalg.inv(D)
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [-inverse @ K, -inverse * DAMPED.viscous]])
+    time = np.arange(round(2.0 * rate / FUNDAMENTAL)) / rate
+    turn = np.exp(1j * np.outer(excitation.frequency, time))
+    steady = response(DAMPED, excitation, 2)
+    settled = (steady @ turn).real
+    speed = (steady * (1j * excitation.frequency) @ turn).real
+    # What is left of the start dies away by itself.
+    away = -np.concatenate((settled[:, 0], speed[:, 0]))
+    fade = expm(A / rate)
+    position = settled.copy()
+    for k in range(time.size):
+        position[:, k] += away[:2]
+        away = fade @ away
+    return time, position
+
+
+def draw(plt, path, time, curves, label, title):
+    figure, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5))
+    for joint, (axis, curve) in enumerate(zip(axes, curves, strict=True), start=1):
+        axis.plot(time, curve, linewidth=0.8)
+        axis.set_ylabel(f"joint {joint}, {label}")
+    axes[0].set_title(title)
+    axes[1].set_xlabel("time [s]")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--figures", type=Path)
+    options = parser.parse_args()
+    literal, ours = rmse(100.0, options.seeds, 1)
+    if options.figures:
+        figures(options.figures)
+    if options.json:
+        keys = ("rmse_m1", "rmse_m2", "literal_rmse_m1", "literal_rmse_m2")
+        print(json.dumps(dict(zip(keys, (*ours.tolist(), *literal.tolist()), strict=True))))
+        return
+    slow_literal, slow = rmse(10.0, options.seeds, 1)
+    _, damped = rmse(100.0, options.seeds, 2)
+    print(f"{machine()}; {options.seeds} seeds, amplitudes {AMPLITUDES} N m; RMSE in kg")
+    rows = (
+        ("published", PUBLISHED),
+        ("as printed, 100 Hz", literal),
+        ("as printed, 10 Hz", slow_literal),
+        ("likelihood, 100 Hz", ours),
+        ("Cramer-Rao bound, 100 Hz", bound(100.0)),
+        ("likelihood, 10 Hz", slow),
+        ("likelihood, corrected arm (second order, friction), 100 Hz", damped),
+    )
+    for name, (first, second) in rows:
+        print(f"{name:60s} m1 {first:8.4f}   m2 {second:8.4f}")
+
+
+if __name__ == "__main__":
+    main()
