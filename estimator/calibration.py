@@ -19,12 +19,14 @@ from estimator.coordinates import Coordinates
 from estimator.drive import motor_torque
 from estimator.errors import ModelError
 from estimator.identify import Estimate
-from estimator.levenberg_marquardt import minimise
+from estimator.levenberg_marquardt import Quadratic, minimise
+from estimator.normal_equations import normal_equations
 from estimator.period import SettledPeriod
 from estimator.physics import Physics
 from estimator.simulation import simulate, steps_per_sample
 
 ANGLE_SCALE = 0.1  # rad
+DIFFERENCE = 1e-6  # of a coordinate, all of the size of 1
 FINE = 1e-6
 WIDTH_FLOOR = 3e-4  # rad/s
 STARTING_WIDTH = 0.005  # rad/s: under a wrong torque constant the first estimate's is worth nothing
@@ -92,12 +94,12 @@ def calibrate(
     if without.joints != with_mass.joints:
         raise ModelError(f"one run has {without.joints} joints and the other {with_mass.joints}: they must agree")
     problem = _Problem((without, with_mass), first, known.change(gravity, without.joints))
-    minimum = minimise(problem.residual, problem.start(), FINE)
+    minimum = minimise(problem.evaluate, problem.start(), FINE)
     x, joints = minimum.x, without.joints
     samples = sum(int(period.valid.sum()) for period in problem.periods)
-    variance = minimum.cost / max(1, samples - x.size)
-    norm = np.sqrt(np.maximum(np.diag(minimum.normal), 1e-300))
-    covariance = variance * np.linalg.pinv(minimum.normal / np.outer(norm, norm), rcond=1e-13, hermitian=True)
+    variance = minimum.at.cost / max(1, samples - x.size)
+    norm = np.sqrt(np.maximum(np.diag(minimum.at.normal), 1e-300))
+    covariance = variance * np.linalg.pinv(minimum.at.normal / np.outer(norm, norm), rcond=1e-13, hermitian=True)
     covariance /= np.outer(norm, norm)
     factor = np.exp(x[:joints])
     slope = problem.coordinates.slopes(x[joints : joints + problem.size])
@@ -116,7 +118,7 @@ def calibrate(
         problem.coordinates.values(x[joints : joints + problem.size]),
         np.sqrt(np.diag(of_values)),
         np.stack(steps),
-        minimum.cost / samples,
+        minimum.at.cost / samples,
     )
 
 
@@ -152,6 +154,18 @@ class _Problem:
                 np.concatenate((filled[:, 0], speed)) / self._state_scale,
             )
         )
+
+    def evaluate(self, x: Array) -> Quadratic:
+        """The sum of squares at `x` with its normal equations, by finite differences."""
+        here = self.residual(x)
+        jacobian = np.empty((here.size, x.size))
+        for index in range(x.size):
+            there = x.copy()
+            there[index] += DIFFERENCE
+            jacobian[:, index] = (self.residual(there) - here) / DIFFERENCE
+        if not (np.all(np.isfinite(here)) and np.all(np.isfinite(jacobian))):
+            return Quadratic(np.inf, np.eye(x.size), np.zeros(x.size))
+        return Quadratic(float(np.sum(here * here)), *normal_equations(jacobian, here))
 
     def residual(self, x: Array) -> Array:
         """Simulated less measured positions of both periods in units of their noise."""

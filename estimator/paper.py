@@ -67,8 +67,7 @@ class Excitation:
     @property
     def frequency(self) -> Array:
         """Angular (lines,) [rad/s]."""
-        frequency: Array = 2.0 * np.pi * FUNDAMENTAL * self.lines
-        return frequency
+        return np.asarray(2.0 * np.pi * FUNDAMENTAL * self.lines, dtype=np.float64)
 
 
 def own_lines() -> Excitation:
@@ -93,8 +92,8 @@ def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
     s = 1j * excitation.frequency
     D, K, F = arm.mass_matrix(), arm.stiffness(), np.eye(2) * arm.viscous
     terms = (s * D[:, :, None] if order == 1 else s * s * D[:, :, None] + s * F[:, :, None]) + K[:, :, None]
-    angles: Complex = np.linalg.solve(np.moveaxis(terms, 2, 0), excitation.torque.T[:, :, None])[:, :, 0].T
-    return angles
+    angles = np.linalg.solve(np.moveaxis(terms, 2, 0), excitation.torque.T[:, :, None])[:, :, 0].T
+    return np.asarray(angles, dtype=np.complex128)
 
 
 def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, seed: int) -> Array:
@@ -175,7 +174,8 @@ def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm
     start = np.array([known.mass_1, known.mass_2, known.viscous][: 1 + order])
     found = least_squares(misfit, start, x_scale=np.maximum(start, 0.1), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     variance = 2.0 * found.cost / (found.fun.size - start.size)
-    std = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    jacobian = np.asarray(found.jac, dtype=np.float64)
+    std = np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     viscous = float(found.x[2]) if order == 2 else 0.0
     return MassEstimate(float(found.x[0]), float(found.x[1]), (float(std[0]), float(std[1])), viscous)
 

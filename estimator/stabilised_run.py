@@ -52,8 +52,10 @@ def _value(physics: Physics, name: str) -> float:
 
 
 def _nudged(physics: Physics, name: str, step: float) -> Physics:
-    if name not in CONSTANTS:
-        return replace(physics, **{name: _value(physics, name) + step})
+    if name == "delay":
+        return replace(physics, delay=physics.delay + step)
+    if name == "lag":
+        return replace(physics, lag=physics.lag + step)
     vector = physics.vector.copy()
     vector[CONSTANTS.index(name)] += step
     return replace(physics, vector=vector)

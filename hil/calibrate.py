@@ -27,7 +27,7 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
         settled_period(each, run.load_facts(), load_samples(run.samples_path, len(each.joints)), IDENTIFY)
         for each, run in ((config, without), (other, with_mass))
     ]
-    first = identify(periods[0], Model(len(config.joints), config.model.friction, config.model.drive))
+    first = identify(periods[0], Model(len(config.joints), config.model.fixed_friction, config.model.drive))
     found = calibrate(periods[0], periods[1], first, known, config.arm.gravity)
     return _described(config, found)
 

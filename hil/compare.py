@@ -63,7 +63,7 @@ def link_length(config: Config) -> float | None:
     """Of link 1 [m]: as the fake arm has it or [known] says; None when nobody knows."""
     if config.known is not None and config.known.length_1 is not None:
         return config.known.quantities()["length_1"].value
-    if config.is_fake and config.fake is not None:
+    if config.is_fake and config.fake is not None and config.fake.arm is not None:
         return config.fake.arm.links[0].length
     return None
 
@@ -101,7 +101,7 @@ def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> 
 
 
 def _ours(config: Config, period: SettledPeriod) -> Peer:
-    model = Model(len(config.joints), config.model.friction, config.model.drive)
+    model = Model(len(config.joints), config.model.fixed_friction, config.model.drive)
     began = time.perf_counter()
     estimate = identify(period, model)
     seconds = time.perf_counter() - began

@@ -189,6 +189,11 @@ class ModelConfig(_Table):
     ripple: bool = Field(False, description="torque ripple over the joint's angle")
     zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
 
+    @property
+    def fixed_friction(self) -> Literal["coulomb", "stribeck", "stribeck_load"]:
+        """What fits that make no choice take: "stribeck" where the file says "auto"."""
+        return "stribeck" if self.friction == "auto" else self.friction
+
     @model_validator(mode="after")
     def _auto_has_no_terms(self) -> Self:
         if self.friction == "auto" and (self.asymmetry or self.ripple or self.zeros):
