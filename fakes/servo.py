@@ -93,6 +93,8 @@ class Servo:
         )
         self.controller = Controller()
         self.health = Health(model.resistance_ohm, temperature_c, thermal, overload)
+        self.motor_current_a = 0.0
+        """Current that the motor is told to carry, in the joint's direction [A]."""
         self._voltage_limited = voltage_limited
         self._input_voltage_v = model.nominal_voltage_v if input_voltage_v is None else input_voltage_v
         self._sag_v = 0.0
@@ -197,10 +199,6 @@ class Servo:
     def value(self, name: str) -> int:
         """The register's present content; KeyError when the model has no such register."""
         return self.memory.value(name)
-
-    @property
-    def zero_ticks(self) -> int:
-        return self.present.zero_ticks
 
     @property
     def direction(self) -> int:
@@ -437,7 +435,6 @@ class Servo:
             self.motor_current_a = self.goal_current_ticks * self._current_per_tick
         elif not moves:
             self.motor_current_a = 0.0
-            """Current that the motor is told to carry, in the joint's direction [A]."""
         self._current_limit: int = memory.get("Current Limit") if "Goal Current" in memory else -1
         by_goal = memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
         known = bool(self.model.operating_modes)
