@@ -10,7 +10,7 @@ import pytest
 from estimator.excitation import Multisine, design_multisine, zippered_lines
 from estimator.period import SettledPeriod
 from fakes.arm import Arm
-from fakes.two_link import make_plant
+from fakes.plant import make_plant
 
 RATE = 400.0
 STEP = 2.0 * math.pi / 4096  # rad
