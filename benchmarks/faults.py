@@ -71,7 +71,7 @@ NAMED: dict[str, str] = {
     FaultKind.CABLE_PULLED: r"Port .* failed|Cannot open|NOT CONFIRMED",
     "wrong_sign": r"against its command|outside its position limit|velocity limit|changes by",
     "torque_taken": r"carries|changes by|stuck|outside its position limit|against its command",
-    "stall": r"deadlines in a row|passed between two commands|does not answer",
+    "stall": r"carries|deadlines in a row|passed between two commands|does not answer",
     "exception": r"injected",
     "SIGINT": r"Ctrl-C",
     "SIGINT twice": r"Ctrl-C",

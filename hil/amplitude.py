@@ -1,5 +1,6 @@
 """The largest torque whose chance of touching a limit is small enough, per joint, by dry runs."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -18,7 +19,7 @@ SEARCH_ARMS = 48
 """Arms during the search; the result is checked on all of them."""
 
 _ROUNDS = 14
-_CLOSE = (0.93, 1.0)
+_CLOSE = 0.94
 """Of the limits, at the wanted chance: where the search is content."""
 
 _LARGEST_STEP = 2.0
@@ -66,27 +67,52 @@ def with_peaks(config: Config, peak_torque: Array) -> Plan:
 
 def _search(config: Config, base: Plan, torque: Array, ensemble: Ensemble, share: float) -> Array:
     """Joint by joint towards the limits; the joints pull at each other, so it takes some rounds."""
-    deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
     most = _most_torque(config)
-    first = base.first_segment()
-    best = 0.25 * torque
+    first = base.first_segment() if share < 1.0 else base
+
+    def reached_with(tried: Array) -> Array:
+        return _reached(config, predict(config, scaled(config, first, tried), ensemble), share)
+
+    best, used = 0.25 * torque, 0.0
     torque = np.minimum(torque, most)
     step = 1.0
     for _ in range(_ROUNDS):
-        prediction = predict(config, scaled(config, first, torque), ensemble)
-        reached = prediction.share_at(deviations)[:GUARDED].max(axis=0) / share
-        counted = prediction.shares[:, :GUARDED].max(axis=(0, 1)) / share
-        reached = np.maximum(reached, counted)
-        if reached.max() <= 1.0 and torque.prod() > best.prod():
-            best = torque
-        wanted = np.where(reached > _CLOSE[1], 0.97 * _CLOSE[1], 1.0) / np.minimum(reached, 1e3)
-        content = (reached <= _CLOSE[1]) & ((reached >= _CLOSE[0]) | (torque >= 0.999 * most))
-        if content.all():
+        reached = reached_with(torque)
+        if reached.max() <= 1.0 and reached.min() > used:
+            best, used = torque, float(reached.min())
+        if reached.max() <= 1.0 and ((reached >= _CLOSE) | (torque >= 0.999 * most)).all():
             break
-        factor = np.clip(wanted**step, 1 / _LARGEST_STEP, _LARGEST_STEP)
-        torque = np.minimum(torque * factor, most)
+        wanted = np.where(reached > 1.0, 0.97, 0.99) / np.clip(reached, 1e-3, 1e3)
+        torque = np.minimum(torque * np.clip(wanted**step, 1 / _LARGEST_STEP, _LARGEST_STEP), most)
         step = max(0.4, 0.85 * step)
-    return best
+    return _polished(reached_with, best, most)
+
+
+def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array) -> Array:
+    """Raise the joint that uses least of its limits, a little at a time, while all stay within."""
+    reached = reached_with(torque)
+    blocked = np.zeros(torque.size, dtype=bool)
+    for _ in range(_ROUNDS):
+        blocked |= (reached >= _CLOSE) | (torque >= 0.999 * most)
+        if blocked.all():
+            break
+        joint = int(np.argmin(np.where(blocked, np.inf, reached)))
+        tried = torque.copy()
+        tried[joint] = min(1.06 * tried[joint], most[joint])
+        there = reached_with(tried)
+        if there.max() <= 1.0:
+            torque, reached = tried, there
+        else:
+            blocked[joint] = True
+    return torque
+
+
+def _reached(config: Config, prediction: Prediction, share: float) -> Array:
+    """How much of `share` of its limits each joint uses (joints,), at the wanted chance and in the worst arm."""
+    deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
+    foreseen = prediction.share_at(deviations)[:GUARDED].max(axis=0)
+    counted = prediction.shares[:, :GUARDED].max(axis=(0, 1))
+    return np.asarray(np.maximum(foreseen, counted) / share)
 
 
 def _chance(prediction: Prediction, share: float) -> float:

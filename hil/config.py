@@ -204,7 +204,7 @@ class ModelConfig(_Table):
 class SafetyConfig(_Table):
     """`[safety]`: what stops the arm, beside the joints' own limits, and how."""
 
-    watchdog: float = Field(0.1, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
+    watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
     allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
     max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")

@@ -1,0 +1,109 @@
+"""Dry runs: what they foresee, what they allow, and the command around them."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.dry_run import prior_study
+from hil.amplitude import largest_amplitude
+from hil.cli import main
+from hil.config import Config, load_config, parse_config
+from hil.dry_run import GUARDED, predict
+from hil.ensemble import prior_ensemble
+from hil.errors import ConfigError
+from hil.plan import make_plan
+from hil.stopping import stopping_distance
+
+Arm = Callable[..., Config]
+KNOWN = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.180]\n")
+
+
+@pytest.fixture
+def known(arm: Arm) -> Config:
+    return arm(KNOWN, ("seed = 1\n", "seed = 1\nheld_out = false\n"))
+
+
+def hil(*arguments: object) -> int:
+    sys.argv = ["hil", *map(str, arguments)]
+    with pytest.raises(SystemExit) as caught:
+        main()
+    return int(caught.value.code or 0)
+
+
+def test_the_same_prior_gives_the_same_prediction_and_more_torque_larger_peaks(known: Config) -> None:
+    ensemble = prior_ensemble(known, 24)
+    plan = make_plan(known)
+    first, again = predict(known, plan, ensemble), predict(known, plan, ensemble)
+    assert (first.values == again.values).all()
+    experiment = known.experiment.model_copy(update={"peak_torque": [0.4, 0.21]})
+    less = predict(known, make_plan(known.model_copy(update={"experiment": experiment})), ensemble)
+    assert (less.median[2] < first.median[2]).all()
+    assert (first.quantile[1:] >= first.median[1:] - 1e-9).all() and (first.quantile[0] <= first.median[0]).all()
+
+
+def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known: Config) -> None:
+    found = largest_amplitude(known, prior_ensemble(known, 48))
+    assert found.prediction.stop_chance <= known.safety.limit_chance
+    assert (found.prediction.shares[:, :GUARDED] < 1.0).all()
+    assert found.prediction.shares[:, :GUARDED].max() > 0.7, "and not for lack of trying"
+
+
+def test_a_brake_stops_sooner_than_the_watchdog(known: Config) -> None:
+    ways = stopping_distance(known, prior_ensemble(known, 12), np.array([4.0, 4.0]), np.array([0.4, 0.2]))
+    assert (ways.braked <= ways.cut + 1e-9).all() and (ways.cut <= ways.watchdog + 1e-9).all()
+    assert (ways.braked > 0.05).all()
+
+
+def test_seen_peaks_stay_within_the_predicted_ones() -> None:
+    study = prior_study(12)
+    assert study["within_quantile"] >= 11 / 12 and study["limit_touched"] == 0
+
+
+def test_without_link_lengths_there_is_no_prior(arm: Arm) -> None:
+    with pytest.raises(ConfigError, match=r"needs arm\.link_lengths"):
+        prior_ensemble(arm(), 4)
+
+
+def test_pilot_needs_link_lengths_and_peak_torque_may_be_left_out(arm_file: Callable[..., Path]) -> None:
+    with pytest.raises(ConfigError, match=r"pilot = true needs arm\.link_lengths"):
+        load_config(arm_file(("seed = 1\n", "seed = 1\npilot = true\n")))
+    text = arm_file(KNOWN).read_text(encoding="utf-8").replace("peak_torque", "# peak_torque")
+    config = parse_config(text, Path("arm.toml"))
+    assert config.experiment.peak_torque is None
+    with pytest.raises(ConfigError, match="peak_torque is missing"):
+        make_plan(config)
+
+
+@pytest.mark.parametrize(("peak", "code"), [("[0.20, 0.10]", 0), ("[1.60, 1.20]", 1)])
+def test_the_verdict_is_the_exit_code(
+    arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], peak: str, code: int
+) -> None:
+    path = arm_file(KNOWN, ("[0.80, 0.42]", peak), ("seed = 1\n", "seed = 1\nheld_out = false\n"))
+    assert hil("dry-run", path, "--arms", "24", "--json") == code
+    said: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert said["safe"] is (code == 0) and said["arms"] == 24
+    elbow = said["asked"]["joints"]["elbow"]
+    assert set(elbow) == {"lowest position", "highest position", "velocity", "current", "torque", "power"}
+    assert elbow["velocity"]["limit"] == 20.0 and elbow["velocity"]["unit"] == "rad/s"
+
+
+def test_a_table_for_a_person_with_what_the_servos_say(
+    arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    path = arm_file(KNOWN, ("[0.80, 0.42]", "[0.20, 0.10]"), ("seed = 1\n", "seed = 1\nheld_out = false\n"))
+    assert hil("dry-run", path, "--arms", "20", "--servos") == 0
+    said = capsys.readouterr().out
+    for part in (
+        "SAFE",
+        "Largest safe torque",
+        "own current limit 3.21 A",
+        "With torque off at 400 per second",
+        "settle",
+    ):
+        assert part in said, part

@@ -1,0 +1,69 @@
+"""Pilot, then full, from joint limits and link lengths only; and arms that need a stabiliser."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.config import load_config
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
+from hil.pilot import identify_in_steps
+from hil.run_folder import RunFolder
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@pytest.fixture(scope="module")
+def in_steps(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path, list[str]]:
+    config = load_config(CONFIGS / "first_time.toml")
+    assert config.experiment.peak_torque is None and config.arm.prior is None
+    run = RunFolder.create(tmp_path_factory.mktemp("steps") / "run", config)
+    said: list[str] = []
+    _, result = identify_in_steps(config, run, config.path, lambda _: None, said.append)
+    return result, run.path, said
+
+
+def test_the_full_run_uses_the_room_and_beats_the_pilot(in_steps: Any) -> None:
+    result, path, _ = in_steps
+    config = load_config(CONFIGS / "first_time.toml")
+    full = result["steps"][-1]
+    low, high = np.array(full["seen"])[:2]
+    allowed = np.ptp([joint.position_limit for joint in config.joints], axis=1)
+    assert ((high - low) / allowed >= 0.7).all()
+    pilot = json.loads((path / "pilot-1" / "result.json").read_text(encoding="utf-8"))
+    for name, entry in result["parameters"].items():
+        assert pilot["parameters"][name]["std"] / entry["std"] >= 10, name
+        assert abs(entry["value"] - result["truth"][name]) <= 0.01 * abs(result["truth"][name]), name
+
+
+def test_every_step_says_predicted_against_seen(in_steps: Any) -> None:
+    result, _, said = in_steps
+    assert result["steps"][0]["name"] == "Pilot"
+    assert sum("predicted" in line and "seen" in line for line in said) == len(result["steps"])
+    full = result["steps"][-1]
+    rest = np.array([-np.pi / 2, 0.0])
+    for row, origin in ((0, rest), (1, rest), (2, 0.0)):
+        foreseen, seen = (np.array(full[key])[row] - origin for key in ("predicted_median", "seen"))
+        assert np.abs(foreseen / seen - 1).max() <= 0.10
+
+
+def test_the_run_folder_estimates_again_with_the_torque_that_was_found(in_steps: Any) -> None:
+    result, path, _ = in_steps
+    folder = RunFolder.open(path)
+    assert folder.load_config().experiment.peak_torque == pytest.approx(result["steps"][-1]["peak_torque"])
+    assert (path / "config.toml").read_bytes() == (CONFIGS / "first_time.toml").read_bytes()
+    assert estimate_run(folder)["parameters"] == result["parameters"]
+
+
+def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None:
+    config = load_config(CONFIGS / "fake_inverted.toml")
+    run = RunFolder.create(tmp_path / "run", config)
+    run_experiment(config, run, config.path, lambda _: None)
+    result = estimate_run(run)
+    for name in ("inertia_1", "inertia_2", "armature_2", "gravity_1", "gravity_2", "viscous_1", "coulomb_1"):
+        assert abs(result["parameters"][name]["value"] / result["truth"][name] - 1) <= 0.02, name
+    assert max(result["validation"]["held_out_rms"]) <= 0.01
+    assert all(rms > 0.0 for rms in result["stabiliser"]["rms_torque"])
