@@ -268,11 +268,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="one JSON object and nothing else")
     parser.add_argument("--servos", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=42)
-    parser.add_argument("--cycles", type=int, default=100, help="in each round at 1 Mbaud; five times as many at once")
+    parser.add_argument("--rounds", type=int, default=42, help="at 1 Mbaud; twice as many at once")
+    parser.add_argument("--cycles", type=int, default=100, help="a round at 1 Mbaud; three times as many at once")
     options = parser.parse_args()
     with responder_binary() as binary:
-        at_once = measure(binary, options.servos, 0, options.rounds, 5 * options.cycles)
+        at_once = measure(binary, options.servos, 0, 2 * options.rounds, 3 * options.cycles)
         wired = measure(binary, options.servos, BYTE_NS, options.rounds, options.cycles)
         samples_cpu = {str(options.servos): round(medians(wired)["ours, whole sample"].cpu_us, 1)}
         with served_pty(binary, BYTE_NS) as device, whole_sample(device, 6) as cycle:
