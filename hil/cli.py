@@ -78,9 +78,15 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
 
 
 @app.command(epilog="Example: hil estimate runs/20261121-153000-fake_two_link")
-def estimate(run: cli_data.Runs, config: cli_data.ArmPath = None, json_only: Json = False) -> None:
+def estimate(
+    run: cli_data.Runs,
+    config: cli_data.ArmPath = None,
+    unsettled: Annotated[
+        bool, typer.Option("--unsettled", help="From all samples, by multiple shooting: no settled period is needed.")
+    ] = False,
+    json_only: Json = False,
+) -> None:
     """Estimate again from a recording; writes its result.json anew. Or from CSV files of any motion."""
-    from hil.errors import RecordingCutShort
     from hil.estimate import estimate_run
     from hil.run_folder import RunFolder
     from hil.terminal import Terminal
@@ -90,13 +96,12 @@ def estimate(run: cli_data.Runs, config: cli_data.ArmPath = None, json_only: Jso
         return
     folder = RunFolder.open(run[0])
     terminal = Terminal(quiet=json_only)
-    try:
-        with terminal.busy("Estimating"):
-            result = estimate_run(folder)
-            cli_results.write_report(folder.path)
-    except RecordingCutShort as error:
-        cli_data.estimate_unsettled(folder, error, json_only)
+    if unsettled:
+        cli_data.estimate_unsettled(folder, json_only)
         return
+    with terminal.busy("Estimating"):
+        result = estimate_run(folder)
+        cli_results.write_report(folder.path)
     _show(result, folder.load_config(), folder.path, json_only)
 
 

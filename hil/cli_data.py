@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hil.errors import ConfigError, RecordingCutShort
+from hil.errors import ConfigError
 
 if TYPE_CHECKING:
     from hil.run_folder import RunFolder
@@ -47,14 +47,12 @@ def estimate_csv(paths: Sequence[Path], config: Path | None, json_only: bool) ->
     show_any(result, json_only)
 
 
-def estimate_unsettled(run: "RunFolder", why: RecordingCutShort, json_only: bool) -> None:
+def estimate_unsettled(run: "RunFolder", json_only: bool) -> None:
     """Estimate a run that holds no settled period from all its samples, by multiple shooting."""
     from hil.estimate_any import estimate_unsettled as estimate
     from hil.terminal import Terminal
 
-    terminal = Terminal(quiet=json_only)
-    terminal.say(f"{why} Until then, from all samples by multiple shooting:")
-    with terminal.busy("Estimating by multiple shooting"):
+    with Terminal(quiet=json_only).busy("Estimating by multiple shooting"):
         result = estimate(run)
     show_any(result, json_only)
 

@@ -16,7 +16,7 @@ from hil.cli import main
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SHORT = (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
+SHORT = (("period = 10.0 ", "period = 5.0 "), ("band = [0.1, 5.0]", "band = [0.2, 5.0]"))
 
 RUN_ELSEWHERE = {
     "sudo": "changes the machine",
