@@ -80,9 +80,19 @@ def result_ensemble(result: dict[str, Any], count: int, farther: float = 1.0, se
     widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2
     extra = np.diag((MODEL_SPREAD * max(1.0, farther) * value) ** 2)
     random = np.random.default_rng((seed, 7))
-    drawn = random.multivariate_normal(value, widened + extra, size=count, method="eigh")
+    drawn = _draws(random, value, widened + extra, count)
     physics = tuple(Physics.of(_physical(dict(zip(names, row.tolist(), strict=True)), known)) for row in drawn)
     return Ensemble(physics, np.ones((count, joints)), "result")
+
+
+def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
+    """Normal draws (count, parameters), in units of each standard deviation: parameters differ by powers of ten."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    correlation = covariance / np.outer(scale, scale)
+    size, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))
+    spread = axes * np.sqrt(np.maximum(size, 0.0))
+    drawn: Array = mean + scale * (random.standard_normal((count, mean.size)) @ spread.T)
+    return drawn
 
 
 def nominal(result: dict[str, Any]) -> Physics:
