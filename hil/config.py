@@ -191,7 +191,7 @@ class SafetyConfig(_Table):
     allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
     max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")
-    max_late: int = Field(5, ge=1, le=1000, description="deadlines in a row that may be missed")
+    max_late: int = Field(20, ge=1, le=1000, description="deadlines in a row that may be missed")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
