@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 PRIOR_ARMS = 128
 RESULT_ARMS = 64
-PILOT_SHARES = (0.35, 0.5, 0.75, 1.0)
+PILOT_SHARES = (0.4, 0.6, 0.8, 1.0)
 """Of the limits: how far the pilot goes; more where the arm did not move enough to be identified."""
 
 MOST_STEPS = 4
