@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 SEARCH_ARMS = 48
 """Arms during the search; the result is checked on all of them."""
 
+PRIOR_ROOM = 0.9
+"""Of the limits, while nothing was identified: a wide prior's tail is longer than the simulated arms show."""
+
 _ROUNDS = 14
 _CLOSE = 0.94
 """Of the limits, at the wanted chance: where the search is content."""
@@ -43,6 +46,8 @@ def largest_amplitude(config: Config, ensemble: Ensemble, share: float = 1.0, pl
     plan: its waves are scaled; by default low-crest multisines. Raises ExperimentError when not even a small torque is
     safe.
     """
+    if ensemble.source == "prior":
+        share *= PRIOR_ROOM
     torque = _most_torque(config) / 8
     base = with_peaks(config, torque) if plan is None else plan
     torque = base.segments[0].peak_torque
@@ -68,7 +73,7 @@ def with_peaks(config: Config, peak_torque: Array) -> Plan:
 def _search(config: Config, base: Plan, torque: Array, ensemble: Ensemble, share: float) -> Array:
     """Joint by joint towards the limits; the joints pull at each other, so it takes some rounds."""
     most = _most_torque(config)
-    first = base.first_segment() if share < 1.0 else base
+    first = base.first_segment() if ensemble.source == "prior" else base
 
     def reached_with(tried: Array) -> Array:
         return _reached(config, predict(config, scaled(config, first, tried), ensemble), share)
@@ -116,10 +121,9 @@ def _reached(config: Config, prediction: Prediction, share: float) -> Array:
 
 
 def _chance(prediction: Prediction, share: float) -> float:
-    if share >= 1.0:
-        return prediction.stop_chance
-    mean_shares = prediction.shares[:, :GUARDED] / share
-    return float(np.mean((mean_shares >= 1.0).any(axis=(1, 2))))
+    """Chance that an arm passes `share` of a limit: counted, and for whole limits also by the tail."""
+    counted = float(np.mean((prediction.shares[:, :GUARDED] >= share).any(axis=(1, 2))))
+    return max(counted, prediction.stop_chance)
 
 
 def _most_torque(config: Config) -> Array:

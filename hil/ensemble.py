@@ -14,8 +14,10 @@ from hil.result import QUANTISATION_FLOOR_TICKS
 
 Array = NDArray[np.float64]
 
-MODEL_SPREAD = 0.01
-"""Relative, on every parameter of a result: what a model leaves out and its covariance cannot know."""
+MODEL_SPREAD = 0.005
+"""Relative, on every parameter of a result: what a model leaves out and its covariance cannot know. Multiplied by how
+many times farther than it was identified the model is to be trusted.
+"""
 
 _LEAST_SHARE = 0.05  # of its value, below which no draw of a positive parameter may fall
 _LEAST_WIDTH = 0.01  # rad/s of friction's step: narrower ones move the arm alike and take longer to simulate
@@ -57,8 +59,11 @@ def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
     return Ensemble(physics, scale, "prior")
 
 
-def result_ensemble(result: dict[str, Any], count: int, seed: int = 0) -> Ensemble:
-    """From a result.json, its covariance widened by what the residual says the model lacks. Raises RunFolderError."""
+def result_ensemble(result: dict[str, Any], count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
+    """From a result.json, its covariance widened by what the residual says the model lacks. Raises RunFolderError.
+
+    farther: range of motion that will be simulated over the range that the result was identified on.
+    """
     try:
         names = list(result["covariance"]["names"])
         covariance = np.array(result["covariance"]["matrix"], dtype=float)
@@ -73,11 +78,21 @@ def result_ensemble(result: dict[str, Any], count: int, seed: int = 0) -> Ensemb
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)
     # A residual beyond rounding is model error, which shifts parameters by more than their covariance says.
     widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2
-    extra = np.diag((MODEL_SPREAD * value) ** 2)
+    extra = np.diag((MODEL_SPREAD * max(1.0, farther) * value) ** 2)
     random = np.random.default_rng((seed, 7))
-    drawn = random.multivariate_normal(value, widened + extra, size=count, method="eigh")
+    drawn = _draws(random, value, widened + extra, count)
     physics = tuple(Physics.of(_physical(dict(zip(names, row.tolist(), strict=True)), known)) for row in drawn)
     return Ensemble(physics, np.ones((count, joints)), "result")
+
+
+def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
+    """Normal draws (count, parameters), in units of each standard deviation: parameters differ by powers of ten."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    correlation = covariance / np.outer(scale, scale)
+    size, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))
+    spread = axes * np.sqrt(np.maximum(size, 0.0))
+    drawn: Array = mean + scale * (random.standard_normal((count, mean.size)) @ spread.T)
+    return drawn
 
 
 def nominal(result: dict[str, Any]) -> Physics:

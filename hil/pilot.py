@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 PRIOR_ARMS = 128
 RESULT_ARMS = 64
-PILOT_SHARES = (0.3, 0.5, 0.75, 1.0)
+PILOT_SHARES = (0.4, 0.6, 0.8, 1.0)
 """Of the limits: how far the pilot goes; more where the arm did not move enough to be identified."""
 
 MOST_STEPS = 4
@@ -88,7 +88,7 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
     steps: list[Step] = []
     result = _pilot(config, run, shown_path, watch, say, steps)
     while True:
-        ensemble = result_ensemble(result, RESULT_ARMS)
+        ensemble = result_ensemble(result, RESULT_ARMS, _farther(config, steps[-1]))
         full = _full_amplitude(config, ensemble, result)
         certain = _typical_share(full) >= CERTAIN
         if certain or len(steps) >= MOST_STEPS - 1:
@@ -146,6 +146,12 @@ def _full_amplitude(config: Config, ensemble: Ensemble, result: dict[str, Any]) 
     optimal = config.experiment.design == "optimal"
     plan = designed_plan(config, arm, list(result["parameters"])) if optimal else roomy_plan(config, arm)
     return largest_amplitude(config, ensemble, plan=plan)
+
+
+def _farther(config: Config, step: Step) -> float:
+    """How many times farther the limits allow to go than this step went, the joint with most room."""
+    allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
+    return float((allowed / np.maximum(step.seen[1] - step.seen[0], 1e-3)).max())
 
 
 def _typical_share(found: Amplitude) -> float:

@@ -50,7 +50,7 @@ def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known
     found = largest_amplitude(known, prior_ensemble(known, 48))
     assert found.prediction.stop_chance <= known.safety.limit_chance
     assert (found.prediction.shares[:, :GUARDED] < 1.0).all()
-    assert found.prediction.shares[:, :GUARDED].max() > 0.7, "and not for lack of trying"
+    assert found.prediction.shares[:, :GUARDED].max() > 0.6, "and not for lack of trying"
 
 
 def test_a_brake_stops_sooner_than_the_watchdog(known: Config) -> None:
