@@ -4,6 +4,11 @@ N = J'WJ is the information, S the scatter of the score J'Wr. Independent errors
 joint, and what a model lacks, are correlated over samples, which S sees when the score's products are summed
 over lags (Newey and West, Econometrica 55 (1987) 703). Bartlett's kernel of L lags is the sum over all windows
 of L samples of the window's own score times itself, over L: one pass, whatever L.
+
+What a model lacks is more than correlated: it is the same at every reversal, so that no number of samples averages
+it out, and what of it looks like a parameter leaves no residual at all. So the part of the residual that is not
+white widens the errors further: 1.4 standard deviations reach as far as the parameters can move before the motion
+changes, RMS, by as much as that part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
 from collections.abc import Sequence
@@ -61,6 +66,21 @@ def correlation_time(residuals: Sequence[Array]) -> int:
     return min(longest, LONGEST_LAG)
 
 
+def structured_share(residual: Array) -> Array:
+    """Share of each residual's power (joints, samples) that is not white (joints,); 0 within chance of white.
+
+    White noise has the same power in every Fourier line; the upper half of the lines, far above the motion, tells
+    how much.
+    """
+    samples = residual.shape[1]
+    power = np.abs(np.fft.rfft(residual, axis=1)) ** 2 / samples**2
+    upper = power[:, power.shape[1] // 2 :].mean(axis=1) * samples
+    total = np.mean(residual**2, axis=1)
+    chance = 1.0 + 4.0 / np.sqrt(samples / 4.0)
+    share: Array = np.clip(1.0 - chance * upper / np.maximum(total, 1e-300), 0.0, 1.0)
+    return share
+
+
 def autocorrelation(residual: Array, lags: int) -> Array:
     """Autocorrelation of one residual (samples,) at 0 to `lags` samples (lags + 1,)."""
     centred = residual - residual.mean()
@@ -70,12 +90,15 @@ def autocorrelation(residual: Array, lags: int) -> Array:
     return rho
 
 
-def robust_covariance(at: Quadratic, scatter: Array | None, samples: int, count: int) -> Array:
+def robust_covariance(
+    at: Quadratic, scatter: Array | None, samples: int, count: int, structured: float = 0.0
+) -> Array:
     """Covariance of the first `count` coordinates (count, count), the others unknown with them.
 
     The larger of the sandwich and of what independent errors would give, direction by direction: a short
     recording cannot prove that its errors cancel. Without `scatter` that of independent errors of variance 1.
-    Infinite for a coordinate that leaves no trace.
+    `structured` is the part of the sum of squares that is a model's error. Infinite for a coordinate that leaves no
+    trace.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen = norm > 1e-12 * norm.max()
@@ -87,6 +110,7 @@ def robust_covariance(at: Quadratic, scatter: Array | None, samples: int, count:
     if scatter is not None:
         robust = inverse @ (scatter[np.ix_(seen, seen)] / lengths) @ inverse * (samples / freedom)
         found = _larger(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
+        found = found + 0.5 * structured * inverse
     covariance[np.ix_(seen, seen)] = found / lengths
     hidden = np.flatnonzero(~seen)
     covariance[hidden, hidden] = np.inf

@@ -9,13 +9,13 @@ far outside are weighed down there (Huber): a few wild readings then cost nothin
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
-from estimator.covariance import Scatter, correlation_time, robust_covariance
+from estimator.covariance import Scatter, correlation_time, robust_covariance, structured_share
 from estimator.least_squares import LinearEstimate
 from estimator.levenberg_marquardt import Minimum, Quadratic, minimise
 from estimator.model import Model
@@ -31,6 +31,9 @@ Run = SimulatedRun | StabilisedRun
 WIDTH_FLOOR = 3e-4  # rad/s: narrower cannot be told from friction that sticks
 # From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both.
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
+# An arm that swings past the upright amplifies what is still wrong: its beginning is fitted before the whole.
+HORIZONS = (0.125, 0.25, 0.5)
+LEAST_HORIZON = 10  # samples of all joints for each unknown
 COARSE = 1e-3  # relative gain in the sum of squares at which each try ends
 FINE = 1e-6
 HASTY = 2e-2
@@ -76,6 +79,8 @@ class Problem:
     """Of the state at the first sample (2 joints,) [rad, rad/s]."""
     weights: tuple[Array, ...]
     """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
+    share: float = 1.0
+    """Of each run, from its beginning, that is looked at."""
 
     @property
     def count(self) -> int:
@@ -97,11 +102,13 @@ class Problem:
         """The weighted sum of squares at `x` with its normal equations."""
         physics = self.physics(x)
         total = Quadratic(0.0, np.zeros((x.size, x.size)), np.zeros(x.size))
+        if not np.all(np.isfinite(physics.vector)):
+            return replace(total, cost=np.inf)
         for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
             transform = self._transform(x, index)
             n, b = np.zeros((transform.shape[0],) * 2), np.zeros(transform.shape[0])
             cost = 0.0
-            for part, position, derivative in run.pieces(physics, self.start(x, index), self.coordinates.names):
+            for part, position, derivative in run.pieces(physics, self.start(x, index), self.coordinates.names, self.share):
                 root = weight[:, part]
                 r = (root * (position - run.measured[:, part])).reshape(-1)
                 J = (root[:, :, None] * derivative).reshape(r.size, -1)
@@ -156,12 +163,16 @@ def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstim
     tries: list[Minimum] = []
     for width in STARTING_WIDTHS:
         x = np.concatenate((problem.coordinates.coordinates(_start(model, linear, ripple, width)), states))
+        for share in HORIZONS:
+            if share * samples < LEAST_HORIZON * x.size:
+                continue
+            x = minimise(replace(problem, share=share).evaluate, x, HASTY).x
         tries.append(minimise(problem.evaluate, x, enough))
         if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
             break
     best = min(tries, key=lambda found: found.at.cost)
     weights, outliers = _weights(periods, problem.positions(best.x))
-    problem = Problem(problem.runs, problem.coordinates, problem.state_scale, weights)
+    problem = replace(problem, weights=weights)
     hopeless = hasty and best.at.cost > HOPELESS * samples
     minimum = minimise(problem.evaluate, best.x, HASTY if hopeless else FINE)
     return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, minimum)))
@@ -215,14 +226,15 @@ def _fit(periods: Sequence[SettledPeriod], problem: Problem, minimum: Minimum, o
     x = minimum.x
     positions = problem.positions(x)
     residuals = [
-        weight * (period.filled() - position)
+        weight * np.where(period.valid, period.position - position, 0.0)
         for period, position, weight in zip(periods, positions, problem.weights, strict=True)
     ]
     lags = correlation_time(residuals)
     count = problem.count
     samples = int(sum(period.valid.sum() for period in periods))
     slopes = problem.coordinates.slopes(x[:count])
-    robust = robust_covariance(minimum.at, problem.scatter(x, lags), samples, count)
+    structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
+    robust = robust_covariance(minimum.at, problem.scatter(x, lags), samples, count, structured)
     # Weights are of the residual as it turned out; the noise that is known would give larger ones.
     known = min(float(np.median(w[w > 0.0] * p.noise.min())) for w, p in zip(problem.weights, periods, strict=True))
     white = known**2 * robust_covariance(minimum.at, None, samples, count)

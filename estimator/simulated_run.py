@@ -40,15 +40,19 @@ class SimulatedRun:
         torque = motor_torque(self.command, self.rate, self.command_to_sample, self.steps, **times)
         return simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0]
 
-    def pieces(self, physics: Physics, start: Array, names: tuple[str, ...]) -> Iterator[tuple[slice, Array, Array]]:
+    def pieces(
+        self, physics: Physics, start: Array, names: tuple[str, ...], share: float = 1.0
+    ) -> Iterator[tuple[slice, Array, Array]]:
         """Piece after piece: which samples, their angles (joints, samples) [rad], and the derivatives of these
-        (joints, samples, causes) by the parameters `names` and then by the state at the first sample."""
+        (joints, samples, causes) by the parameters `names` and then by the state at the first sample. Ends after
+        `share` of the samples."""
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
         motion = Sensitive(physics, start, (*names, *state), 1.0 / (self.rate * self.steps))
         times = {"delay": physics.delay, "lag": physics.lag}
         torque = motor_torque(self.command, self.rate, self.command_to_sample, self.steps, **times)
         slopes = torque_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
+        samples = round(share * samples)
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
             yield part, *motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part])

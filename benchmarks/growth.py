@@ -1,0 +1,94 @@
+"""Time and memory of both stages as the period grows, and stage 1 at the usual size.
+
+    python benchmarks/growth.py [--json] [--most N]
+
+One settled period of the ideal arm, 4,000 to 1,000,000 samples at 400 Hz with the same lines, each size in a process
+of its own. The motion comes from the estimator's own simulation, rounded to encoder steps: only time is measured here.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+
+import numpy as np
+from machine import machine
+from recorded_arm import COMMAND_TO_SAMPLE, RATE, STEP, servo_arm
+
+from estimator.drive import motor_torque
+from estimator.excitation import design_multisine
+from estimator.identify import identify
+from estimator.least_squares import fit_lines
+from estimator.model import Model
+from estimator.period import SettledPeriod
+from estimator.physics import Physics
+from estimator.simulation import simulate, steps_per_sample
+from fakes.arm import base_parameters
+
+SIZES = (4_000, 16_000, 62_500, 250_000, 1_000_000)
+LINES = 25  # per joint
+PEAK = (0.50, 0.30)  # N m: never past the upright, where a long motion would be chaotic
+
+
+def period_of(samples: int) -> SettledPeriod:
+    """A period with LINES lines per joint up to 5 Hz, whatever its length."""
+    period = samples / RATE
+    spacing = max(1, round(5.0 * period / (2 * LINES)))
+    lines = [range(spacing * (1 + joint), spacing * (1 + joint) + 2 * spacing * LINES, 2 * spacing) for joint in (0, 1)]
+    wave = design_multisine(RATE, period, lines, PEAK, 2)
+    truth = base_parameters(servo_arm({"coulomb_width": 0.05}))
+    physics = Physics.of({**truth, "coulomb_width_1": 0.05, "coulomb_width_2": 0.05})
+    steps = steps_per_sample(RATE)
+    torque = motor_torque(wave.torque, RATE, COMMAND_TO_SAMPLE, steps, delay=0.0, lag=0.0)
+    state = np.array([[-np.pi / 2, 0.0], [0.0, 0.0]])
+    _, state = simulate(physics, state, torque[:, -40 * int(RATE) :], 1.0 / (RATE * steps))
+    position, _ = simulate(physics, state, torque, 1.0 / (RATE * steps))
+    return SettledPeriod(RATE, wave.torque, np.round(position / STEP) * STEP, COMMAND_TO_SAMPLE, np.full(2, STEP))
+
+
+def measure(samples: int) -> dict[str, float]:
+    identify(period_of(4_000), Model(2))  # compiles
+    period = period_of(samples)
+    seconds = []
+    for _ in range(5 if samples <= 16_000 else 1):
+        started = time.perf_counter()
+        fit_lines(period)
+        seconds.append(time.perf_counter() - started)
+    started = time.perf_counter()
+    estimate = identify(period, Model(2))
+    both = time.perf_counter() - started
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    evaluations = estimate.iterations
+    return {"samples": samples, "stage_1": min(seconds), "both": both, "evaluations": evaluations, "peak_gib": peak}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--most", type=int, default=SIZES[-1])
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        print(json.dumps(measure(options.one)))
+        return
+    measured = []
+    for samples in (size for size in SIZES if size <= options.most):
+        command = [sys.executable, __file__, "--one", str(samples)]
+        measured.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+    if options.json:
+        print(json.dumps(measured))
+        return
+    print(machine())
+    print("  samples   stage 1 [s]   both [s]   evaluations   both per evaluation and sample [us]   peak [GiB]")
+    for row in measured:
+        each = 1e6 * row["both"] / row["samples"] / row["evaluations"]
+        print(
+            f"{row['samples']:9,d} {row['stage_1']:13.4f} {row['both']:10.2f} {row['evaluations']:13d} {each:37.2f} "
+            f"{row['peak_gib']:12.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
