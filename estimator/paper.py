@@ -175,7 +175,8 @@ def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm
     start = np.array([known.mass_1, known.mass_2, known.viscous][: 1 + order])
     found = least_squares(misfit, start, x_scale=np.maximum(start, 0.1), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     variance = 2.0 * found.cost / (found.fun.size - start.size)
-    std = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    J = np.asarray(found.jac)
+    std = np.sqrt(variance * np.diag(np.linalg.inv(J.T @ J)))
     viscous = float(found.x[2]) if order == 2 else 0.0
     return MassEstimate(float(found.x[0]), float(found.x[1]), (float(std[0]), float(std[1])), viscous)
 
