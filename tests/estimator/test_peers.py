@@ -28,9 +28,9 @@ def test_filtered_inverse_dynamics_is_within_percents(ideal_arm: Arm, ideal_peri
 
 
 def test_recursive_least_squares_gets_near_it(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
-    found = fit_recursively([joined(ideal_period, 1)], 20.0, 0.05)
-    assert worst(found.names, found.value, ideal_arm, "inertia", "coupling", "armature", "gravity") < 0.06
-    assert worst(found.names, found.value, ideal_arm, "viscous", "coulomb") < 0.1
+    found = fit_recursively([joined(ideal_period, 1)], 15.0, 0.05)
+    assert worst(found.names, found.value, ideal_arm, "inertia", "coupling", "armature", "gravity") < 0.03
+    assert worst(found.names, found.value, ideal_arm, "viscous", "coulomb") < 0.03
 
 
 @pytest.mark.parametrize("kind", ["ekf", "ukf"])
