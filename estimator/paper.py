@@ -67,8 +67,7 @@ class Excitation:
     @property
     def frequency(self) -> Array:
         """Angular (lines,) [rad/s]."""
-        frequency: Array = 2.0 * np.pi * FUNDAMENTAL * self.lines
-        return frequency
+        return np.asarray(2.0 * np.pi * FUNDAMENTAL * self.lines, dtype=np.float64)
 
 
 def own_lines() -> Excitation:
@@ -93,8 +92,8 @@ def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
     s = 1j * excitation.frequency
     D, K, F = arm.mass_matrix(), arm.stiffness(), np.eye(2) * arm.viscous
     terms = (s * D[:, :, None] if order == 1 else s * s * D[:, :, None] + s * F[:, :, None]) + K[:, :, None]
-    angles: Complex = np.linalg.solve(np.moveaxis(terms, 2, 0), excitation.torque.T[:, :, None])[:, :, 0].T
-    return angles
+    angles = np.linalg.solve(np.moveaxis(terms, 2, 0), excitation.torque.T[:, :, None])[:, :, 0].T
+    return np.asarray(angles, dtype=np.complex128)
 
 
 def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, seed: int) -> Array:
