@@ -1,7 +1,7 @@
 """Recursive least squares on causally filtered signals, the on-line peer.
 
-Position and torque pass the same causal low-pass filter, so that both lag alike; velocity and acceleration
-are backward differences of what came out. Every sample then corrects the parameters once: Ljung, System
+Position passes a causal low-pass filter and is differenced, the regressor evaluated and filtered again; the torque
+passes the same filter twice, so that both lag alike. Every sample then corrects the parameters once: Ljung, System
 Identification (1999), section 11.2, with a forgetting factor of 1, the best for an arm that does not change.
 """
 
@@ -15,7 +15,7 @@ from estimator.arrays import Array
 from estimator.idim import InverseDynamics, uniform
 from estimator.recording import Recording
 
-ORDER = 2  # of the filter; every order lags more
+ORDER = 4  # of the filter
 WIDE = 1e3  # standard deviation of the parameters before the first sample, in units of SI
 WARM_UP = 2.0  # cycles of the cut-off before the filters have forgotten their start
 
@@ -50,6 +50,9 @@ def _causal_rows(recording: Recording, cutoff: float, width: float, delay: float
     # Differences belong to the middle of what they span: one sample back for the second, half for the first.
     velocity = 0.5 * (velocity[:, 1:] + velocity[:, :-1])
     Y = regressor(smooth[:, 1:-1], velocity, acceleration, width)
+    start = sosfilt_zi(filter_)[:, None, :, None]
+    Y, _ = sosfilt(filter_, Y, axis=1, zi=start * Y[None, :, :1])
+    tau, _ = sosfilt(filter_, tau, axis=1, zi=rest * tau[None, :, :1])
     warm = int(WARM_UP / (cutoff * dt))
     return Y[:, warm:], tau[:, 1 + warm : -1]
 

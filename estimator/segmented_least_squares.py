@@ -20,7 +20,9 @@ Residual = Callable[[int, Array, Array], Array]
 
 DIFFERENCE = 1e-4  # of a coordinate, which is of the size of 1
 LONGEST = 2.0  # change of one coordinate in one step
-ITERATIONS = 60
+ITERATIONS = 30
+UNFINISHED = 1e-3  # of the sum: less than this still to gain is no reason to give up
+ENOUGH_SEGMENTS = 3
 FIRST_DAMPING = 1e-3
 LEAST_DAMPING = 1e-8
 MOST_DAMPING = 1e5
@@ -46,13 +48,18 @@ class Segmented:
         """Sandwich covariance of the shared coordinates (shared, shared), segments taken as independent.
 
         It holds when the residuals of a segment hang together, as model error makes them: Liang and Zeger,
-        "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13.
+        "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13. Fewer than
+        ENOUGH_SEGMENTS times as many segments as coordinates cannot tell what correlates with what: they tell
+        one factor by which all is more uncertain than white noise would make it.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
         bread = np.linalg.pinv(self.information / np.outer(norm, norm), rcond=1e-12, hermitian=True)
         bread /= np.outer(norm, norm)
-        few = segments / max(1, segments - size)
+        few = segments / max(1, segments - 1)
+        if segments < ENOUGH_SEGMENTS * size:
+            pooled = float(np.einsum("si,ij,sj->", self.scores, bread, self.scores)) / size
+            return np.asarray(few * pooled * bread)
         covariance: Array = few * bread @ (self.scores.T @ self.scores) @ bread
         return covariance
 
@@ -88,8 +95,8 @@ def minimise_segmented(residual: Residual, shared: Array, own: Array, enough: fl
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
     `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when a step gains
-    less than `enough` of the sum. `residual` is called from several threads; the result does not depend on
-    their number. Raises ConvergenceError.
+    less than `enough` of the sum, or after ITERATIONS when it gained less than UNFINISHED. `residual` is called
+    from several threads; the result does not depend on their number. Raises ConvergenceError.
     """
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         rows = _residuals(residual, shared, own, threads)
@@ -109,7 +116,7 @@ def minimise_segmented(residual: Residual, shared: Array, own: Array, enough: fl
                     damping = max(0.2 * damping, LEAST_DAMPING)
                     break
                 damping = max(8.0 * damping, FIRST_DAMPING)
-            if gained < enough * cost:
+            if gained < enough * cost or (iteration == ITERATIONS and gained < UNFINISHED * cost):
                 blocks = _blocks(residual, shared, own, rows, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
                 return Segmented(shared, own, cost, information, scores, iteration)

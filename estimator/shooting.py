@@ -34,7 +34,7 @@ START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "delay": 
 SHORT = 0.25  # of the segments' length, to begin with
 FEWEST = 8  # samples in a segment
 COARSE = 1e-3
-FINE = 1e-5
+FINE = 3e-5
 ANGLE_SCALE = 0.1  # rad
 START_WINDOW = 0.03  # s on either side, for the state that a segment starts from
 
