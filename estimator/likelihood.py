@@ -108,7 +108,9 @@ class Problem:
             transform = self._transform(x, index)
             n, b = np.zeros((transform.shape[0],) * 2), np.zeros(transform.shape[0])
             cost = 0.0
-            for part, position, derivative in run.pieces(physics, self.start(x, index), self.coordinates.names, self.share):
+            for part, position, derivative in run.pieces(
+                physics, self.start(x, index), self.coordinates.names, self.share
+            ):
                 root = weight[:, part]
                 r = (root * (position - run.measured[:, part])).reshape(-1)
                 J = (root[:, :, None] * derivative).reshape(r.size, -1)

@@ -1,5 +1,6 @@
 """One stabilised run as the likelihood simulates it: in closed loop, its derivatives by finite differences."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -33,8 +34,11 @@ class StabilisedRun:
         """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
         return self.stabiliser.positions(physics, start, self.rate, self.command_to_sample)
 
-    def pieces(self, physics: Physics, start: Array, names: tuple[str, ...]) -> Iterator[tuple[slice, Array, Array]]:
-        """The whole run as one piece, as `SimulatedRun.pieces` gives them."""
+    def pieces(
+        self, physics: Physics, start: Array, names: tuple[str, ...], share: float = 1.0
+    ) -> Iterator[tuple[slice, Array, Array]]:
+        """The whole run, or the first `share` of it, as one piece, as `SimulatedRun.pieces` gives them."""
+        count = math.ceil(share * self.measured.shape[1])
         position = self.position(physics, start)
         derivatives = []
         for name in names:
@@ -44,7 +48,7 @@ class StabilisedRun:
             nudged = start.copy()
             nudged[index] += LEAST
             derivatives.append((self.position(physics, nudged) - position) / LEAST)
-        yield slice(0, position.shape[1]), position, np.stack(derivatives, axis=-1)
+        yield slice(0, count), position[:, :count], np.stack(derivatives, axis=-1)[:, :count]
 
 
 def _value(physics: Physics, name: str) -> float:

@@ -14,7 +14,7 @@ from estimator.prediction import prediction_rms
 from estimator.recording import Recording
 from estimator.shooting import estimate_by_shooting
 from fakes.arm import Arm, base_parameters
-from fakes.two_link import make_plant
+from fakes.plant import make_plant
 
 STEP = 2.0 * np.pi / 4096
 

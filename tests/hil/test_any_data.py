@@ -15,7 +15,7 @@ from hil.recording import load_samples
 ArmFile = Callable[..., Path]
 DATA = Path(__file__).parents[1] / "data" / "dfki_double_pendulum"
 WHOLE = Path(__file__).parents[3] / "shared" / "data" / "dfki_double_pendulum"
-DFKI = Path(__file__).parents[2] / "configs" / "dfki_double_pendulum.toml"
+DFKI = Path(__file__).parents[2] / "configs" / "recorded" / "dfki_double_pendulum.toml"
 
 
 def hil(*arguments: object) -> int:
