@@ -46,7 +46,9 @@ def engine() -> mujoco.MjModel:
         for link in LINKS
     ]
     length = LINKS[0]["length"]
-    elbow = f'<body pos="{length} 0 0"><inertial pos="0 0 0" mass="{SERVO["mass"]}" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    elbow = (
+        f'<body pos="{length} 0 0"><inertial pos="0 0 0" mass="{SERVO["mass"]}" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    )
     text = (
         f'<mujoco><option timestep="{TIMESTEP}" gravity="0 0 -9.81" integrator="implicitfast" solver="Newton" '
         'tolerance="1e-12" iterations="50"/><worldbody><body>'

@@ -90,9 +90,7 @@ def autocorrelation(residual: Array, lags: int) -> Array:
     return rho
 
 
-def robust_covariance(
-    at: Quadratic, scatter: Array | None, samples: int, count: int, structured: float = 0.0
-) -> Array:
+def robust_covariance(at: Quadratic, scatter: Array | None, samples: int, count: int, structured: float = 0.0) -> Array:
     """Covariance of the first `count` coordinates (count, count), the others unknown with them.
 
     The larger of the sandwich and of what independent errors would give, direction by direction: a short
