@@ -35,6 +35,7 @@ COARSE = 1e-3  # relative gain in the sum of squares at which each try ends
 FINE = 1e-6
 HASTY = 2e-2
 HOPELESS = 2.0  # sum of squares per sample in units of the noise from which a hasty fit gives up
+ALIKE = 1.05  # of the best try's sum of squares: up to here another try may still end lower
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
@@ -174,8 +175,10 @@ def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstim
     weights, outliers = _weights(periods, problem.positions(best.x))
     problem = replace(problem, weights=weights)
     hopeless = hasty and best.at.cost > HOPELESS * samples
-    minimum = minimise(problem.evaluate, best.x, HASTY if hopeless else FINE)
-    return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, minimum)))
+    last = [best.x] if hopeless else [found.x for found in tries if found.at.cost < ALIKE * best.at.cost]
+    ends = [minimise(problem.evaluate, x, HASTY if hopeless else FINE) for x in last]
+    minimum = min(ends, key=lambda found: found.at.cost)
+    return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, *ends)))
 
 
 def _approach(problem: Problem, x: Array, samples: int, enough: float) -> Minimum:
