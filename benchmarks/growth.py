@@ -35,8 +35,9 @@ PEAK = (0.50, 0.30)  # N m: never past the upright, where a long motion would be
 def period_of(samples: int) -> SettledPeriod:
     """A period with LINES lines per joint up to 5 Hz, whatever its length."""
     period = samples / RATE
-    spacing = max(1, round(5.0 * period / (2 * LINES)))
-    lines = [range(spacing * (1 + joint), spacing * (1 + joint) + 2 * spacing * LINES, 2 * spacing) for joint in (0, 1)]
+    # Drawn, not evenly spaced: lines with a common factor would repeat one short period, rounding and all.
+    drawn = np.random.default_rng(1).choice(np.arange(1, round(5.0 * period)), 2 * LINES - 1, replace=False)
+    lines = [sorted(drawn[:LINES].tolist()), sorted(drawn[LINES:].tolist())]
     wave = design_multisine(RATE, period, lines, PEAK, 2)
     truth = base_parameters(servo_arm({"coulomb_width": 0.05}))
     physics = Physics.of({**truth, "coulomb_width_1": 0.05, "coulomb_width_2": 0.05})

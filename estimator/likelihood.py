@@ -38,6 +38,7 @@ COARSE = 1e-3  # relative gain in the sum of squares at which each try ends
 FINE = 1e-6
 HASTY = 2e-2
 HOPELESS = 2.0  # sum of squares per sample in units of the noise from which a hasty fit gives up
+ALIKE = 1.05  # of the best try's sum of squares: up to here another try may still end lower
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
@@ -165,19 +166,40 @@ def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstim
     tries: list[Minimum] = []
     for width in STARTING_WIDTHS:
         x = np.concatenate((problem.coordinates.coordinates(_start(model, linear, ripple, width)), states))
-        for share in HORIZONS:
-            if share * samples < LEAST_HORIZON * x.size:
-                continue
-            x = minimise(replace(problem, share=share).evaluate, x, HASTY).x
-        tries.append(minimise(problem.evaluate, x, enough))
+        tries.append(_approach(problem, x, samples, enough))
         if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
             break
+    # What explains the motion may still have its friction's step in the wrong place, by a little of the sum.
+    best = min(tries, key=lambda found: found.at.cost)
+    wide = _with_width(problem, best.x, STARTING_WIDTHS[-1])
+    if not (hasty and best.at.cost > HOPELESS * samples):
+        tries.append(minimise(problem.evaluate, wide, enough))
     best = min(tries, key=lambda found: found.at.cost)
     weights, outliers = _weights(periods, problem.positions(best.x))
     problem = replace(problem, weights=weights)
     hopeless = hasty and best.at.cost > HOPELESS * samples
-    minimum = minimise(problem.evaluate, best.x, HASTY if hopeless else FINE)
-    return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, minimum)))
+    last = [best.x] if hopeless else [found.x for found in tries if found.at.cost < ALIKE * best.at.cost]
+    ends = [minimise(problem.evaluate, x, HASTY if hopeless else FINE) for x in last]
+    minimum = min(ends, key=lambda found: found.at.cost)
+    return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, *ends)))
+
+
+def _approach(problem: Problem, x: Array, samples: int, enough: float) -> Minimum:
+    """From stage 1's parameters to the whole of every run, by way of its beginning."""
+    for share in HORIZONS:
+        if share * samples > LEAST_HORIZON * x.size:
+            x = minimise(replace(problem, share=share).evaluate, x, HASTY).x
+    return minimise(problem.evaluate, x, enough)
+
+
+def _with_width(problem: Problem, x: Array, width: float) -> Array:
+    """The coordinates `x` with all friction's steps of this width [rad/s]."""
+    names = problem.coordinates.names
+    steps = np.array([name.startswith("coulomb_width") for name in names])
+    value = np.where(steps, width, problem.coordinates.values(x[: len(names)]))
+    moved = x.copy()
+    moved[: len(names)][steps] = problem.coordinates.coordinates(value)[steps]
+    return moved
 
 
 def _problem(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate) -> tuple[Problem, Array]:

@@ -1,6 +1,5 @@
 """One stabilised run as the likelihood simulates it: in closed loop, its derivatives by finite differences."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -38,7 +37,7 @@ class StabilisedRun:
         self, physics: Physics, start: Array, names: tuple[str, ...], share: float = 1.0
     ) -> Iterator[tuple[slice, Array, Array]]:
         """The whole run, or the first `share` of it, as one piece, as `SimulatedRun.pieces` gives them."""
-        count = math.ceil(share * self.measured.shape[1])
+        count = round(share * self.measured.shape[1])
         position = self.position(physics, start)
         derivatives = []
         for name in names:
