@@ -69,7 +69,12 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
 
 
 @app.command(epilog="Example: hil estimate runs/20261121-153000-fake_two_link")
-def estimate(run: cli_data.Runs, config: cli_data.ArmPath = None, json_only: Json = False) -> None:
+def estimate(
+    run: cli_data.Runs,
+    config: cli_data.ArmPath = None,
+    all_samples: cli_data.AllSamples = False,
+    json_only: Json = False,
+) -> None:
     """Estimate again from a recording; writes its result.json anew. Or from CSV files of any motion."""
     from hil.errors import RecordingCutShort
     from hil.estimate import estimate_run
@@ -80,14 +85,17 @@ def estimate(run: cli_data.Runs, config: cli_data.ArmPath = None, json_only: Jso
         cli_data.estimate_csv(run, config, json_only)
         return
     folder = RunFolder.open(run[0])
+    if all_samples:
+        cli_data.estimate_all_samples(folder, json_only)
+        return
     terminal = Terminal(quiet=json_only)
     try:
         with terminal.busy("Estimating"):
             result = estimate_run(folder)
             cli_results.write_report(folder.path)
     except RecordingCutShort as error:
-        cli_data.estimate_unsettled(folder, error, json_only)
-        return
+        error.add_note(f"What there is can be used without a settled period: hil estimate {folder.path} --all-samples")
+        raise
     _show(result, folder.load_config(), folder.path, json_only)
 
 

@@ -6,7 +6,7 @@
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
@@ -185,6 +185,7 @@ class Config(_Table):
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
     known: KnownConfig | None = None
+    columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.csv_config checks it")
     fake: FakeArm | None = None
 
     @model_validator(mode="after")
