@@ -26,7 +26,7 @@ from estimator.shooting import ShootingEstimate, estimate_by_shooting
 from hil.csv_config import load_csv_config
 from hil.csv_recording import read_csv
 
-CONFIG = Path(__file__).parents[1] / "configs" / "recorded" / "dfki_double_pendulum.toml"
+CONFIG = Path(__file__).parents[1] / "configs" / "recordings" / "dfki_double_pendulum.toml"
 CUTOFFS = (3.0, 4.0, 5.0, 8.0, 15.0, 30.0)  # Hz
 CUSTOMARY = 8.0
 WIDTH = 0.05  # rad/s

@@ -17,7 +17,7 @@ from typing import Any
 
 from machine import machine
 
-from hil.compare import OURS, compare_run
+from hil.compare import OURS, OURS_PLAIN, compare_run
 from hil.config import load_config
 from hil.experiment import run_experiment
 from hil.run_folder import RunFolder
@@ -63,10 +63,12 @@ def main() -> None:
             f"{name:14s} {entry['seconds']:8.3f} {100 * entry['worst_relative_error']:10.3f} % "
             f"{entry['worst_parameter']:12s} {shown:>9s}  {entry['settings']}"
         )
-    others = [entry["worst_relative_error"] for name, entry in methods.items() if name != OURS]
+    others = [entry["worst_relative_error"] for name, entry in methods.items() if name not in {OURS, OURS_PLAIN}]
     print(f"best of the others over ours: {min(others) / methods[OURS]['worst_relative_error']:.1f} in worst error")
     if "mujoco_sysid" in methods:
-        print(f"mujoco.sysid over ours: {methods['mujoco_sysid']['seconds'] / methods[OURS]['seconds']:.1f} in time")
+        seconds = {name: methods[name]["seconds"] for name in (OURS, OURS_PLAIN, "mujoco_sysid")}
+        ratios = (seconds["mujoco_sysid"] / seconds[name] for name in (OURS, OURS_PLAIN))
+        print("mujoco.sysid over ours in time: {:.1f}, with the same friction model {:.1f}".format(*ratios))
 
 
 if __name__ == "__main__":

@@ -81,12 +81,11 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
 def estimate(
     run: cli_data.Runs,
     config: cli_data.ArmPath = None,
-    unsettled: Annotated[
-        bool, typer.Option("--unsettled", help="From all samples, by multiple shooting: no settled period is needed.")
-    ] = False,
+    all_samples: cli_data.AllSamples = False,
     json_only: Json = False,
 ) -> None:
     """Estimate again from a recording; writes its result.json anew. Or from CSV files of any motion."""
+    from hil.errors import RecordingCutShort
     from hil.estimate import estimate_run
     from hil.run_folder import RunFolder
     from hil.terminal import Terminal
@@ -95,13 +94,17 @@ def estimate(
         cli_data.estimate_csv(run, config, json_only)
         return
     folder = RunFolder.open(run[0])
-    terminal = Terminal(quiet=json_only)
-    if unsettled:
-        cli_data.estimate_unsettled(folder, json_only)
+    if all_samples:
+        cli_data.estimate_all_samples(folder, json_only)
         return
-    with terminal.busy("Estimating"):
-        result = estimate_run(folder)
-        cli_results.write_report(folder.path)
+    terminal = Terminal(quiet=json_only)
+    try:
+        with terminal.busy("Estimating"):
+            result = estimate_run(folder)
+            cli_results.write_report(folder.path)
+    except RecordingCutShort as error:
+        error.add_note(f"What there is can be used without a settled period: hil estimate {folder.path} --all-samples")
+        raise
     _show(result, folder.load_config(), folder.path, json_only)
 
 

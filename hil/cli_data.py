@@ -21,6 +21,9 @@ Runs = Annotated[
 ArmPath = Annotated[
     Path | None, typer.Option("--config", metavar="ARM.toml", help="For CSV files: [columns] says what is in them.")
 ]
+AllSamples = Annotated[
+    bool, typer.Option("--all-samples", help="No settled period is needed: every sample, by multiple shooting.")
+]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
 
@@ -47,13 +50,13 @@ def estimate_csv(paths: Sequence[Path], config: Path | None, json_only: bool) ->
     show_any(result, json_only)
 
 
-def estimate_unsettled(run: "RunFolder", json_only: bool) -> None:
+def estimate_all_samples(run: "RunFolder", json_only: bool) -> None:
     """Estimate a run that holds no settled period from all its samples, by multiple shooting."""
-    from hil.estimate_any import estimate_unsettled as estimate
+    from hil.estimate_any import estimate_unsettled
     from hil.terminal import Terminal
 
     with Terminal(quiet=json_only).busy("Estimating by multiple shooting"):
-        result = estimate(run)
+        result = estimate_unsettled(run)
     show_any(result, json_only)
 
 

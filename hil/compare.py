@@ -22,6 +22,8 @@ from hil.settled import settled_period
 
 SCHEMA = 1
 OURS = "hil"
+OURS_PLAIN = "hil_coulomb"
+"""This project's estimate with the friction that mujoco.sysid has too: like against like, for the time it takes."""
 
 
 def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> dict[str, Any]:
@@ -46,7 +48,7 @@ def all_methods(
     config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
 ) -> Iterator[Peer]:
     """This project's own estimate first, then its peers."""
-    ours = _ours(config, period)
+    ours = _ours(period, OURS, Model(period.joints, config.model.fixed_friction, config.model.drive))
     yield ours
     length = link_length(config)
     yield from compare_peers(period, length, config.arm.gravity)
@@ -56,6 +58,7 @@ def all_methods(
         if length is None and period.joints == 2:
             raise ConfigError("mujoco.sysid needs the length of link 1: add length_1 under [known].")
         centre = dict(truth) if truth else {name: ours.parameters[name] for name in ours.std if name in ours.parameters}
+        yield _ours(period, OURS_PLAIN, Model(period.joints, "coulomb", "delay"))
         yield fit_with_mujoco(period, centre, length or 0.0, config.arm.gravity, seed)
 
 
@@ -100,14 +103,13 @@ def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> 
     return worst, errors[worst]
 
 
-def _ours(config: Config, period: SettledPeriod) -> Peer:
-    model = Model(len(config.joints), config.model.fixed_friction, config.model.drive)
+def _ours(period: SettledPeriod, name: str, model: Model) -> Peer:
     began = time.perf_counter()
     estimate = identify(period, model)
     seconds = time.perf_counter() - began
     std = dict(zip(estimate.names, estimate.std.tolist(), strict=True))
-    settings = f"{config.model.friction} friction, {config.model.drive} drive"
-    return Peer(OURS, estimate.parameters, std, seconds, settings, 1)
+    settings = f"{model.friction} friction, {model.drive} drive"
+    return Peer(name, estimate.parameters, std, seconds, settings, 1)
 
 
 def _held_out(period: SettledPeriod, parameters: Mapping[str, float]) -> float | None:

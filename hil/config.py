@@ -6,7 +6,7 @@
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
@@ -247,6 +247,7 @@ class Config(_Table):
     safety: SafetyConfig = SafetyConfig()
     stabiliser: StabiliserConfig | None = None
     known: KnownConfig | None = None
+    columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.csv_config checks it")
     fake: FakeArm | None = None
 
     @model_validator(mode="after")

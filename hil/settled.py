@@ -27,8 +27,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         wanted = experiment.periods + 1
         raise RecordingCutShort(
             f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods, and among "
-            f"them no {experiment.periods} settled ones; {wanted * count} samples are the least. Record again, "
-            "or estimate from all samples with hil estimate RUN --unsettled."
+            f"them no {experiment.periods} settled ones; {wanted * count} samples are the least. Record again."
         )
     used = periods[first : first + experiment.periods]
     constants = np.array([joint.torque_per_goal for joint in config.joints])

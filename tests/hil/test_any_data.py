@@ -15,7 +15,7 @@ from hil.recording import load_samples
 ArmFile = Callable[..., Path]
 DATA = Path(__file__).parents[1] / "data" / "dfki_double_pendulum"
 WHOLE = Path(__file__).parents[3] / "shared" / "data" / "dfki_double_pendulum"
-DFKI = Path(__file__).parents[2] / "configs" / "recorded" / "dfki_double_pendulum.toml"
+DFKI = Path(__file__).parents[2] / "configs" / "recordings" / "dfki_double_pendulum.toml"
 
 
 def hil(*arguments: object) -> int:
@@ -114,7 +114,9 @@ def test_a_run_cut_short_still_tells_something(arm_file: ArmFile, capsys: pytest
     whole = json.loads(capsys.readouterr().out)
     samples = load_samples(Path("run/samples.npy"), 2)
     np.save("run/samples.npy", samples[:2000], allow_pickle=False)
-    assert hil("estimate", "run", "--json") == 0
+    assert hil("estimate", "run") == 1
+    assert "--all-samples" in capsys.readouterr().err
+    assert hil("estimate", "run", "--all-samples", "--json") == 0
     result = json.loads(capsys.readouterr().out)
     assert result["method"].startswith("multiple shooting")
     for name in ("inertia_1", "gravity_1", "gravity_2", "coulomb_1"):
