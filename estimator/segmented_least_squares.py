@@ -20,7 +20,7 @@ Residual = Callable[[int, Array, Array], Array]
 
 DIFFERENCE = 1e-4  # of a coordinate, which is of the size of 1
 LONGEST = 2.0  # change of one coordinate in one step
-ITERATIONS = 30
+ITERATIONS = 80
 UNFINISHED = 1e-3  # of the sum: less than this still to gain is no reason to give up
 ENOUGH_SEGMENTS = 3
 FIRST_DAMPING = 1e-3

@@ -45,7 +45,7 @@ def test_kalman_filters_recover_from_a_start_that_is_off(
 
 
 def test_a_filter_that_diverges_says_so(ideal_period: SettledPeriod) -> None:
-    nonsense = np.full(12, 1e-9)
+    nonsense = np.full(12, -1.0)  # no arm has negative inertia
     with pytest.raises(ConvergenceError, match="EKF diverged"):
         fit_by_kalman(joined(ideal_period, 1), nonsense, "ekf", 0.05, 1e-3)
 
