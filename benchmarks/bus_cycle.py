@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -38,6 +37,7 @@ from drivers.joint import Joint
 from drivers.port import open_port
 from drivers.servo_model import Mode, servo_model
 from drivers.state import Converter, spans
+from hil.config import Config, load_config
 
 BAUD = 1_000_000
 BYTE_NS = 10_000
@@ -86,10 +86,7 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
     from hil.recording import Phase, Recorder
 
     joints = [Joint(f"joint{index}", index + 1, servo_model("XM430-W350")) for index in range(servos)]
-    limits = [
-        SimpleNamespace(joint=joint, position_limit=[-1e9, 1e9], velocity_limit=1e9, goal_limit=1.2) for joint in joints
-    ]
-    guard = Guard(SimpleNamespace(joints=limits, safety=SimpleNamespace(max_missing=5)))  # type: ignore[arg-type]
+    guard = Guard(_without_limits(servos))
     port = open_port(name, BAUD)
     port.latency = PATIENCE_S
     exchange = make_exchange(port, servos)
@@ -107,6 +104,15 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
 
         yield cycle
     port.close()
+
+
+def _without_limits(servos: int) -> Config:
+    """A configuration whose guard looks at everything and stops nothing: the responder's arm follows no command."""
+    config = load_config(Path(__file__).parents[1] / "configs" / "fake_two_link.toml")
+    free = {"position_limit": [-1e9, 1e9], "velocity_limit": 1e9}
+    joints = [config.joints[0].model_copy(update=free)] * servos
+    safety = config.safety.model_copy(update={"follow_time": 1e6})
+    return config.model_copy(update={"joints": joints, "safety": safety})
 
 
 @contextmanager
