@@ -106,3 +106,11 @@ def test_a_latency_timer_that_may_not_be_set_is_refused_with_the_command_to_type
     config = arm()
     with pytest.raises(WrongSetting, match=rf"latency timer is 16 ms.*Type: echo 1 \| sudo tee {timer}"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None)
+
+
+def test_a_person_sees_heat_and_supply(arm: Arm, tmp_path: Path) -> None:
+    config = arm()
+    run = RunFolder.create(tmp_path / "run", config)
+    seen: list[float] = []
+    run_experiment(config, run, config.path, lambda progress: seen.append(progress.state.slow.temperature[0]))
+    assert 35.0 in seen
