@@ -5,7 +5,6 @@ be used, a ramp out; then no current until the arm is at rest. Where a stop allo
 raises; torque is cut by whoever switched it on.
 """
 
-import math
 from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
@@ -173,7 +172,7 @@ class Stream:
             self._look(state, phase)
         self._stop.check()
         # Heat and supply come with one sample in many: that one is always shown.
-        if self._index % self._watch_every == 0 or math.isfinite(state.slow.temperature[0]):
+        if self._index % self._watch_every == 0 or state.slow is not None:
             role = self._plan.segments[self._segment].role
             self._watch(Progress(self._index, self._plan.expected, phase, role, state))
         return state
