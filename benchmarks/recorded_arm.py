@@ -9,7 +9,7 @@ import numpy as np
 from estimator.excitation import design_multisine, zippered_lines
 from estimator.period import SettledPeriod
 from fakes.arm import Arm
-from fakes.two_link import make_plant
+from fakes.plant import make_plant
 
 RATE = 400.0
 PERIOD = 10.0
