@@ -9,21 +9,13 @@ import numpy as np
 import pytest
 
 from estimator import peers
-from hil.cli import main
 from hil.recording import load_samples
+from tests.hil.command_line import hil
 
 ArmFile = Callable[..., Path]
 DATA = Path(__file__).parents[1] / "data" / "dfki_double_pendulum"
 WHOLE = Path(__file__).parents[3] / "shared" / "data" / "dfki_double_pendulum"
 DFKI = Path(__file__).parents[2] / "configs" / "recordings" / "dfki_double_pendulum.toml"
-
-
-def hil(*arguments: object) -> int:
-    """Run the command in this process; its exit code."""
-    sys.argv = ["hil", *map(str, arguments)]
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return int(caught.value.code or 0)
 
 
 @pytest.fixture(autouse=True)

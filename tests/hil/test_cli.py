@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.cli import main
 from hil.recording import load_samples
+from tests.hil.command_line import hil
 
 ArmFile = Callable[..., Path]
 
@@ -24,14 +24,6 @@ LONG = (
     ("peak_torque = [0.80, 0.42]", "peak_torque = [0.2, 0.1]"),  # so slow a motion would go over the top with more
 )
 """Changes that make an experiment long enough to be interrupted."""
-
-
-def hil(*arguments: object) -> int:
-    """Run the command in this process; its exit code."""
-    sys.argv = ["hil", *map(str, arguments)]
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return int(caught.value.code or 0)
 
 
 @pytest.fixture(autouse=True)

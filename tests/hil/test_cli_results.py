@@ -6,14 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.cli import main
-
-
-def hil(*arguments: object) -> int:
-    sys.argv = ["hil", *map(str, arguments)]
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return int(caught.value.code or 0)
+from tests.hil.command_line import hil
 
 
 @pytest.fixture(autouse=True)

@@ -1,7 +1,6 @@
 """Dry runs: what they foresee, what they allow, and the command around them."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,13 @@ import pytest
 
 from benchmarks.dry_run import prior_study
 from hil.amplitude import largest_amplitude
-from hil.cli import main
 from hil.config import Config, load_config, parse_config
 from hil.dry_run import GUARDED, predict
 from hil.ensemble import prior_ensemble
 from hil.errors import ConfigError
 from hil.plan import make_plan
 from hil.stopping import stopping_distance
+from tests.hil.command_line import hil
 
 Arm = Callable[..., Config]
 KNOWN = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.180]\n")
@@ -26,13 +25,6 @@ KNOWN = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.180]\n")
 @pytest.fixture
 def known(arm: Arm) -> Config:
     return arm(KNOWN, ("seed = 1\n", "seed = 1\nheld_out = false\n"))
-
-
-def hil(*arguments: object) -> int:
-    sys.argv = ["hil", *map(str, arguments)]
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return int(caught.value.code or 0)
 
 
 def test_the_same_prior_gives_the_same_prediction_and_more_torque_larger_peaks(known: Config) -> None:

@@ -10,20 +10,13 @@ import pytest
 from drivers.port import open_port
 from drivers.servo_model import SERVO_MODELS, Mode
 from hil.arm_template import ArmAnswers, JointAnswers, arm_toml
-from hil.cli import main
 from hil.config import load_config, parse_config, port_url
 from hil.errors import ExperimentError
 from hil.interview import interview
 from hil.scan import Found, Heard, scan
+from tests.hil.command_line import hil
 
 ArmFile = Callable[..., Path]
-
-
-def hil(*arguments: object) -> int:
-    sys.argv = ["hil", *map(str, arguments)]
-    with pytest.raises(SystemExit) as caught:
-        main()
-    return int(caught.value.code or 0)
 
 
 @pytest.fixture(autouse=True)
