@@ -29,7 +29,6 @@ app = typer.Typer(
 ConfigPath = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="TOML file of the arm, or the name of a bundled one.")
 ]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
 PortOrConfig = Annotated[
     str | None,
     typer.Argument(metavar="[PORT]", help="Serial port or pyserial URL, or a TOML file; without it: list the ports."),
@@ -75,6 +74,36 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
         result = estimate_run(run)
         cli_results.write_report(run.path)
     _show(result, checked, run.path, json_only)
+
+
+@app.command(epilog="Example: hil record configs/fake_two_link.toml --out runs/monday")
+def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> None:
+    """Play the experiment and keep its recording, for `hil estimate`."""
+    from hil.config import load_config
+    from hil.errors import ConfigError
+    from hil.experiment import run_experiment
+    from hil.recording import load_samples
+    from hil.run_folder import RunFolder
+    from hil.terminal import Terminal
+    from hil.timing import timing
+
+    checked = load_config(config)
+    if checked.experiment.pilot:
+        raise ConfigError(
+            f"{config}: experiment.pilot = true: each step's torque follows from an estimate of the one before, which "
+            "`hil identify` does. To record alone, give experiment.peak_torque and set pilot = false."
+        )
+    run = RunFolder.create(out or _default_folder(config), checked)
+    terminal = Terminal(quiet=json_only)
+    with terminal.streaming(checked) as watch:
+        torque = run_experiment(checked, run, config, watch)
+    terminal.say(torque)
+    samples = load_samples(run.samples_path, len(checked.joints))
+    recorded = {"run": str(run.path), "samples": len(samples), "timing": timing(samples, checked.experiment.rate)}
+    if json_only:
+        print(json.dumps(recorded))
+        return
+    print(f"Run folder: {run.path}, {len(samples)} samples.\nEstimate from it: hil estimate {run.path}")
 
 
 @app.command(epilog="Example: hil estimate runs/20261121-153000-fake_two_link")

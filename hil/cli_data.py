@@ -24,7 +24,7 @@ ArmPath = Annotated[
 AllSamples = Annotated[
     bool, typer.Option("--all-samples", help="No settled period is needed: every sample, by multiple shooting.")
 ]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
 
 
