@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from hil import __version__, cli_data, cli_dry_run, cli_init, cli_results
+from hil import __version__, cli_data, cli_dry_run, cli_init, cli_results, strict_json
 
 if TYPE_CHECKING:
     from hil.config import Config
@@ -101,7 +101,7 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
     samples = load_samples(run.samples_path, len(checked.joints))
     recorded = {"run": str(run.path), "samples": len(samples), "timing": timing(samples, checked.experiment.rate)}
     if json_only:
-        print(json.dumps(recorded))
+        print(strict_json.dumps(recorded))
         return
     print(f"Run folder: {run.path}, {len(samples)} samples.\nEstimate from it: hil estimate {run.path}")
 
@@ -274,7 +274,7 @@ def main() -> NoReturn:
 
 def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool) -> None:
     if json_only:
-        print(json.dumps(result, ensure_ascii=False))
+        print(strict_json.dumps(result))
         return
     from rich.console import Console
 

@@ -1,7 +1,7 @@
 """result.json: what an identification found, in one dictionary that a person and a program can read.
 
 schema, method, config, joints
-parameters   the base parameters: value, std, unit
+parameters   the base parameters: value, std (null on file where the recording shows nothing of it), unit
 extra        what the model needed beside them (friction's shape, drive's lag): value, std, unit
 covariance   of parameters and extra together, rows in the order of `names`
 fit          residual of the settled period, in encoder steps, against the encoder's own rounding
