@@ -235,6 +235,14 @@ app.command(epilog="Example: hil calibrate runs/bare runs/with_mass --mass 0.1 -
 )
 
 
+def _list_faults(wanted: bool) -> None:
+    if wanted:
+        from hil import fake_command
+
+        fake_command.list_faults()
+        raise typer.Exit
+
+
 @app.command(epilog="Example: hil fake configs/fake_two_link.toml --pty --link /tmp/arm")
 def fake(
     config: ConfigPath,
@@ -246,14 +254,15 @@ def fake(
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of noise and faults, instead of the file's.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No status line.")] = False,
-    list_faults: Annotated[bool, typer.Option("--list-faults", help="Print the kinds of faults and exit.")] = False,
+    _: Annotated[
+        bool,
+        typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="Print the kinds of faults and exit."),
+    ] = False,
 ) -> None:
     """Serve the fake arm of a file to any program, in real time; without --pty, say what it is made of."""
     from hil import fake_command
 
-    if list_faults:
-        fake_command.list_faults()
-    elif pty:
+    if pty:
         fake_command.serve_fake(config, link, fault or [], seed, quiet)
     else:
         fake_command.describe_fake(config, fault or [], seed)
