@@ -242,6 +242,14 @@ def test_after_a_loss_in_a_slow_turn_the_usual_registers_are_asked_for() -> None
     assert [cycle([0, 0]).span for _ in range(4)] == [0, 1, 0, 2]
 
 
+def test_after_a_loss_and_an_answer_the_usual_registers_are_asked_for_again() -> None:
+    with_tick = struct.pack("<Hxxxxhii", 500, 0, 0, 1)
+    good = answer(1, 0, 0, 1) + answer(2, 0, 0, 1)
+    wire = Wire([b"", encode_status(1, 0, with_tick) + encode_status(2, 0, with_tick), good, good])
+    cycle = exchange(wire).cycle
+    assert [cycle([0, 0]).span for _ in range(4)] == [0, 1, 0, 0]
+
+
 @pytest.mark.parametrize(("count", "at_most_s"), [(2, 3e-3), (6, 4.5e-3)])
 def test_a_cycle_without_answers_is_bounded(count: int, at_most_s: float) -> None:
     wire = Wire()
