@@ -358,14 +358,19 @@ def _passed_a_limit(error: BaseException | None) -> bool:
 
 
 def _at(port: Any, spy: Spy, when: float, action: Callable[[], None]) -> None:
-    """Do it when the port's clock passes `when`."""
+    """Do it when the port's clock passes `when`, unless the run is over."""
+    call_at(port, when, lambda: None if spy.over else action())
+
+
+def call_at(port: Any, when: float, action: Callable[[], None]) -> None:
+    """Do it once, in the first wait that ends after `when` on the port's clock."""
     clock = port.clock
     wait = clock.wait_until
     todo = [action]
 
     def waiting(deadline: float) -> None:
         wait(deadline)
-        if todo and not spy.over and clock.now() >= when:
+        if todo and clock.now() >= when:
             todo.pop()()
 
     clock.wait_until = waiting
