@@ -46,15 +46,24 @@ class BusConfig:
 
 @dataclass(frozen=True)
 class TorqueOff:
-    """How the attempt to cut torque ended: joints read back as off, and why the others could not be confirmed."""
+    """How the attempt to cut torque ended: joints read back as off, why the others could not be confirmed, and which of
+    all have no Bus Watchdog.
+    """
 
     confirmed: tuple[Joint, ...]
     unconfirmed: tuple[tuple[Joint, str], ...]
+    unwatched: frozenset[Joint] = frozenset()
 
     def __str__(self) -> str:
         if not self.unconfirmed:
             return f"Torque is off on all {len(self.confirmed)} servos, read back."
         names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
+        alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
+        if alone:
+            return (
+                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
+                "Watchdog and may go on with its last current: cut the supply now."
+            )
         return (
             f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that hears nothing, but cut the "
             "supply before you reach into the arm."
@@ -272,7 +281,7 @@ class ServoBus:
             if joint not in self._without_watchdog:
                 with suppress(DriverError):
                     self._servos[joint].write("Bus Watchdog", 0)
-        self.torque_off_report = TorqueOff(tuple(confirmed), tuple(unconfirmed))
+        self.torque_off_report = TorqueOff(tuple(confirmed), tuple(unconfirmed), frozenset(self._without_watchdog))
         return self.torque_off_report
 
     def _broadcast_torque_off(self) -> None:

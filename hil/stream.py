@@ -197,7 +197,7 @@ class Stream:
         state = self._state
         with suppress(DriverError):
             for _ in range(self._plan.brake_samples):
-                goals = None if state is None or self._stop.insisted else brake.goals(state)
+                goals = None if state is None else brake.goals(state)
                 if goals is None:
                     return
                 deadline, _, late = self._ticks.wait()

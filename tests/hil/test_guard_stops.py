@@ -15,7 +15,7 @@ import pytest
 import serial
 
 from benchmarks.faults import SpiedPlant, Spy, call_at
-from drivers.errors import WrongModel
+from drivers.errors import TorqueNotOff, WrongModel
 from fakes.faults import Fault, FaultKind
 from hil.config import Config, parse_config
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
@@ -136,6 +136,21 @@ def test_an_arm_that_moves_before_the_start(arm: Arm, tmp_path: Path, ports: lis
     assert_stopped(ports[0])
 
 
+def test_an_arm_that_is_still_moving_when_the_rest_is_over(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    config = arm()
+
+    def push() -> None:
+        ports[0].bus.plant._v2 = 0.6
+
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(ExperimentError, match=r"moves before the start: joint 'elbow' \(ID 2.* at 0\.\d\d rad/s"):
+        run_experiment(config, run, config.path, once(push, Phase.REST, 180), plan)
+    assert not load_samples(run.samples_path, 2)["goal_current"][:200].any()
+    assert_stopped(ports[0])
+
+
 def test_a_goal_that_is_no_number_is_never_sent(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
     config = arm()
     broken = plan.segments[0].period_current.copy()
@@ -164,27 +179,37 @@ def test_a_jump_of_the_wanted_current_reaches_the_servos_in_steps(
 # How it comes to rest
 
 
+def braked_samples(arm: Arm, folder: Path, ports: list[Any], plan: Plan, then: Callable[[], None] | None) -> int:
+    """Samples of braking after Ctrl-C, when `then` happens 12 ms later."""
+    config = arm(("[experiment]\n", "[safety]\ndamp_time = 0.06\n\n[experiment]\n"))
+
+    def act() -> None:
+        port = ports[-1]
+        os.kill(os.getpid(), signal.SIGINT)
+        if then is not None:
+            call_at(port, port.clock.now() + 0.012, then)
+
+    run = RunFolder.create(folder, config)
+    with pytest.raises(StopRequested):
+        run_experiment(config, run, config.path, once(act), plan)
+    assert_stopped(ports[-1])
+    return int(np.count_nonzero(load_samples(run.samples_path, 2)["phase"] == Phase.BRAKING))
+
+
+def test_braking_takes_its_time_and_no_more(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
+    assert braked_samples(arm, tmp_path / "run", ports, plan, None) == 24
+
+
 @pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_second_signal_ends_the_braking_at_once(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, second: signal.Signals
 ) -> None:
-    def braked(insist: bool) -> int:
-        config = arm(("[experiment]\n", "[safety]\ndamp_time = 0.06\n\n[experiment]\n"))
+    count = braked_samples(arm, tmp_path / "run", ports, plan, lambda: os.kill(os.getpid(), second))
+    assert 2 <= count <= 5
 
-        def act() -> None:
-            port = ports[-1]
-            os.kill(os.getpid(), signal.SIGINT)
-            if insist:
-                call_at(port, port.clock.now() + 0.012, lambda: os.kill(os.getpid(), second))
 
-        run = RunFolder.create(tmp_path / f"{insist}", config)
-        with pytest.raises(StopRequested):
-            run_experiment(config, run, config.path, once(act), plan)
-        assert_stopped(ports[-1])
-        return int(np.count_nonzero(load_samples(run.samples_path, 2)["phase"] == Phase.BRAKING))
-
-    assert braked(False) == 24
-    assert 2 <= braked(True) <= 5
+def test_a_missed_deadline_ends_the_braking(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
+    assert 2 <= braked_samples(arm, tmp_path / "run", ports, plan, lambda: stall(ports, 0.03)) <= 5
 
 
 def test_a_joint_whose_replies_are_missing_is_not_taken_to_be_at_rest(
@@ -266,6 +291,21 @@ def test_firmware_without_a_bus_watchdog_runs_where_the_user_says_so(
         run_experiment(config, run, config.path, once(look), plan)
     assert armed == [(4, 0)], "20 ms units: the servo that has a watchdog has it armed, the other is not written to"
     assert_stopped(ports[0])
+
+
+def test_a_servo_without_a_watchdog_that_falls_silent_is_said_to_go_on(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, as_found: Found
+) -> None:
+    as_found(has_old_firmware)
+    config = arm(("[experiment]\n", "[safety]\nallow_no_watchdog = true\n\n[experiment]\n"))
+    pull = once(lambda: setattr(ports[0].bus.servos[2], "connected", False))
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(TorqueNotOff, match=r"NOTHING STOPS JOINT 'ELBOW' \(ID 2.*cut the supply now"):
+        run_experiment(config, run, config.path, pull, plan)
+    port = ports[0]
+    port.clock.wait_until(port.clock.now() + 1.0)
+    assert not port.bus.servos[1].torque_enabled
+    assert port.bus.servos[2].motor_current_a != 0.0, "and it does"
 
 
 def test_servos_that_a_killed_program_left_behind_are_taken_over(
