@@ -126,6 +126,14 @@ def test_a_computer_that_stalls_beyond_the_watchdogs_time_finds_the_arm_stopped(
     assert_stopped(ports[0])
 
 
+def test_commands_too_far_apart_for_the_watchdogs(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    config = arm(("rate = 400.0", "rate = 40.0"), ("[experiment]\n", "[safety]\nwatchdog = 0.02\n\n[experiment]\n"))
+    stop, samples = run_until_stopped(config, tmp_path / "run", lambda _: None, make_plan(config))
+    assert stop.cause is Cause.LATE and "25 ms passed between two commands" in str(stop)
+    assert len(samples) == 2
+    assert_stopped(ports[0])
+
+
 def test_an_arm_that_moves_before_the_start(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
     def push() -> None:
         ports[0].bus.plant._v2 = 1.5
