@@ -7,9 +7,11 @@ undisturbed motion. After each run the emulated servos themselves are asked. An 
 
 unsafe          torque neither off nor stopped by the watchdog, or current still flowing 100 ms after the fault (after
                 the guard's last look where no single sample shows it: a joint held, a sign turned, lost packets)
-beyond_limit    a joint farther beyond its limit than the dry run's stopping distance
+beyond_limit    a joint farther beyond its limit than hil.stopping predicts for the way in which this run was stopped
 unreadable      the recording cannot be read
 unnamed         the message does not name the cause
+
+How far the joints went beyond their limits is printed as a share of what was predicted, by way of stopping.
 """
 
 import argparse
@@ -19,8 +21,8 @@ import re
 import signal
 import tempfile
 import traceback
-from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
@@ -31,12 +33,13 @@ import serial
 
 from fakes.faults import Fault, FaultKind
 from hil.config import Config, parse_config
-from hil.ensemble import prior_ensemble
-from hil.errors import HilError
+from hil.ensemble import Ensemble, prior_ensemble
+from hil.errors import Cause, HilError, SafetyStop
 from hil.experiment import run_experiment
+from hil.plan import Plan, make_plan
 from hil.recording import Phase, load_samples
 from hil.run_folder import RunFolder
-from hil.stopping import stopping_distance
+from hil.stopping import LONGEST_S, Stopping, Way, beyond_when_passed, stopping_distance
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 PRIOR = """[arm.prior]
@@ -56,6 +59,9 @@ OWN = ("wrong_sign", "torque_taken", "stall", "exception", "SIGINT", "SIGTERM", 
 GRADUAL = {"wrong_sign", "torque_taken", FaultKind.STUCK_JOINT, FaultKind.LOST_REPLY, FaultKind.CORRUPTED_REPLY}
 GRADUAL |= {FaultKind.TRUNCATED_REPLY, FaultKind.DUPLICATED_REPLY, FaultKind.LATE_REPLY, FaultKind.NOISE}
 GRADUAL |= {FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION, FaultKind.ENCODER_JUMP}
+
+OFF_PLAN = {"wrong_sign", "torque_taken", FaultKind.STUCK_JOINT}
+"""After these the arm does not move as planned, so it may pass a limit at any speed up to its own limit."""
 
 _SILENT = (
     r"missed \d+ replies|does not answer|failed|NOT CONFIRMED|reads back|refused|carries|alert|moved by|watchdogs act"
@@ -88,46 +94,56 @@ class Spy:
     low: list[float] = field(default_factory=lambda: [np.inf, np.inf])
     high: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     turned: int | None = None
+    tripped: bool = False
+    """A watchdog has acted."""
     over: bool = False
     """The run has ended: nothing is injected any more."""
 
 
 @dataclass(frozen=True)
 class Outcome:
+    """seen, predicted: way beyond the limits (joints,) [rad], negative within them; way: how the run was stopped."""
+
     fault: str
     phase: str
     unsafe: bool
-    beyond: bool
     unreadable: bool
     unnamed: bool
     message: str
+    way: str
+    seen: np.ndarray
+    predicted: np.ndarray
+
+    @property
+    def beyond(self) -> bool:
+        return bool((self.seen > self.predicted).any())
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """The arm under test, its undisturbed timetable, and how far it may go beyond its limits."""
+    """The arm under test, what it plays, its undisturbed timetable, and how far it may go beyond its limits."""
 
     config: Config
+    plan: Plan
+    arms: Ensemble
     windows: dict[str, tuple[float, float]]
-    stopping: np.ndarray
+    stopping: Stopping
 
 
 def prepare() -> Campaign:
-    """Run once undisturbed: the timetable, limits close to the motion, the stopping distances by simulation.
-
-    They are from a limit outwards, at the sum of the joints' velocity limits: a joint that jams hands its speed on.
-    """
+    """Run once undisturbed: the timetable, limits close to the motion, the stopping distances by simulation."""
     config = short_config(CONFIG.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:
-        _, _, samples, _ = play(config, Path(folder), lambda port, spy: None)
+        _, _, samples, _ = play(config, make_plan(config), Path(folder), lambda port, spy: None)
     config = short_config(_with_close_limits(CONFIG.read_text(encoding="utf-8"), samples))
+    plan = make_plan(config)
     with tempfile.TemporaryDirectory() as folder:
-        error, port, samples, _ = play(config, Path(folder), lambda port, spy: None)
+        error, port, samples, _ = play(config, plan, Path(folder), lambda port, spy: None)
     assert error is None, error
-    fastest = np.full(2, sum(joint.velocity_limit for joint in config.joints))
-    most = np.abs(samples["goal_current"]).max(axis=0)
-    way = stopping_distance(config, prior_ensemble(config, 48), fastest, most).worst
-    return Campaign(config, _windows(samples, port.clock.now()), way)
+    fastest = np.array([joint.velocity_limit for joint in config.joints])
+    arms = prior_ensemble(config, 16)
+    stopping = stopping_distance(config, plan, arms, fastest)
+    return Campaign(config, plan, arms, _windows(samples, port.clock.now()), stopping)
 
 
 def _with_close_limits(text: str, samples: np.ndarray) -> str:
@@ -156,7 +172,7 @@ def short_config(text: str) -> Config:
 
 
 def play(
-    config: Config, folder: Path, prepare_port: Callable[[Any, Spy], None]
+    config: Config, plan: Plan, folder: Path, prepare_port: Callable[[Any, Spy], None]
 ) -> tuple[BaseException | None, Any, np.ndarray, Spy]:
     """One run; the error it ended with, the port, the samples (None where unreadable) and what the spy saw."""
     run = RunFolder.create(folder / "run", config)
@@ -168,6 +184,8 @@ def play(
         port = opened(*args, **kwargs)
         ports.append(port)
         port.bus.plant = SpiedPlant(port.bus.plant, spy)
+        for servo in port.bus.servos.values():
+            servo.trip_watchdog = _told(spy, servo.trip_watchdog)
         prepare_port(port, spy)
         return port
 
@@ -175,7 +193,7 @@ def play(
     serial.serial_for_url = open_port
     try:
         # The fake describes itself from the text under test, limits aside.
-        run_experiment(config, run, CONFIG, lambda _: None)
+        run_experiment(config, run, CONFIG, lambda _: None, plan)
     except Exception as caught:
         error = caught
     finally:
@@ -217,6 +235,14 @@ class SpiedPlant:
 
     def _turned(self, current: Sequence[float]) -> list[float]:
         return [-each if joint == self._spy.turned else each for joint, each in enumerate(current)]
+
+
+def _told(spy: Spy, trip: Callable[[], None]) -> Callable[[], None]:
+    def tripping() -> None:
+        spy.tripped = True
+        trip()
+
+    return tripping
 
 
 def _windows(samples: np.ndarray, end: float) -> dict[str, tuple[float, float]]:
@@ -263,14 +289,13 @@ def inject(campaign: Campaign, kind: str, phase: str, seed: int) -> Outcome:
         try:
             for number in handlers:
                 signal.signal(number, signal.SIG_IGN)  # a signal outside the experiment must not end the campaign
-            error, port, samples, spy = play(campaign.config, Path(folder), prepare_port)
-            unreadable = False
+            error, port, samples, spy = play(campaign.config, campaign.plan, Path(folder), prepare_port)
         except HilError as broken:
-            return Outcome(kind, phase, False, False, True, False, str(broken))
+            return Outcome(kind, phase, False, True, False, str(broken), "", np.zeros(2), np.zeros(2))
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
-    return _judge(campaign, kind, phase, happened[0], error, port, samples, spy, unreadable)
+    return _judge(campaign, kind, phase, happened[0], error, port, samples, spy)
 
 
 def _judge(
@@ -282,9 +307,8 @@ def _judge(
     port: Any,
     samples: np.ndarray,
     spy: Spy,
-    unreadable: bool,
 ) -> Outcome:
-    port.clock.wait_until(port.clock.now() + 0.4)
+    port.clock.wait_until(port.clock.now() + LONGEST_S)
     servos = port.bus.servos.values()
     stopped = all(not servo.torque_enabled or servo.watchdog_tripped for servo in servos)
     text = "" if error is None else "\n".join(traceback.format_exception(error))
@@ -297,19 +321,56 @@ def _judge(
     limits = np.array([joint.position_limit for joint in campaign.config.joints])
     beyond = np.maximum(limits[:, 0] - spy.low, np.array(spy.high) - limits[:, 1])
     named = error is None or bool(re.search(NAMED[kind], text)) or (phase == BRAKING and "Ctrl-C" in text)
-    unreadable |= spy.live_until > 0 and not len(samples)
-    return Outcome(kind, phase, unsafe, bool((beyond > campaign.stopping).any()), unreadable, not named, text)
+    unreadable = spy.live_until > 0 and not len(samples)
+    way, predicted = _way(campaign, kind, error, samples, spy, bool((beyond > 0).any()))
+    return Outcome(kind, phase, unsafe, unreadable, not named, text, way, beyond, predicted)
+
+
+def _way(
+    campaign: Campaign, kind: str, error: BaseException | None, samples: np.ndarray, spy: Spy, beyond: bool
+) -> tuple[str, np.ndarray]:
+    """How the run was stopped, and how far beyond the limits that may lead (joints,) [rad]."""
+    if error is None:
+        return "ran on", np.zeros(2)
+    braked = bool(len(samples)) and bool((samples["phase"] == Phase.BRAKING).any())
+    if kind not in OFF_PLAN and not _passed_a_limit(error):
+        tripped = Way.SILENT_BRAKE if braked else Way.SILENT
+        way = tripped if spy.tripped else Way.BRAKED if braked else Way.CUT
+        return f"planned, {way}", campaign.stopping.planned[way]
+    way = Way.REVERSED if braked and kind == "wrong_sign" else Way.BRAKED if braked else Way.CUT
+    return f"passed, {way}", (_at_these_speeds(campaign, samples) if beyond else campaign.stopping.passed)[way]
+
+
+def _at_these_speeds(campaign: Campaign, samples: np.ndarray) -> dict[Way, np.ndarray]:
+    """From a limit at the speeds of the last tenth of a second before the stop, with the other joint where it was."""
+    looked = samples[(samples["phase"] != Phase.BRAKING) & ~samples["missing"].any(axis=1)]
+    latest = looked[looked["deadline"] > looked["deadline"][-1] - 0.1]
+    speeds = np.abs(latest["velocity"]).max(axis=0)
+    return beyond_when_passed(campaign.config, campaign.plan, campaign.arms, speeds, latest["position"][-1])
+
+
+def _passed_a_limit(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, SafetyStop) and error.cause in {Cause.POSITION, Cause.VELOCITY}:
+            return True
+        error = error.__context__
+    return False
 
 
 def _at(port: Any, spy: Spy, when: float, action: Callable[[], None]) -> None:
-    """Do it when the port's clock passes `when`."""
+    """Do it when the port's clock passes `when`, unless the run is over."""
+    call_at(port, when, lambda: None if spy.over else action())
+
+
+def call_at(port: Any, when: float, action: Callable[[], None]) -> None:
+    """Do it once, in the first wait that ends after `when` on the port's clock."""
     clock = port.clock
     wait = clock.wait_until
     todo = [action]
 
     def waiting(deadline: float) -> None:
         wait(deadline)
-        if todo and not spy.over and clock.now() >= when:
+        if todo and clock.now() >= when:
             todo.pop()()
 
     clock.wait_until = waiting
@@ -350,18 +411,37 @@ def kinds() -> list[str]:
     return [*map(str, FaultKind), *OWN]
 
 
+def campaign_of(seeds: int, jobs: int) -> list[Outcome]:
+    """Every fault in every phase, `seeds` times each, in `jobs` processes."""
+    campaign = prepare()
+    every = [(kind, phase, seed) for seed in range(seeds) for phase in PHASES for kind in kinds()]
+    with ProcessPoolExecutor(jobs) as processes:
+        return list(processes.map(inject, [campaign] * len(every), *zip(*every, strict=True), chunksize=8))
+
+
+def shares_of_predicted(outcomes: list[Outcome]) -> dict[str, tuple[int, np.ndarray]]:
+    """By way of stopping: stops, and for each joint beyond its limit its way there over the predicted one."""
+    shares: dict[str, tuple[int, np.ndarray]] = {}
+    for way in sorted({each.way for each in outcomes}):
+        chosen = [each for each in outcomes if each.way == way]
+        seen, predicted = np.array([each.seen for each in chosen]), np.array([each.predicted for each in chosen])
+        beyond = seen > 0
+        with np.errstate(divide="ignore"):
+            shares[way] = len(chosen), seen[beyond] / predicted[beyond]
+    return shares
+
+
 def main() -> None:
     from machine import machine
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=14)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--show", action="store_true", help="print every outcome that is not as it should be")
     options = parser.parse_args()
-    campaign = prepare()
-    outcomes = [
-        inject(campaign, kind, phase, seed) for seed in range(options.seeds) for phase in PHASES for kind in kinds()
-    ]
+    outcomes = campaign_of(options.seeds, options.jobs)
+    shares = shares_of_predicted(outcomes)
     counted = {
         "injections": len(outcomes),
         "unsafe": sum(each.unsafe for each in outcomes),
@@ -372,18 +452,21 @@ def main() -> None:
     if options.show:
         for each in outcomes:
             if each.unsafe or each.beyond or each.unreadable or each.unnamed:
-                print(
-                    each.fault, each.phase, each.unsafe, each.beyond, each.unreadable, each.unnamed, each.message[-600:]
-                )
+                print(each.fault, each.phase, each.unsafe, each.beyond, each.unreadable, each.unnamed, each.way)
+                print(each.seen, each.predicted, each.message[-600:])
     if options.json:
-        print(json.dumps(counted))
+        every = np.concatenate([share for _, share in shares.values()])
+        print(json.dumps({**counted, "worst_of_predicted": round(float(every.max()), 3)}))
         return
     print(machine())
-    print("stopping distance [rad]:", ", ".join(f"{value:.2f}" for value in campaign.stopping))
     for name, value in counted.items():
         print(f"{name:14s} {value}")
-    ended = Counter("ran on" if not each.message else "stopped" for each in outcomes)
-    print(", ".join(f"{count} {how}" for how, count in ended.items()))
+    print("\nbeyond a limit: predicted at most [rad], joints seen there, and how far of what was predicted")
+    print(f"{'stopped':24s} {'stops':>6s} {'predicted':>14s} {'joints':>7s} {'median':>7s} {'worst':>7s}")
+    for way, (stops, share) in shares.items():
+        most = np.max([each.predicted for each in outcomes if each.way == way], axis=0)
+        told = f"{np.median(share):7.2f} {share.max():7.2f}" if share.size else f"{'-':>7s} {'-':>7s}"
+        print(f"{way:24s} {stops:6d} {', '.join(f'{value:.2f}' for value in most):>14s} {share.size:7d} {told}")
 
 
 if __name__ == "__main__":

@@ -46,15 +46,24 @@ class BusConfig:
 
 @dataclass(frozen=True)
 class TorqueOff:
-    """How the attempt to cut torque ended: joints read back as off, and why the others could not be confirmed."""
+    """How the attempt to cut torque ended: joints read back as off, why the others could not be confirmed, and which of
+    all have no Bus Watchdog.
+    """
 
     confirmed: tuple[Joint, ...]
     unconfirmed: tuple[tuple[Joint, str], ...]
+    unwatched: frozenset[Joint] = frozenset()
 
     def __str__(self) -> str:
         if not self.unconfirmed:
             return f"Torque is off on all {len(self.confirmed)} servos, read back."
         names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
+        alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
+        if alone:
+            return (
+                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
+                "Watchdog and may go on with its last current: cut the supply now."
+            )
         return (
             f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that hears nothing, but cut the "
             "supply before you reach into the arm."
@@ -255,7 +264,8 @@ class ServoBus:
     def torque_off(self) -> TorqueOff:
         """Cut torque on every servo and read it back. Tries all of them whatever fails; never raises.
 
-        The broadcast goes out a second time before the unconfirmed are given up: a servo that cannot answer may hear.
+        After each servo that cannot be confirmed all are told again: it may hear though it cannot answer, and while it
+        was asked the others' watchdogs heard packets and waited.
         """
         self._broadcast_torque_off()
         confirmed, unconfirmed = [], []
@@ -264,24 +274,26 @@ class ServoBus:
                 servo.write("Torque Enable", 0)
             except Exception as error:  # whatever one servo does, the next must be tried
                 unconfirmed.append((joint, str(error) or type(error).__name__))
+                self._broadcast_torque_off()
             else:
                 confirmed.append(joint)
-        if unconfirmed:
-            self._broadcast_torque_off()
         for joint in confirmed:
             if joint not in self._without_watchdog:
                 with suppress(DriverError):
                     self._servos[joint].write("Bus Watchdog", 0)
-        self.torque_off_report = TorqueOff(tuple(confirmed), tuple(unconfirmed))
+        self.torque_off_report = TorqueOff(tuple(confirmed), tuple(unconfirmed), frozenset(self._without_watchdog))
         return self.torque_off_report
 
     def _broadcast_torque_off(self) -> None:
-        """One packet to all servos first: it takes 0.2 ms, the confirmed writes after it some ms each."""
+        """To all servos at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s where one is silent.
+
+        Twice, since a packet may be lost.
+        """
         entry = self._servos[self.joints[0]].table["Torque Enable"]
         body = entry.address.to_bytes(2, "little") + b"\x00"
         # Where this fails, the confirmed writes will say so.
         with suppress(DriverError):
-            self.port.write(encode(BROADCAST_ID, Instruction.WRITE, body))
+            self.port.write(2 * encode(BROADCAST_ID, Instruction.WRITE, body))
 
 
 def _prepare_servo(joint: Joint, servo: Servo) -> None:

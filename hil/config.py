@@ -8,12 +8,12 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
 
 import fakes
 from drivers.bus import BusConfig
 from drivers.joint import Joint
-from drivers.servo_model import SERVO_MODELS, Mode, servo_model
+from drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from fakes.description import FakeArm
 from fakes.table_errors import describe
 from hil.bundled import find_config
@@ -220,6 +220,14 @@ class SafetyConfig(_Table):
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
     damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
     limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
+
+    @field_validator("watchdog")
+    @classmethod
+    def _in_whole_steps(cls, seconds: float) -> float:
+        steps = seconds / WATCHDOG_UNIT
+        if abs(steps - round(steps)) > 1e-6:
+            raise ValueError(f"the servos count in steps of {WATCHDOG_UNIT:g} s, so a multiple of it")
+        return seconds
 
 
 class StabiliserConfig(_Table):

@@ -1,15 +1,27 @@
 """The first part of a stop, where it is possible: brake, that is, a current against each joint's velocity.
 
 For a bounded time and within the current limits; over at once when a reply is missing, a servo alerts, a deadline is
-missed or a second signal comes. Torque is cut after it in any case.
+missed, a second signal comes, or a joint gets faster instead of slower, as one does whose motor turns the wrong way.
+Torque is cut after it in any case.
 """
 
 from drivers.state import State
 from hil.config import Config
 from hil.errors import ExperimentError, SafetyStop
 
-FULL_AT = 0.2
-"""Share of the velocity limit at which the brake uses the whole current limit."""
+FULL_AT = 0.5
+"""Share of the velocity limit at which the brake uses the whole current limit. A fiercer one stops hardly sooner, and
+throws the arm back much farther where the connection is lost while it brakes.
+"""
+
+
+GETS_FASTER = 0.1
+"""Share of the velocity limit by which a braked joint may get faster before the brake is given up: gravity and its
+neighbour's brake pull at it.
+"""
+
+NOTICED_AFTER = 2
+"""Samples for which a brake that pushes acts before the sample that shows it, once it shows: one, and one under way."""
 
 
 def may_brake(config: Config, error: BaseException) -> bool:
@@ -30,13 +42,24 @@ class Brake:
     def __init__(self, config: Config) -> None:
         self._gains = braking_gains(config)
         self._limits = [joint.goal_limit for joint in config.joints]
+        self._allowed = [GETS_FASTER * joint.velocity_limit for joint in config.joints]
         self._enough = config.safety.rest_velocity
+        self._slowest: list[float] | None = None
 
     def goals(self, state: State) -> list[float] | None:
-        """Goal currents [A] for this sample; None when braking is over: at rest, or a joint cannot be felt."""
-        if any(state.missing) or any(state.error) or all(abs(velocity) < self._enough for velocity in state.velocity):
+        """Goal currents [A] for this sample; None when it is over: at rest, a joint cannot be felt, or it pushes."""
+        speeds = [abs(velocity) for velocity in state.velocity]
+        if any(state.missing) or any(state.error) or all(speed < self._enough for speed in speeds):
+            return None
+        if self._pushes(speeds):
             return None
         return [
             max(-limit, min(limit, -gain * velocity))
             for gain, limit, velocity in zip(self._gains, self._limits, state.velocity, strict=True)
         ]
+
+    def _pushes(self, speeds: list[float]) -> bool:
+        """Whether a joint has become faster than it was before in this braking."""
+        former = speeds if self._slowest is None else self._slowest
+        self._slowest = [min(pair) for pair in zip(former, speeds, strict=True)]
+        return any(now > before + allowed for now, before, allowed in zip(speeds, former, self._allowed, strict=True))

@@ -22,10 +22,11 @@ def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos
     """
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
-    asked = None if config.experiment.peak_torque is None else predict(config, make_plan(config), ensemble)
+    plan = None if config.experiment.peak_torque is None else make_plan(config)
+    asked = None if plan is None else predict(config, plan, ensemble)
     largest = largest_amplitude(config, ensemble)
     shown = largest.prediction if asked is None else asked
-    stopping = stopping_distance(config, ensemble, shown.quantile[2].clip(max=shown.limits[2]), shown.quantile[3])
+    stopping = stopping_distance(config, plan or largest.plan, ensemble, shown.quantile[2].clip(max=shown.limits[2]))
     return DryRun(ensemble.source, ensemble.size, asked, largest, stopping, said)
 
 

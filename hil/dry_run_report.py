@@ -4,13 +4,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from hil.amplitude import Amplitude
 from hil.config import Config
 from hil.dry_run import QUANTITIES, UNITS, Prediction
-from hil.stopping import Stopping
+from hil.stopping import Stopping, Way
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,15 @@ def dry_run_json(config: Config, run: DryRun) -> dict[str, Any]:
         "asked": None if run.asked is None else _prediction_json(config, run.asked),
         "largest": _prediction_json(config, run.largest.prediction),
         "stopping_distance_rad": {
-            kind: [round(float(value), 3) for value in getattr(run.stopping, kind)]
-            for kind in ("braked", "cut", "watchdog")
+            "planned": _ways_json(run.stopping.planned),
+            "passed": _ways_json(run.stopping.passed),
         },
         "servos": list(run.servos),
     }
+
+
+def _ways_json(ways: dict[Way, NDArray[np.float64]]) -> dict[str, list[float]]:
+    return {str(way): [round(float(value), 3) for value in beyond] for way, beyond in ways.items()}
 
 
 def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
@@ -108,14 +113,15 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
 
 def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     torque = ", ".join(f"{value:.2f}" for value in run.largest.peak_torque)
-    braked, watchdog = (
-        ", ".join(f"{value:.2f}" for value in ways) for ways in (run.stopping.braked, run.stopping.watchdog)
-    )
+    planned, passed = run.stopping.planned, run.stopping.passed
+    stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])
     lines = [
         "99 %: all peaks of an arm together stay within these in 99 of 100 arms.",
         settling_text(config, shown),
-        f"Should a limit be passed at these speeds, the joints go on for up to {braked} rad when braked, {watchdog} "
-        "rad when the program is killed. Keep that much clear.",
+        f"Stopped at any moment, the joints swing at most {_radians(stopped)} beyond their limits; with the program "
+        f"killed or the cable pulled, {_radians(planned[Way.SILENT])}.",
+        f"Should something drive them over a limit at these speeds, they go on for at most "
+        f"{_radians(passed[Way.BRAKED])} when braked, {_radians(passed[Way.CUT])} when cut. Keep that much clear.",
         f"Largest safe torque: peak_torque = [{torque}] N m.",
     ]
     allowed = f"safety.limit_chance allows {100 * config.safety.limit_chance:g} %"
@@ -126,3 +132,7 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
         ]
     word = "SAFE" if run.is_safe(config) else "NOT SAFE as configured"
     return [*lines, f"{word}: a guard stop has a chance of {100 * shown.stop_chance:.2g} %; {allowed}."]
+
+
+def _radians(beyond: NDArray[np.float64]) -> str:
+    return ", ".join(f"{value:.2f}" for value in beyond) + " rad"

@@ -106,7 +106,8 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
                 f"{joint} is at {position:.3f} rad; arm.rest_pose says {rest:.3f} and arm.rest_tolerance allows "
-                f"{config.arm.rest_tolerance:g}. If the arm hangs at rest now, set zero_ticks = {ticks}."
+                f"{config.arm.rest_tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
+                f"Only if it is in its rest pose now, set zero_ticks = {ticks}."
             )
 
 

@@ -1,6 +1,6 @@
 """Looks at every sample and stops the arm when a limit is passed or an answer makes no sense.
 
-Two joints cost some 4 us a sample: plain floats, one pass over the joints, everything known beforehand worked out once.
+Two joints cost 1 to 4 us a sample: plain floats, one pass over the joints, everything known beforehand worked out once.
 """
 
 from collections.abc import Sequence

@@ -142,11 +142,14 @@ class Stream:
         window = rest_window(self._plan.rate)
         for _ in range(0, self._plan.end_samples, window):
             self._play(self._silence(window), Phase.COMING_TO_REST)
-            slowest = np.abs(np.nan_to_num(self._recorder.samples["velocity"][-window:])).max()
-            if slowest < self._safety.rest_velocity:
+            speeds = np.abs(self._recorder.samples["velocity"][-window:])
+            # Replies that are missing say nothing; a joint of which none came is not known to be at rest.
+            fastest = np.fmax.reduce(speeds, axis=0)
+            if (fastest < self._safety.rest_velocity).all():
                 self._note("at rest")
                 return
-        self._note(f"still moving at {slowest:.2f} rad/s after {self._safety.rest_time:g} s without current")
+        told = ", ".join(f"{speed:.2f}" for speed in fastest)
+        self._note(f"still moving at {told} rad/s after {self._safety.rest_time:g} s without current")
 
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
         """Send goal currents, (samples, joints) [A], one row a tick; the last state."""
@@ -194,9 +197,11 @@ class Stream:
         state = self._state
         with suppress(DriverError):
             for _ in range(self._plan.brake_samples):
-                goals = None if state is None or self._stop.insisted else brake.goals(state)
+                goals = None if state is None else brake.goals(state)
+                if goals is None:
+                    return
                 deadline, _, late = self._ticks.wait()
-                if goals is None or late:
+                if late or self._stop.insisted:
                     return
                 state = self._bus.exchange(goals)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)

@@ -51,6 +51,11 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("mass = 0.180 ", "mass = -1.0 ", r"fake\.arm\.links\[1\]\.mass = -1\.0: must be at least 0"),
         ("mass = 0.180 ", 'mass = "0.18" ', r"fake\.arm\.links\[1\]\.mass = '0\.18': must be a number"),
         ("gear_ratio = 353.5", "gear = 353.5", r"fake\.arm\.drives\[1\]\.gear is not a known key; .*gear_ratio"),
+        (
+            "[experiment]",
+            "[safety]\nwatchdog = 0.05\n[experiment]",
+            r"safety\.watchdog.*steps of 0\.02 s, so a multiple",
+        ),
         ("url =", "url ", r"not valid TOML"),
     ],
 )

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from benchmarks.dry_run import prior_study
@@ -15,7 +14,6 @@ from hil.dry_run import GUARDED, predict
 from hil.ensemble import prior_ensemble
 from hil.errors import ConfigError
 from hil.plan import make_plan
-from hil.stopping import stopping_distance
 from tests.hil.command_line import hil
 
 Arm = Callable[..., Config]
@@ -43,12 +41,6 @@ def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known
     assert found.prediction.stop_chance <= known.safety.limit_chance
     assert (found.prediction.shares[:, :GUARDED] < 1.0).all()
     assert found.prediction.shares[:, :GUARDED].max() > 0.6, "and not for lack of trying"
-
-
-def test_a_brake_stops_sooner_than_the_watchdog(known: Config) -> None:
-    ways = stopping_distance(known, prior_ensemble(known, 12), np.array([4.0, 4.0]), np.array([0.4, 0.2]))
-    assert (ways.braked <= ways.cut + 1e-9).all() and (ways.cut <= ways.watchdog + 1e-9).all()
-    assert (ways.braked > 0.05).all()
 
 
 def test_seen_peaks_stay_within_the_predicted_ones() -> None:

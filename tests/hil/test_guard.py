@@ -1,8 +1,8 @@
 """The guard by itself: what each sample must not show, and what a look costs."""
 
-import time
 from collections.abc import Callable
 from math import inf, nan
+from timeit import timeit
 from typing import Any
 
 import pytest
@@ -36,6 +36,7 @@ def look(guard: Guard, *states: State) -> Cause:
         ({"velocity": (15.1, 0.0)}, Cause.VELOCITY),
         ({"velocity": (nan, 0.0)}, Cause.VELOCITY),
         ({"error": (0, 0x80)}, Cause.ALERT),
+        ({"error": (0, 0x80), "missing": (False, True)}, Cause.ALERT),
         ({"slow": NOTHING_SLOW._replace(temperature=(71.0, nan))}, Cause.TEMPERATURE),
         ({"slow": NOTHING_SLOW._replace(voltage=(nan, 31.0))}, Cause.VOLTAGE),
     ],
@@ -82,6 +83,14 @@ def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
         Guard(arm()).look(STILL, 0.12)
 
 
+def test_late_deadlines_stop_before_a_short_watchdog_acts(arm: Arm) -> None:
+    guard = Guard(arm(("[experiment]\n", "[safety]\nwatchdog = 0.04\n\n[experiment]\n")))
+    for _ in range(12):
+        guard.late()
+    with pytest.raises(SafetyStop, match="13 deadlines in a row were missed, 32 ms without a command"):
+        guard.late()
+
+
 def test_motion_before_the_start(arm: Arm) -> None:
     guard = Guard(arm())
     guard.look_at_rest(STILL)
@@ -102,14 +111,19 @@ def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:
             guard.clamp([wrong, 0.0])
 
 
-def test_a_look_costs_at_most_ten_microseconds(arm: Arm) -> None:
+def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
+    """The figure is benchmarks/guard.py's; here only what slows a look down shows, on a machine of any speed."""
     guard = Guard(arm())
     moving = STILL._replace(goal_current=(0.1, 0.1), current=(0.1, 0.1), velocity=(0.5, 0.5))
-    best = inf
-    for _ in range(20):
-        started = time.perf_counter()
-        for _ in range(500):
-            guard.clamp((0.1, 0.1))
-            guard.look(moving, 0.0025)
-        best = min(best, (time.perf_counter() - started) / 500)
-    assert best <= 10e-6, f"{1e6 * best:.1f} us"
+
+    def look() -> None:
+        guard.clamp((0.1, 0.1))
+        guard.look(moving, 0.0025)
+
+    def add() -> None:
+        total = 0.0
+        for each in range(100):
+            total += each
+
+    rounds = [(timeit(look, number=500), timeit(add, number=500)) for _ in range(20)]
+    assert min(looked for looked, _ in rounds) < 3 * min(added for _, added in rounds)

@@ -1,0 +1,73 @@
+"""What the guard costs a sample: its clamp before the exchange and its look after it, two joints.
+
+    python benchmarks/guard.py [--json]
+
+The samples are those of a run of the fake arm, played to the guard again and again, without bus and recorder. The
+figure is the median over rounds of the mean over a round's samples; the fastest round is printed beside it, because
+other programs can only add to it.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+from benchmarks.faults import CONFIG, short_config
+from drivers.state import State
+from hil.config import Config
+from hil.experiment import run_experiment
+from hil.guard import Guard
+from hil.recording import Phase, load_samples
+from hil.run_folder import RunFolder
+
+ROUNDS = 200
+
+
+def guard_cost(rounds: int = ROUNDS) -> list[float]:
+    """Seconds a sample, one mean for each round."""
+    config = short_config(CONFIG.read_text(encoding="utf-8"))
+    states = recorded_states(config)
+    costs = []
+    for _ in range(rounds):
+        guard = Guard(config)
+        started = time.perf_counter()
+        for state in states:
+            guard.clamp(state.goal_current)
+            guard.look(state, 0.005)
+        costs.append((time.perf_counter() - started) / len(states))
+    return costs
+
+
+def recorded_states(config: Config) -> list[State]:
+    """The samples of an undisturbed run in motion, as the stream saw them; slow readings aside."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = RunFolder.create(Path(folder) / "run", config)
+        run_experiment(config, run, CONFIG, lambda _: None)
+        samples = load_samples(run.samples_path, len(config.joints))
+    names = ("goal_current", "current", "velocity", "position", "error", "missing")
+    return [
+        State(float(row["time_before_write"]), float(row["time_after_read"]), *(tuple(row[n].tolist()) for n in names))
+        for row in samples[samples["phase"] == Phase.PERIODIC]
+    ]
+
+
+def main() -> None:
+    from machine import machine
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    costs = guard_cost()
+    measured = {"joints": 2, "us_a_sample": round(1e6 * median(costs), 2), "us_fastest": round(1e6 * min(costs), 2)}
+    if options.json:
+        print(json.dumps(measured))
+        return
+    print(machine())
+    for name, value in measured.items():
+        print(f"{name:12s} {value}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""Torque on and off, as the emulated servos see it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from drivers.bus import BusConfig, ServoBus
+from drivers.errors import ServoRefused, TorqueNotOff
+from fakes.faults import Fault, FaultKind
+
+Make = Callable[..., BusConfig]
+GOAL_CURRENT, WATCHDOG, TORQUE = 102, 98, 64
+
+
+def servos(bus: ServoBus) -> dict[int, Any]:
+    fake: Any = bus.port
+    found: dict[int, Any] = fake._serial.bus.servos
+    return found
+
+
+def fake_bus(bus: ServoBus) -> Any:
+    fake: Any = bus.port
+    return fake._serial.bus
+
+
+def written(bus: ServoBus, servo_id: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, float]]:
+    """What will be written to a servo: address, value, time [s]."""
+    servo = servos(bus)[servo_id]
+    write = servo.write
+    seen: list[tuple[int, int, float]] = []
+
+    def writing(address: int, data: bytes) -> int:
+        seen.append((address, int.from_bytes(data, "little", signed=True), bus.port.clock.now()))
+        error: int = write(address, data)
+        return error
+
+    monkeypatch.setattr(servo, "write", writing)
+    return seen
+
+
+@pytest.mark.parametrize("servo_id", [1, 2])
+def test_goal_current_is_zero_and_the_watchdog_armed_before_torque_comes_on(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch, servo_id: int
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        servos(bus)[servo_id].write(GOAL_CURRENT, (1000).to_bytes(2, "little"))
+        seen = written(bus, servo_id, monkeypatch)
+        with bus.torque(watchdog=0.1):
+            order = [(address, value) for address, value, _ in seen]
+        assert order.index((GOAL_CURRENT, 0)) < order.index((TORQUE, 1))
+        assert order.index((WATCHDOG, 5)) < order.index((TORQUE, 1))
+        assert not servos(bus)[servo_id].torque_enabled
+
+
+def refusing(bus: ServoBus, servo_id: int, refused: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A servo that answers this write without an error, and does nothing."""
+    servo = servos(bus)[servo_id]
+    write = servo.write
+
+    def writing(address: int, data: bytes) -> int:
+        if (address, int.from_bytes(data, "little")) == refused:
+            return 0
+        error: int = write(address, data)
+        return error
+
+    monkeypatch.setattr(servo, "write", writing)
+
+
+def test_no_torque_where_the_watchdog_does_not_read_back_as_armed(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        refusing(bus, 2, (WATCHDOG, 5), monkeypatch)
+        said = r"'elbow'.*Bus Watchdog was written as 5 but reads back as 0"
+        with pytest.raises(ServoRefused, match=said), bus.torque(watchdog=0.1):
+            raise AssertionError("torque is on")
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
+def test_a_servo_that_keeps_its_torque_though_it_answers_is_named(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        said = r"NOT CONFIRMED for JOINT 'ELBOW' \(ID 2.*reads back as 1.*cut the supply"
+        with pytest.raises(TorqueNotOff, match=said), bus.torque(watchdog=0.1):
+            refusing(bus, 2, (TORQUE, 0), monkeypatch)
+        assert not servos(bus)[1].torque_enabled
+        bus.port.clock.wait_until(bus.port.clock.now() + 0.11)
+        assert servos(bus)[2].watchdog_tripped, "it was left armed"
+
+
+def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While a silent servo is asked again and again, the packets feed the others' watchdogs."""
+    with ServoBus.open(fake_config()) as bus:
+        with pytest.raises(TorqueNotOff, match="'SHOULDER'"), bus.torque(watchdog=0.1):
+            bus.exchange([0.3, 0.3])
+            seen = written(bus, 2, monkeypatch)
+            servos(bus)[1].connected = False
+            left = bus.port.clock.now()
+            faults = fake_bus(bus).faults
+            faults.add(Fault(kind=FaultKind.LOST_INSTRUCTION, at=fake_bus(bus).time, duration=2e-4))
+        assert any(fault.kind == FaultKind.LOST_INSTRUCTION for fault in faults.happened)
+        off = next(time for address, value, time in seen if (address, value) == (TORQUE, 0))
+        assert off - left < 0.002
