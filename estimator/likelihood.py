@@ -42,7 +42,7 @@ ALIKE = 1.05  # of the best try's sum of squares: up to here another try may sti
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
-START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02}
+START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
 LEAST_LAG = 1e-4  # s, at the start
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 OUTLIER = 4.0  # standard deviations; rounding never leaves more than 1.7

@@ -188,6 +188,9 @@ class ModelConfig(_Table):
     asymmetry: bool = Field(False, description="viscous friction that differs with direction")
     ripple: bool = Field(False, description="torque ripple over the joint's angle")
     zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
+    torque_scale: bool = Field(
+        False, description="the ratio of the joints' torque constants; one of them has to be believed"
+    )
 
     @property
     def fixed_friction(self) -> Literal["coulomb", "stribeck", "stribeck_load"]:

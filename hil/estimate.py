@@ -66,7 +66,12 @@ def _estimate(config: Config, period: SettledPeriod, other: SettledPeriod | None
     if wanted.friction == "auto":
         choice = choose([period], other, wanted.drive)
         return choice.estimate, choice
-    terms = {"asymmetry": wanted.asymmetry, "ripple": wanted.ripple, "zeros": wanted.zeros}
+    terms = {
+        "asymmetry": wanted.asymmetry,
+        "ripple": wanted.ripple,
+        "zeros": wanted.zeros,
+        "torque_scale": wanted.torque_scale,
+    }
     return identify(period, Model(len(config.joints), wanted.friction, wanted.drive, **terms)), None
 
 
