@@ -1,6 +1,6 @@
 """The estimator's front door: a settled period in, parameters with standard errors and predictions out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,12 +80,19 @@ class Estimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
-def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model, *, hasty: bool = False) -> Estimate:
+def identify(
+    periods: SettledPeriod | Sequence[SettledPeriod],
+    model: Model,
+    *,
+    hasty: bool = False,
+    former: Mapping[str, float] | None = None,
+) -> Estimate:
     """Estimate the parameters of `model` from one settled period, or from several of one arm together:
     regression on their lines, then maximum likelihood.
 
     The same periods give the same numbers to the last digit. `hasty` is for trying models: one that leaves much
-    more than the noise is not fitted to its last digits. Raises ModelError when `model` has another
+    more than the noise is not fitted to its last digits. `former`: what another experiment with the same arm gave, by
+    name; one more place to start from, nothing more. Raises ModelError when `model` has another
     number of joints than a period, UnidentifiableError and ConvergenceError.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
@@ -94,7 +101,7 @@ def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model, *, 
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(*used)
-    fit = fit_runs(used, model, linear, hasty=hasty)
+    fit = fit_runs(used, model, linear, hasty=hasty, former=former)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
         model,

@@ -8,7 +8,7 @@ How large the errors are is itself estimated, joint by joint, between a coarse f
 far outside are weighed down there (Huber): a few wild readings then cost nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -154,18 +154,29 @@ class Problem:
         return transform
 
 
-def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate, *, hasty: bool = False) -> Fit:
+def fit_runs(
+    periods: Sequence[SettledPeriod],
+    model: Model,
+    linear: LinearEstimate,
+    *,
+    hasty: bool = False,
+    former: Mapping[str, float] | None = None,
+) -> Fit:
     """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError.
 
-    `hasty` is for trying a model: one that leaves much more than the noise is given up before its last digits.
+    `former`: parameters from which another try starts, before all others. `hasty` is for trying a model: one that leaves much more than the noise is given up before its last digits.
     """
     problem, states = _problem(periods, model, linear)
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
     enough = HASTY if hasty else COARSE
     tries: list[Minimum] = []
-    for width in STARTING_WIDTHS:
-        x = np.concatenate((problem.coordinates.coordinates(_start(model, linear, ripple, width)), states))
+    starts = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
+    if former is not None:
+        known = [former.get(name, other) for name, other in zip(model.names, starts[0].tolist(), strict=True)]
+        starts.insert(0, np.array(known))
+    for start in starts:
+        x = np.concatenate((problem.coordinates.coordinates(start), states))
         tries.append(_approach(problem, x, samples, enough))
         if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
             break

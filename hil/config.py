@@ -274,6 +274,8 @@ class Config(_Table):
             for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
                 _check_peak_torque(joint, peak)
         self._check_pilot()
+        if self.model.torque_scale and count != 2:
+            raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
         if len({joint.drive_mode for joint in self.joints}) != 1:
             raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:

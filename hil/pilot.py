@@ -96,10 +96,12 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
         say("What is known so far is too uncertain to go to the limits at once: one more run on the way.")
         between = _without_held_out(config)
         folder = run.below(f"step-{len(steps) + 1}", between)
+        folder.write_former(_values(result))
         _play(between, folder, shown_path, watch, say, f"Step {len(steps) + 1}", full, steps)
         result = estimate_run(folder)
     played = _with_torque(config, full.peak_torque)
     run.write_played(played)
+    run.write_former(_values(result))
     torque = _play(played, run, shown_path, watch, say, "Full run", full, steps)
     result = estimate_run(run)
     result["steps"] = [step.as_json() for step in steps]
@@ -179,6 +181,10 @@ def _play(
     if not step.within:
         say(f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed.")
     return torque
+
+
+def _values(result: dict[str, Any]) -> dict[str, float]:
+    return {name: entry["value"] for name, entry in {**result["parameters"], **result["extra"]}.items()}
 
 
 def _with_torque(config: Config, peak_torque: Array) -> Config:

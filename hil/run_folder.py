@@ -108,6 +108,18 @@ class RunFolder:
         folder.write_played(played)
         return folder
 
+    @property
+    def former_path(self) -> Path:
+        return self.path / "former.json"
+
+    def write_former(self, parameters: dict[str, float]) -> None:
+        """Keep what the run before this one gave: the estimate starts there too, now and when it is made anew."""
+        write_json(self.former_path, parameters)
+
+    def load_former(self) -> dict[str, float] | None:
+        """What the run before this one gave, if one did; raises RunFolderError."""
+        return _read_json(self.former_path) if self.former_path.is_file() else None
+
     def write_played(self, played: Config) -> None:
         """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found."""
         write_json(self.played_path, played.experiment.model_dump())
