@@ -164,7 +164,8 @@ def fit_runs(
 ) -> Fit:
     """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError.
 
-    `former`: parameters from which another try starts, before all others. `hasty` is for trying a model: one that leaves much more than the noise is given up before its last digits.
+    `former`: parameters from which another try starts, before all others. `hasty` is for trying a model: one that
+    leaves much more than the noise is given up before its last digits.
     """
     problem, states = _problem(periods, model, linear)
     samples = int(sum(period.valid.sum() for period in periods))

@@ -16,10 +16,8 @@ PER_JOINT = (
 # The order in which the compiled simulation takes them.
 CONSTANTS = (*RIGID, *(f"{name}_{joint}" for name in PER_JOINT for joint in (1, 2)))
 # What stands for a term the model lacks; a pendulum's second joint is a wheel that nothing turns.
-ABSENT = {
-    name: {"armature": 1.0, "coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}.get(name.rstrip("_12"), 0.0)
-    for name in CONSTANTS
-}
+ONE_WHERE_ABSENT = ("armature", "coulomb_width", "stribeck_velocity", "torque_scale")
+ABSENT = {name: 1.0 if name.rstrip("_12") in ONE_WHERE_ABSENT else 0.0 for name in CONSTANTS}
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
 from hil.result_table import GOOD_RESIDUAL_TICKS
+from hil.torque_constants import torque_constants_said
 
 GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05
 """Error of the free prediction, of the motion's RMS, up to which a model is called good, and usable."""
@@ -74,12 +75,7 @@ def _limits(data: RunData) -> str:
 
 
 def _torque_constants(data: RunData) -> str:
-    unsure = [
-        f"{joint.name} {percent(joint.torque_per_goal_std / joint.torque_per_goal)}"
-        for joint in data.model.joints
-        if joint.torque_per_goal_std
-    ]
-    return f"All values scale with their joint's torque constant, known to: {listed(unsure)}." if unsure else ""
+    return torque_constants_said(data.model.joints, data.result["extra"])
 
 
 def _hardware(data: RunData) -> str:
