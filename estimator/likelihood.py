@@ -160,11 +160,11 @@ def fit_runs(
     linear: LinearEstimate,
     *,
     hasty: bool = False,
-    former: Mapping[str, float] | None = None,
+    starts: Sequence[Mapping[str, float]] = (),
 ) -> Fit:
     """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError.
 
-    `former`: parameters from which another try starts, before all others. `hasty` is for trying a model: one that
+    `starts`: parameters from which further tries start, before all others. `hasty` is for trying a model: one that
     leaves much more than the noise is given up before its last digits.
     """
     problem, states = _problem(periods, model, linear)
@@ -172,11 +172,10 @@ def fit_runs(
     ripple = find_ripple(periods, linear) if model.ripple else {}
     enough = HASTY if hasty else COARSE
     tries: list[Minimum] = []
-    starts = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
-    if former is not None:
-        known = [former.get(name, other) for name, other in zip(model.names, starts[0].tolist(), strict=True)]
-        starts.insert(0, np.array(known))
-    for start in starts:
+    own = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
+    unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
+    given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
+    for start in (*given, *own):
         x = np.concatenate((problem.coordinates.coordinates(start), states))
         tries.append(_approach(problem, x, samples, enough))
         if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:

@@ -124,7 +124,7 @@ class PriorConfig(_Table):
     link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
     servo_mass: list[PositiveFloat] | None = Field(None, description="kg")
     armature: list[PositiveFloat] | None = Field(None, description="kg m^2: rotor inertia times gear ratio squared")
-    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad")
+    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad; in pwm mode back-EMF included")
     coulomb: list[PositiveFloat] | None = Field(None, description="N m")
 
 

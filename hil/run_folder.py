@@ -109,16 +109,21 @@ class RunFolder:
         return folder
 
     @property
-    def former_path(self) -> Path:
-        return self.path / "former.json"
+    def starts_path(self) -> Path:
+        return self.path / "starts.json"
 
-    def write_former(self, parameters: dict[str, float]) -> None:
-        """Keep what the run before this one gave: the estimate starts there too, now and when it is made anew."""
-        write_json(self.former_path, parameters)
+    def write_starts(self, starts: list[dict[str, float]]) -> None:
+        """Keep parameters from which the estimate starts too, now and when it is made anew."""
+        write_json(self.starts_path, {"starts": starts})
 
-    def load_former(self) -> dict[str, float] | None:
-        """What the run before this one gave, if one did; raises RunFolderError."""
-        return _read_json(self.former_path) if self.former_path.is_file() else None
+    def load_starts(self) -> list[dict[str, float]]:
+        """Those kept, if any were; raises RunFolderError."""
+        if not self.starts_path.is_file():
+            return []
+        starts = _read_json(self.starts_path).get("starts")
+        if not isinstance(starts, list):
+            raise RunFolderError(f"{self.starts_path} is damaged: it holds no list of starts.")
+        return starts
 
     def write_played(self, played: Config) -> None:
         """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found."""
