@@ -7,7 +7,7 @@ rest, gets better only by what is true in it. Without such a motion the Bayesian
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,17 +67,20 @@ class Choice:
         return float(np.exp(np.mean(np.log(sizes[0][seen] / sizes[1][seen]))))
 
 
-def choose(periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drive: Drive) -> Choice:
+def choose(
+    periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drive: Drive, *, torque_scale: bool = False
+) -> Choice:
     """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
 
     Coulomb, Stribeck and load-dependent friction come first; then ripple over the angle and friction that differs
     with direction, on top of the best. Ends when the prediction's error is the encoder's own noise. Raises
-    ConvergenceError when no model can be fitted.
+    ConvergenceError when no model can be fitted. `torque_scale` is part of every model, or of none.
     """
     trials: list[Trial] = []
     best: Trial | None = None
     joints = periods[0].joints
-    for model in _ladder(joints, drive):
+    for step in _ladder(joints, drive):
+        model = replace(step, torque_scale=torque_scale)
         trial = _try(model if best is None else _on_top(model, best.model), periods, held_out, hasty=True)
         trials.append(trial)
         if best is None or trial.score < WORTH * best.score:
@@ -102,7 +105,7 @@ def _ladder(joints: int, drive: Drive) -> Iterator[Model]:
 def _on_top(model: Model, best: Model) -> Model:
     """Direction is added to the best so far; ripple only shows with all of friction in place."""
     if model.asymmetry:
-        return Model(best.joints, best.friction, best.drive, asymmetry=True, ripple=best.ripple)
+        return replace(best, asymmetry=True)
     return model
 
 

@@ -1,8 +1,9 @@
 """The arm's motion under commands that depend on its motion: a spring and damper in software, a brake.
 
-The equations and the integration step are those of `estimator.simulation`. A command is worked out once a sample
-from the state of the sample before, as the computer on the bus does it, clipped, and held; the motor follows it with
-a first-order lag. A pure delay of the drive is taken as more of that lag, which is the same to first order.
+The equations and the integration step are those of `estimator.simulation`, torque scale and all. A command is worked
+out once a sample from the state of the sample before, as the computer on the bus does it, clipped, and held; the motor
+follows it with a first-order lag. A pure delay of the drive is taken as more of that lag, which is the same to first
+order.
 """
 
 import math

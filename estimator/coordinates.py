@@ -86,7 +86,7 @@ def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: f
         **dict.fromkeys(("ripple_sin", "ripple_cos", "ripple_cycles", "zero"), 0.02),
         "stribeck_velocity": velocity,
         "coulomb_width": 0.05,
-        **dict.fromkeys(("stribeck_rise", "load"), 1.0),
+        **dict.fromkeys(("stribeck_rise", "load", "torque_scale"), 1.0),
         **dict.fromkeys(("delay", "lag"), 1e-3),
     }
     return np.array([scale[_kind(name)] for name in names])

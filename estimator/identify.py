@@ -1,6 +1,6 @@
 """The estimator's front door: a settled period in, parameters with standard errors and predictions out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,7 @@ from estimator.simulation import simulate, steps_per_sample
 
 MOST_PERIODS = 50  # simulated until the motion is periodic
 PERIODIC = 1e-7  # rad and rad/s, from one period's end to the next
+NEARLY = 1e-5  # what is good enough where that is not reached: far below any encoder's step
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,19 @@ class Estimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
-def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model, *, hasty: bool = False) -> Estimate:
+def identify(
+    periods: SettledPeriod | Sequence[SettledPeriod],
+    model: Model,
+    *,
+    hasty: bool = False,
+    starts: Sequence[Mapping[str, float]] = (),
+) -> Estimate:
     """Estimate the parameters of `model` from one settled period, or from several of one arm together:
     regression on their lines, then maximum likelihood.
 
     The same periods give the same numbers to the last digit. `hasty` is for trying models: one that leaves much
-    more than the noise is not fitted to its last digits. Raises ModelError when `model` has another
+    more than the noise is not fitted to its last digits. `starts`: parameters by name, of another experiment or of
+    arms like this one; more places to start from, nothing more. Raises ModelError when `model` has another
     number of joints than a period, UnidentifiableError and ConvergenceError.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
@@ -94,7 +102,7 @@ def identify(periods: SettledPeriod | Sequence[SettledPeriod], model: Model, *, 
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(*used)
-    fit = fit_runs(used, model, linear, hasty=hasty)
+    fit = fit_runs(used, model, linear, hasty=hasty, starts=starts)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
         model,
@@ -133,10 +141,10 @@ def predict(
     step = 1.0 / (rate * steps)
     motor = motor_torque(torque, rate, command_to_sample, steps, delay=physics.delay, lag=physics.lag)
     state = np.stack((estimate.start[0] if pose is None else pose, np.zeros(joints)))
-    for _ in range(MOST_PERIODS):
+    for period in range(MOST_PERIODS):
         position, end = simulate(physics, state, motor, step)
         change = float(np.abs(end - state).max())
-        if change < PERIODIC:
+        if change < (PERIODIC if period < MOST_PERIODS - 1 else NEARLY):
             return position
         state = end
     raise PeriodicityError(

@@ -8,7 +8,7 @@ How large the errors are is itself estimated, joint by joint, between a coarse f
 far outside are weighed down there (Huber): a few wild readings then cost nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +42,7 @@ ALIKE = 1.05  # of the best try's sum of squares: up to here another try may sti
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
-START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02}
+START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
 LEAST_LAG = 1e-4  # s, at the start
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 OUTLIER = 4.0  # standard deviations; rounding never leaves more than 1.7
@@ -154,18 +154,29 @@ class Problem:
         return transform
 
 
-def fit_runs(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate, *, hasty: bool = False) -> Fit:
+def fit_runs(
+    periods: Sequence[SettledPeriod],
+    model: Model,
+    linear: LinearEstimate,
+    *,
+    hasty: bool = False,
+    starts: Sequence[Mapping[str, float]] = (),
+) -> Fit:
     """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError.
 
-    `hasty` is for trying a model: one that leaves much more than the noise is given up before its last digits.
+    `starts`: parameters from which further tries start, before all others. `hasty` is for trying a model: one that
+    leaves much more than the noise is given up before its last digits.
     """
     problem, states = _problem(periods, model, linear)
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
     enough = HASTY if hasty else COARSE
     tries: list[Minimum] = []
-    for width in STARTING_WIDTHS:
-        x = np.concatenate((problem.coordinates.coordinates(_start(model, linear, ripple, width)), states))
+    own = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
+    unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
+    given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
+    for start in (*given, *own):
+        x = np.concatenate((problem.coordinates.coordinates(start), states))
         tries.append(_approach(problem, x, samples, enough))
         if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
             break

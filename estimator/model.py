@@ -26,6 +26,7 @@ UNITS = {
     "ripple_cos": "1",
     "ripple_cycles": "1",
     "zero": "rad",
+    "torque_scale": "1",
     "delay": "s",
     "lag": "s",
 }
@@ -41,9 +42,11 @@ class Model:
     lag, `delay_lag` both. `asymmetry` adds viscous_asymmetry |v|: friction that differs with direction (of the
     Coulomb level, that is the offset). `ripple` multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles
     q) + ripple_cos cos(ripple_cycles q), ripple_cycles per turn of the joint. `zeros` adds the errors of the
-    encoders' zeros, true angle = measured angle + zero; the first joint's shows only under gravity.
+    encoders' zeros, true angle = measured angle + zero; the first joint's shows only under gravity. `torque_scale`
+    multiplies the second joint's torque: true over supposed torque constant, relative to the first joint's. One
+    unknown torque constant scales all parameters; of two, the ratio shows, since both joints feel the same masses.
 
-    Raises ModelError for other names and for other than one or two joints.
+    Raises ModelError for other names, for other than one or two joints, and for a torque_scale of one joint.
     """
 
     joints: int
@@ -52,6 +55,7 @@ class Model:
     asymmetry: bool = False
     ripple: bool = False
     zeros: bool = False
+    torque_scale: bool = False
 
     def __post_init__(self) -> None:
         parameter_names(self.joints)
@@ -59,6 +63,8 @@ class Model:
             raise ModelError(f"friction model {self.friction!r}: choose one of {', '.join(FRICTION_TERMS)}")
         if self.drive not in DRIVE_TERMS:
             raise ModelError(f"drive model {self.drive!r}: choose one of {', '.join(DRIVE_TERMS)}")
+        if self.torque_scale and self.joints != 2:
+            raise ModelError("torque_scale compares two joints' torque constants: it needs two joints")
 
     @property
     def base_names(self) -> tuple[str, ...]:
@@ -71,12 +77,17 @@ class Model:
         more = FRICTION_TERMS[self.friction]
         more += ("viscous_asymmetry",) * self.asymmetry + RIPPLE * self.ripple + ("zero",) * self.zeros
         terms = (f"{term}_{joint + 1}" for term in more for joint in range(self.joints))
-        return (*self.base_names, *terms, *DRIVE_TERMS[self.drive])
+        return (*self.base_names, *terms, *(("torque_scale_2",) * self.torque_scale), *DRIVE_TERMS[self.drive])
 
     @property
     def description(self) -> str:
         """In words, for a person."""
-        words = {"asymmetry": self.asymmetry, "ripple": self.ripple, "zeros": self.zeros}
+        words = {
+            "asymmetry": self.asymmetry,
+            "ripple": self.ripple,
+            "zeros": self.zeros,
+            "torque scale": self.torque_scale,
+        }
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 
     @property

@@ -11,15 +11,13 @@ RIGID = ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravi
 # Of each joint; the angle's zero is an error of the encoder's: true angle = measured angle + zero.
 PER_JOINT = (
     *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
-    *("viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero"),
+    *("viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale"),
 )
 # The order in which the compiled simulation takes them.
 CONSTANTS = (*RIGID, *(f"{name}_{joint}" for name in PER_JOINT for joint in (1, 2)))
 # What stands for a term the model lacks; a pendulum's second joint is a wheel that nothing turns.
-ABSENT = {
-    name: {"armature": 1.0, "coulomb_width": 1.0, "stribeck_velocity": 1.0}.get(name.rstrip("_12"), 0.0)
-    for name in CONSTANTS
-}
+ONE_WHERE_ABSENT = ("armature", "coulomb_width", "stribeck_velocity", "torque_scale")
+ABSENT = {name: 1.0 if name.rstrip("_12") in ONE_WHERE_ABSENT else 0.0 for name in CONSTANTS}
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class Physics:
     """Constants of one simulation."""
 
     vector: Array
-    """In the order of CONSTANTS (30,) [SI]."""
+    """In the order of CONSTANTS (32,) [SI]."""
     delay: float
     """Pure delay of the torque [s]."""
     lag: float

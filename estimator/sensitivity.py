@@ -94,6 +94,8 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float, F: Any, S: Any) -> 
     viscous, coulomb, offset, width = p[c], p[c + 2], p[c + 4], p[c + 6]
     rise, fading, load, asymmetry = p[c + 8], p[c + 10], p[c + 12], p[c + 14]
     ripple_sin, ripple_cos, cycles = p[c + 16], p[c + 18], p[c + 20]
+    commanded, scale = t, p[c + 24]
+    t *= scale
     sine, cosine = 0.0, 1.0
     if cycles != 0.0:
         sine, cosine = math.sin(cycles * q), math.cos(cycles * q)
@@ -122,15 +124,16 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float, F: Any, S: Any) -> 
     F[c + 16], S[c + 16] = t * sine * (1.0 - loaded * bend), t * sine * loaded * bent
     F[c + 18], S[c + 18] = t * cosine * (1.0 - loaded * bend), t * cosine * loaded * bent
     F[c + 20], S[c + 20] = q * turn * (1.0 - loaded * bend), q * turn * loaded * bent
+    F[c + 24], S[c + 24] = commanded * gain * (1.0 - loaded * bend), commanded * gain * loaded * bent
     return (
         motor - offset - viscous * v - (asymmetry * v + level) * bend,
         viscous + level * bent,
         cycles * turn * (1.0 - loaded * bend),
         -viscous - (asymmetry * v + level) * bent - (asymmetry + level_v) * bend,
-        gain * (1.0 - loaded * bend),
+        scale * gain * (1.0 - loaded * bend),
         cycles * turn * loaded * bent,
         level_v * bent + level * bent_v,
-        gain * loaded * bent,
+        scale * gain * loaded * bent,
     )
 
 
@@ -146,8 +149,8 @@ def _arm(
     left_1, slope_1, f1_q, f1_v, f1_t, s1_q, s1_v, s1_t = _drive(p, 0, q1, v1, t1, F[0], S[0])
     left_2, slope_2, f2_q, f2_v, f2_t, s2_q, s2_v, s2_t = _drive(p, 1, q2, v2, t2, F[1], S[1])
     for cause in range(2):
-        F[0, 30 + cause], S[0, 30 + cause] = f1_t * dt[cause, 0], s1_t * dt[cause, 0]
-        F[1, 30 + cause], S[1, 30 + cause] = f2_t * dt[cause, 1], s2_t * dt[cause, 1]
+        F[0, DELAY + cause], S[0, DELAY + cause] = f1_t * dt[cause, 0], s1_t * dt[cause, 0]
+        F[1, DELAY + cause], S[1, DELAY + cause] = f2_t * dt[cause, 1], s2_t * dt[cause, 1]
     q1 += p[28]
     q2 += p[29]
     cos_2, sin_2 = math.cos(q2), math.sin(q2)

@@ -2,7 +2,7 @@
 
 The equations are those of `estimator.arm_model` with a friction law that is smooth:
 
-    motor torque = torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
+    motor torque = torque_scale torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
     friction(v) = viscous v + viscous_asymmetry |v| + level(v) tanh(v / width)
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
 
@@ -67,6 +67,7 @@ def _pieces(physics: Physics, step: float) -> int:
 def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, float]:
     """Torque that a drive leaves its joint after friction, and the slope of that friction."""
     p = p[6 + joint :: 2]
+    t *= p[12]
     if p[10] != 0.0:
         t *= 1.0 + p[8] * math.sin(p[10] * q) + p[9] * math.cos(p[10] * q)
     level = p[1] * (1.0 + p[4] * math.exp(-((v / p[5]) ** 2))) + p[6] * abs(t)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hil.config import Config
 from hil.dry_run import GUARDED, Prediction, predict
 from hil.ensemble import Ensemble
-from hil.errors import ExperimentError
+from hil.errors import NoSafeTorque
 from hil.plan import Plan, make_plan, scaled
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class Amplitude:
 def largest_amplitude(config: Config, ensemble: Ensemble, share: float = 1.0, plan: Plan | None = None) -> Amplitude:
     """Scale each joint's torque until its peaks reach `share` of the limits but for safety.limit_chance of the arms.
 
-    plan: its waves are scaled; by default low-crest multisines. Raises ExperimentError when not even a small torque is
+    plan: its waves are scaled; by default low-crest multisines. Raises NoSafeTorque when not even a small torque is
     safe.
     """
     if ensemble.source == "prior":
@@ -58,7 +58,7 @@ def largest_amplitude(config: Config, ensemble: Ensemble, share: float = 1.0, pl
         if _chance(prediction, share) <= config.safety.limit_chance:
             return Amplitude(plan, found, prediction)
         found = found * _BACK_OFF
-    raise ExperimentError(
+    raise NoSafeTorque(
         "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, say more "
         "in [arm.prior], or raise safety.limit_chance."
     )

@@ -124,7 +124,7 @@ class PriorConfig(_Table):
     link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
     servo_mass: list[PositiveFloat] | None = Field(None, description="kg")
     armature: list[PositiveFloat] | None = Field(None, description="kg m^2: rotor inertia times gear ratio squared")
-    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad")
+    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad; in pwm mode back-EMF included")
     coulomb: list[PositiveFloat] | None = Field(None, description="N m")
 
 
@@ -188,6 +188,9 @@ class ModelConfig(_Table):
     asymmetry: bool = Field(False, description="viscous friction that differs with direction")
     ripple: bool = Field(False, description="torque ripple over the joint's angle")
     zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
+    torque_scale: bool = Field(
+        False, description="the ratio of the joints' torque constants; one of them has to be believed"
+    )
 
     @property
     def fixed_friction(self) -> Literal["coulomb", "stribeck", "stribeck_load"]:
@@ -279,6 +282,8 @@ class Config(_Table):
             for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
                 _check_peak_torque(joint, peak)
         self._check_pilot()
+        if self.model.torque_scale and count != 2:
+            raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
         if len({joint.drive_mode for joint in self.joints}) != 1:
             raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:

@@ -1,8 +1,8 @@
 """The experiment simulated on an ensemble of arms: what will be reached, against each limit.
 
 Every arm of the ensemble gets the very goal currents of the plan, rounded to the servos' ticks, ramps included, through
-lag and stabiliser. Peaks are compared as shares of the way to their limit; an arm with any share of 1 or more is one
-that the guard would have stopped.
+lag and stabiliser, for as many periods as it takes to settle. Peaks are compared as shares of the way to their limit;
+an arm with any share of 1 or more is one that the guard would have stopped.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.servo_model import Mode
-from estimator.closed_loop import Feedback, respond, resting
+from estimator.closed_loop import Feedback
 from estimator.physics import Physics
 from hil.config import Config
 from hil.ensemble import Ensemble
-from hil.plan import Plan, Segment
-from hil.settled import settling_difference
+from hil.plan import Plan
+from hil.simulated_experiment import Commands, commands_of, simulate_experiment
 from hil.stabiliser import feedback_of
 
 Array = NDArray[np.float64]
@@ -51,8 +51,8 @@ class Prediction:
     """What a dry run foresees.
 
     values: extreme values of every arm (arms, quantities, joints), in QUANTITIES and UNITS. shares: the same as shares
-    of the way from rest to the limit. limits: (quantities, joints). settled_after: periods, per arm, 0 where more than
-    were simulated. shown: positions over time of a few arms (arms, joints, samples) [rad].
+    of the way from rest to the limit. limits: (quantities, joints). settled_after: periods, per arm, 0 where it is more
+    than max_settling_periods. shown: positions over time of a few arms (arms, joints, samples) [rad], then NaN.
     """
 
     values: Array
@@ -114,28 +114,32 @@ class Prediction:
         return float(np.quantile(worst, QUANTILE, method="higher"))
 
 
+def quantities_of(config: Config) -> tuple[tuple[str, str], ...]:
+    """Names and units of a prediction's rows: goals are volts where the joints are driven by voltage."""
+    named = tuple(zip(QUANTITIES, UNITS, strict=True))
+    if config.joints[0].drive_mode is not Mode.PWM:
+        return named
+    return tuple(("voltage", "V") if name == "current" else (name, unit) for name, unit in named)
+
+
 def predict(config: Config, plan: Plan, ensemble: Ensemble) -> Prediction:
     """Simulate `plan` on every arm of the ensemble."""
-    segments = [_command(config, segment, plan.periods) for segment in plan.segments]
-    feedback = feedback_of(config)
-    pose = np.array(config.arm.rest_pose)
-    samples = plan.segments[0].multisine.samples
-    ramp = plan.segments[0].ramp_samples
+    commands = [commands_of(config, segment) for segment in plan.segments]
 
     def one(arm: int) -> Peaks:
         physics, scale = ensemble.physics[arm], ensemble.torque_scale[arm]
-        return _simulate(config, plan, physics, scale, segments, feedback, pose, (ramp, samples), arm < _SHOWN_ARMS)
+        return _reached(config, plan, commands, physics, scale, keep=arm < _SHOWN_ARMS)
 
     peaks = _each(one, ensemble.size)
     values = np.stack([peak.values for peak in peaks])
     limits = limits_of(config)
-    rest = pose
+    rest = np.array(config.arm.rest_pose)
     return Prediction(
         values,
         _shares(values, limits, rest),
         limits,
         np.array([peak.settled_after for peak in peaks]),
-        np.stack([peak.position for peak in peaks if peak.position is not None]),
+        _side_by_side([peak.position for peak in peaks if peak.position is not None]),
         rest,
         plan.rate,
     )
@@ -172,54 +176,24 @@ def scaled_feedback(feedback: Feedback, scale: Array) -> Feedback:
     return Feedback(feedback.stiffness * scale, feedback.damping * scale, feedback.pose, feedback.limit * scale)
 
 
-def _command(config: Config, segment: Segment, periods: int) -> Array:
-    """Torque of ramp in, settling and used periods, ramp out, in whole ticks of current (joints, samples) [N m]."""
-    constant = np.array([joint.torque_per_goal for joint in config.joints])
-    tick = np.array(
-        [abs(joint.joint.drive_unit(12.0 if joint.joint.mode is Mode.PWM else 0.0)) for joint in config.joints]
-    )
-    period = [segment.period_current] * (1 + periods)
-    current = np.concatenate([segment.ramp_in, *period, segment.ramp_out])
-    return np.ascontiguousarray((np.round(current / tick) * tick * constant).T)
-
-
-def _simulate(
-    config: Config,
-    plan: Plan,
-    physics: Physics,
-    scale: Array,
-    segments: list[Array],
-    feedback: Feedback,
-    pose: Array,
-    sizes: tuple[int, int],
-    keep: bool,
+def _reached(
+    config: Config, plan: Plan, commands: list[Commands], physics: Physics, scale: Array, *, keep: bool
 ) -> Peaks:
-    felt = scaled_feedback(feedback, scale)
-    state = resting(pose)
-    parts = []
-    for command in segments:
-        part = respond(physics, state, command * scale[:, None], plan.rate, felt)
-        state = part.state
-        parts.append(part)
-    position = np.concatenate([part.position for part in parts], axis=1)
-    velocity = np.concatenate([part.velocity for part in parts], axis=1)
+    feedback = scaled_feedback(feedback_of(config), scale)
+    motion = simulate_experiment(plan, commands, physics, scale, feedback)
     constant = np.array([joint.torque_per_goal for joint in config.joints])
-    current = np.concatenate([part.torque for part in parts], axis=1) / (scale * constant)[:, None]
-    return Peaks(
-        peaks_of(config, position, velocity, current),
-        _settled_after(parts[0].position, sizes, plan.settle_within),
-        position.astype(np.float32) if keep else None,
-    )
+    current = motion.torque / (scale * constant)[:, None]
+    values = peaks_of(config, motion.position, motion.velocity, current)
+    return Peaks(values, motion.settled_after, motion.position.astype(np.float32) if keep else None)
 
 
-def _settled_after(position: Array, sizes: tuple[int, int], within: float) -> int:
-    ramp, samples = sizes
-    periods = position[:, ramp:]
-    for count in range(1, periods.shape[1] // samples):
-        former, latest = (periods[:, (count - 1 + i) * samples : (count + i) * samples] for i in (0, 1))
-        if settling_difference(former, latest) <= within:
-            return count
-    return 0
+def _side_by_side(positions: list[Array]) -> Array:
+    """Positions (joints, samples) of arms that took different times, NaN after the end (arms, joints, samples)."""
+    longest = max(position.shape[1] for position in positions)
+    together = np.full((len(positions), positions[0].shape[0], longest), np.nan, dtype=np.float32)
+    for row, position in zip(together, positions, strict=True):
+        row[:, : position.shape[1]] = position
+    return together
 
 
 def _shares(values: Array, limits: Array, rest: Array) -> Array:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from hil.amplitude import Amplitude
 from hil.config import Config
-from hil.dry_run import QUANTITIES, UNITS, Prediction
+from hil.dry_run import Prediction, quantities_of
 from hil.stopping import Stopping, Way
 
 
@@ -66,7 +66,7 @@ def settling_text(config: Config, prediction: Prediction) -> str:
     """When the simulated arms were settled."""
     settled = prediction.settled_after > 0
     if not settled.any():
-        return "No simulated arm settled within the simulated periods."
+        return f"No simulated arm settled within {config.experiment.max_settling_periods} periods."
     seconds = config.experiment.ramp + config.experiment.period * float(
         np.quantile(prediction.settled_after[settled], 0.99)
     )
@@ -80,13 +80,13 @@ def _prediction_json(config: Config, prediction: Prediction) -> dict[str, Any]:
     joints = {
         joint.name: {
             name: {
-                "unit": UNITS[row],
+                "unit": unit,
                 "median": float(median[row, index]),
                 "quantile_99": float(quantile[row, index]),
                 "limit": float(prediction.limits[row, index]),
                 "chance": float(chance[row, index]),
             }
-            for row, name in enumerate(QUANTITIES)
+            for row, (name, unit) in enumerate(quantities_of(config))
         }
         for index, joint in enumerate(config.joints)
     }
@@ -103,10 +103,10 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
         table.add_column(heading, justify="right")
     median, quantile, chance = prediction.median, prediction.quantile, prediction.limit_chance
     for index, joint in enumerate(config.joints):
-        for row, name in enumerate(QUANTITIES):
+        for row, (name, unit) in enumerate(quantities_of(config)):
             numbers = (median[row, index], quantile[row, index], prediction.limits[row, index])
             cells = [f"{value:.3g}" for value in numbers] + [f"{100 * chance[row, index]:.2g} %"]
-            table.add_row(joint.name if row == 0 else "", name, UNITS[row], *cells)
+            table.add_row(joint.name if row == 0 else "", name, unit, *cells)
         table.add_section()
     return table
 

@@ -114,6 +114,10 @@ class ArmModel:
         (torque,) = self._motion(torque=torque)
         return np.asarray(torque / np.array([joint.torque_per_goal for joint in self.joints]))
 
+    def torque_scale(self, joint: int) -> float:
+        """Of `joint`, from 1: torque in units of the first joint's torque constant, over supposed torque."""
+        return self.values.get(f"torque_scale_{joint}", 1.0)
+
     def _motion(self, **arrays: ArrayLike) -> list[Array]:
         """The arguments as arrays of one shape; raises ValueError."""
         taken = {name: np.asarray(values, dtype=np.float64) for name, values in arrays.items()}
@@ -168,7 +172,7 @@ class ArmModel:
         """Motor torque over what the current stands for, at the angles q."""
         cycles = self.values.get(f"ripple_cycles_{joint}", 0.0) * q
         sine, cosine = (self.values.get(f"ripple_{part}_{joint}", 0.0) for part in ("sin", "cos"))
-        return np.asarray(1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles))
+        return np.asarray(self.torque_scale(joint) * (1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles)))
 
     def _step(self, joint: int, v: Array) -> Array:
         width = self.values.get(f"coulomb_width_{joint}", 0.0)

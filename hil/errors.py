@@ -11,6 +11,7 @@ HilError                    exit code
     ├── SafetyStop          1   the guard saw a limit passed and stopped the arm
     ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
     ├── NotSettled          1   the motion never became periodic
+    ├── NoSafeTorque        1   a dry run found none that keeps the arm within its limits
     └── RecordingCutShort   1   the recording holds no settled period
 
 drivers.errors.DriverError  1   between computer and servos; its leaves are listed there.
@@ -103,6 +104,10 @@ class SafetyStop(ExperimentError):
 
 class StopRequested(ExperimentError):
     """Somebody asked for the stop. Example: Ctrl-C."""
+
+
+class NoSafeTorque(ExperimentError):
+    """A dry run found no torque that is safe for all arms that might be this one. Example: a prior of 100 % spread."""
 
 
 class NotSettled(ExperimentError):

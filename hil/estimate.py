@@ -34,7 +34,7 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
-    estimate, choice = _estimate(config, period, other)
+    estimate, choice = _estimate(config, period, other, run.load_starts())
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if other is not None:
         predicted = _predict(config, estimate, other)
@@ -60,14 +60,21 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
     return result
 
 
-def _estimate(config: Config, period: SettledPeriod, other: SettledPeriod | None) -> tuple[Estimate, Choice | None]:
+def _estimate(
+    config: Config, period: SettledPeriod, other: SettledPeriod | None, starts: list[dict[str, float]]
+) -> tuple[Estimate, Choice | None]:
     """The estimate of the model that the configuration asks for, or of the one chosen, with how it was."""
     wanted = config.model
     if wanted.friction == "auto":
-        choice = choose([period], other, wanted.drive)
+        choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale)
         return choice.estimate, choice
-    terms = {"asymmetry": wanted.asymmetry, "ripple": wanted.ripple, "zeros": wanted.zeros}
-    return identify(period, Model(len(config.joints), wanted.friction, wanted.drive, **terms)), None
+    terms = {
+        "asymmetry": wanted.asymmetry,
+        "ripple": wanted.ripple,
+        "zeros": wanted.zeros,
+        "torque_scale": wanted.torque_scale,
+    }
+    return identify(period, Model(len(config.joints), wanted.friction, wanted.drive, **terms), starts=starts), None
 
 
 def _predict(config: Config, estimate: Estimate, other: SettledPeriod) -> NDArray[np.float64]:

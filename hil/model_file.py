@@ -19,7 +19,7 @@ _RIGID_BODY = {
 _PER_JOINT = ("viscous", "coulomb", "offset")
 _OPTIONAL_PER_JOINT = (
     *("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry"),
-    *("ripple_sin", "ripple_cos", "ripple_cycles", "zero"),
+    *("ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale"),
 )
 _DRIVE = ("lag", "delay")
 

@@ -17,10 +17,11 @@ from hil.amplitude import Amplitude, largest_amplitude
 from hil.config import Config
 from hil.design import designed_plan, roomy_plan
 from hil.dry_run import GUARDED, QUANTITIES, UNITS, peaks_of
-from hil.ensemble import Ensemble, nominal, prior_ensemble, result_ensemble
-from hil.errors import ExperimentError
+from hil.ensemble import nominal, prior_ensemble, result_ensemble
+from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimate import estimate_run
 from hil.experiment import run_experiment
+from hil.likely_arms import likely_arms
 from hil.recording import load_samples
 from hil.run_folder import RunFolder
 from hil.stream import Watch
@@ -37,6 +38,8 @@ CERTAIN = 0.8
 """A typical arm should come this far on its way to a limit; where it stays below, uncertainty costs too much range."""
 
 _PILOT_PERIOD_SHARE = 0.5
+_STARTS = 3
+"""Arms of the prior from which the pilot's estimate starts, beside the regression's."""
 
 Say = Callable[[str], None]
 
@@ -86,20 +89,21 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
     Raises what a run raises, and ExperimentError when the pilot cannot be identified at any safe torque.
     """
     steps: list[Step] = []
-    result = _pilot(config, run, shown_path, watch, say, steps)
+    result, full = _pilot(config, run, shown_path, watch, say, steps)
     while True:
-        ensemble = result_ensemble(result, RESULT_ARMS, _farther(config, steps[-1]))
-        full = _full_amplitude(config, ensemble, result)
         certain = _typical_share(full) >= CERTAIN
         if certain or len(steps) >= MOST_STEPS - 1:
             break
         say("What is known so far is too uncertain to go to the limits at once: one more run on the way.")
         between = _without_held_out(config)
         folder = run.below(f"step-{len(steps) + 1}", between)
+        folder.write_starts([_values(result)])
         _play(between, folder, shown_path, watch, say, f"Step {len(steps) + 1}", full, steps)
         result = estimate_run(folder)
+        full = _next_amplitude(config, result, steps[-1])
     played = _with_torque(config, full.peak_torque)
     run.write_played(played)
+    run.write_starts([_values(result)])
     torque = _play(played, run, shown_path, watch, say, "Full run", full, steps)
     result = estimate_run(run)
     result["steps"] = [step.as_json() for step in steps]
@@ -109,8 +113,8 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
 
 def _pilot(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, steps: list[Step]
-) -> dict[str, Any]:
-    """The first run, as small as can be identified."""
+) -> tuple[dict[str, Any], Amplitude]:
+    """The first run, as small as can be identified; its result, and how far it lets the next one go."""
     pilot = pilot_config(config)
     ensemble = prior_ensemble(config, PRIOR_ARMS)
     for share in PILOT_SHARES:
@@ -119,8 +123,11 @@ def _pilot(
         folder = run.below(f"pilot-{len(steps) + 1}", played)
         try:
             _play(played, folder, shown_path, watch, say, "Pilot", found, steps)
-            return estimate_run(folder)
-        except EstimationError as error:
+            samples = load_samples(folder.samples_path, len(config.joints))
+            folder.write_starts(likely_arms(played, ensemble, found.plan, samples, _STARTS))
+            result = estimate_run(folder)
+            return result, _next_amplitude(config, result, steps[-1])
+        except (EstimationError, NoSafeTorque) as error:
             reason = error
             say(f"The pilot did not move the arm enough: {error}")
     raise ExperimentError(
@@ -141,7 +148,9 @@ def pilot_config(config: Config) -> Config:
     return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
 
 
-def _full_amplitude(config: Config, ensemble: Ensemble, result: dict[str, Any]) -> Amplitude:
+def _next_amplitude(config: Config, result: dict[str, Any], step: Step) -> Amplitude:
+    """As far as what `result` of `step` leaves open allows."""
+    ensemble = result_ensemble(result, RESULT_ARMS, _farther(config, step))
     arm = nominal(result)
     optimal = config.experiment.design == "optimal"
     plan = designed_plan(config, arm, list(result["parameters"])) if optimal else roomy_plan(config, arm)
@@ -179,6 +188,10 @@ def _play(
     if not step.within:
         say(f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed.")
     return torque
+
+
+def _values(result: dict[str, Any]) -> dict[str, float]:
+    return {name: entry["value"] for name, entry in {**result["parameters"], **result["extra"]}.items()}
 
 
 def _with_torque(config: Config, peak_torque: Array) -> Config:

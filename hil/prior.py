@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.servo_model import ServoModel
+from drivers.servo_model import Mode, ServoModel
 from hil.config import Config, PriorConfig
 from hil.errors import ConfigError
 
@@ -21,6 +21,8 @@ _INERTIA_SHARE = 1 / 12  # of mass times length squared: a rod
 _ARMATURE_PER_STALL = 2.5e-3  # kg m^2 per N m of stall torque
 _VISCOUS_PER_STALL = 1.05e-2  # N m s/rad per N m
 _COULOMB_PER_STALL = 1.3e-2  # N m per N m
+_OFFSET_PER_COULOMB = 0.1  # standard deviation of a torque of either sign
+_GEAR_EFFICIENCY = 0.6
 _STRIBECK_RISE = 0.3
 _STRIBECK_VELOCITY = 0.15  # rad/s
 _COULOMB_WIDTH = 0.01  # rad/s
@@ -56,7 +58,10 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
         )
     random = np.random.default_rng((seed, 5))
     drawn = {name: quantity.draw(random, count) for name, quantity in quantities(config, np.array(lengths)).items()}
-    return _base(drawn, np.array(lengths), config.arm.gravity)
+    offset = _OFFSET_PER_COULOMB * drawn["coulomb"] * random.standard_normal(drawn["coulomb"].shape)
+    return _base(drawn, np.array(lengths), config.arm.gravity) | {
+        f"offset_{joint + 1}": offset[:, joint] for joint in range(offset.shape[1])
+    }
 
 
 def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
@@ -69,7 +74,7 @@ def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
         "link_centre": _CENTRE_SHARE * lengths,
         "servo_mass": np.array([_SERVO_MASS.get(model.name.split("-")[0], 0.082) for model in models]),
         "armature": _ARMATURE_PER_STALL * stall,
-        "viscous": _VISCOUS_PER_STALL * stall,
+        "viscous": _VISCOUS_PER_STALL * stall + _generated(config),
         "coulomb": _COULOMB_PER_STALL * stall,
     }
     chosen = {name: _chosen(given, name, guess) for name, guess in rough.items()}
@@ -88,6 +93,16 @@ def _stall_torque(model: ServoModel) -> float:
     """N m at the middle one of the published voltages."""
     torques = sorted(stall.torque for stall in model.stalls)
     return torques[len(torques) // 2]
+
+
+def _generated(config: Config) -> Array:
+    """What turning motors take from the torque of an applied voltage, as viscous friction (joints,) [N m s/rad].
+
+    A motor generates as many V s/rad as it gives N m/A before the gears' losses. Under current control: nothing.
+    """
+    emf = np.array([joint.joint.servo.torque_per_ampere.value / _GEAR_EFFICIENCY for joint in config.joints])
+    per_volt = [joint.torque_per_goal if joint.drive_mode is Mode.PWM else 0.0 for joint in config.joints]
+    return np.asarray(np.array(per_volt) * emf)
 
 
 def _base(drawn: dict[str, Array], lengths: Array, gravity: float) -> dict[str, Array]:

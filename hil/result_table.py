@@ -9,13 +9,16 @@ from rich.table import Table
 from drivers.servo_model import Mode
 from hil.config import Config
 from hil.physical import physical_lines
+from hil.stabiliser import StabiliserShare
+from hil.torque_constants import torque_constants_said
 
 
 def print_result(result: dict[str, Any], config: Config, run: Path, console: Console) -> None:
     """The table, the fit and what to do next."""
     console.print(_parameters(result))
     physical = physical_lines(result["physical"]) if "physical" in result else []
-    told = (*_fit(result), *_choice(result), *_verdict(result), *_torque_constants(config), *physical)
+    told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
+    told = (*told, *_torque_constants(result, config), *physical)
     for line in (*told, *_next(result, run)):
         console.print(line, soft_wrap=True, markup=False)
 
@@ -85,18 +88,18 @@ def _verdict(result: dict[str, Any]) -> list[str]:
     return [f"Trust it: {verdict['trust']}. " + " ".join(said)]
 
 
-def _torque_constants(config: Config) -> list[str]:
-    unsure = [
-        f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.0f} %"
-        for joint in config.joints
-        if joint.torque_per_goal_std
-    ]
+def _stabiliser(result: dict[str, Any], config: Config) -> list[str]:
+    if "stabiliser" not in result:
+        return []
+    return [StabiliserShare.from_json(result["stabiliser"]).said([joint.name for joint in config.joints])]
+
+
+def _torque_constants(result: dict[str, Any], config: Config) -> list[str]:
     lines = []
     if any(joint.drive_mode is Mode.PWM for joint in config.joints):
         lines.append("Driven by voltage: the viscous friction includes what the motor generates when it turns.")
-    if not unsure:
-        return lines
-    return [*lines, f"Every value also scales with its joint's torque constant, known to: {', '.join(unsure)}."]
+    said = torque_constants_said(config.joints, result["extra"])
+    return [*lines, said] if said else lines
 
 
 def _next(result: dict[str, Any], run: Path) -> list[str]:

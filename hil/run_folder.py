@@ -108,6 +108,23 @@ class RunFolder:
         folder.write_played(played)
         return folder
 
+    @property
+    def starts_path(self) -> Path:
+        return self.path / "starts.json"
+
+    def write_starts(self, starts: list[dict[str, float]]) -> None:
+        """Keep parameters from which the estimate starts too, now and when it is made anew."""
+        write_json(self.starts_path, {"starts": starts})
+
+    def load_starts(self) -> list[dict[str, float]]:
+        """Those kept, if any were; raises RunFolderError."""
+        if not self.starts_path.is_file():
+            return []
+        starts = _read_json(self.starts_path).get("starts")
+        if not isinstance(starts, list):
+            raise RunFolderError(f"{self.starts_path} is damaged: it holds no list of starts.")
+        return starts
+
     def write_played(self, played: Config) -> None:
         """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found."""
         write_json(self.played_path, played.experiment.model_dump())

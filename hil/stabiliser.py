@@ -4,7 +4,9 @@ The estimator is given the torque that was really commanded, spring and damper i
 from the recording at any time, since they act on the former sample's position and velocity alone.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +61,16 @@ class StabiliserShare:
     peak: NDArray[np.float64]
     commanded_rms: NDArray[np.float64]
 
+    @property
+    def share(self) -> NDArray[np.float64]:
+        """The stabiliser's RMS over that of all torque (joints,); over 1 where the excitation worked against it."""
+        return np.asarray(self.rms / np.maximum(self.commanded_rms, 1e-12))
+
+    @classmethod
+    def from_json(cls, entry: dict[str, Any]) -> "StabiliserShare":
+        """From result.json."""
+        return cls(*(np.array(entry[key]) for key in ("rms_torque", "peak_torque", "commanded_rms_torque")))
+
     def as_json(self) -> dict[str, list[float]]:
         """For result.json."""
         return {
@@ -67,12 +79,15 @@ class StabiliserShare:
             "commanded_rms_torque": self.commanded_rms.tolist(),
         }
 
-    def __str__(self) -> str:
+    def said(self, names: Sequence[str]) -> str:
+        """In one sentence, for the joints of these names."""
         each = ", ".join(
-            f"{rms:.3f} of {whole:.3f} N m RMS (peak {peak:.3f})"
-            for rms, whole, peak in zip(self.rms, self.commanded_rms, self.peak, strict=True)
+            f"{name} {rms:.3f} of {whole:.3f} N m RMS ({100 * part:.0f} %, peak {peak:.3f})"
+            for name, rms, whole, part, peak in zip(
+                names, self.rms, self.commanded_rms, self.share, self.peak, strict=True
+            )
         )
-        return f"The stabiliser gave {each}."
+        return f"Of the torque, the stabiliser gave: {each}."
 
 
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:

@@ -20,6 +20,7 @@ from hil.report.sections.parameters import parameters
 from hil.report.sections.prediction import prediction
 from hil.report.sections.provenance import provenance
 from hil.report.sections.spectra import spectra
+from hil.report.sections.stabiliser import stabiliser
 from hil.report.sections.steps import steps
 from hil.report.sections.timing import timing
 from hil.report.sections.verdict import verdict
@@ -34,6 +35,7 @@ SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     spectra,
     correlation,
     limits,
+    stabiliser,
     steps,
     timing,
     provenance,

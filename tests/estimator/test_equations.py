@@ -151,3 +151,10 @@ def test_settling_is_seen_in_the_difference_of_periods() -> None:
     assert np.allclose(settling.relative[:, 0], np.array([0.09, 0.01]) * np.sqrt(2.0))
     with pytest.raises(ShapeError):
         period_difference(periods[:1])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_joint_that_never_answered_is_not_settled() -> None:
+    periods = np.ones((2, 2, 50))
+    periods[1, 1] = np.nan
+    assert period_difference(periods).relative.tolist() == [[0.0, np.inf]]

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.dry_run import prior_study
-from hil.amplitude import largest_amplitude
+from benchmarks.dry_run import is_within, prior_study, run_on
+from hil.amplitude import Amplitude, largest_amplitude
 from hil.config import Config, load_config, parse_config
 from hil.dry_run import GUARDED, predict
 from hil.ensemble import prior_ensemble
@@ -17,6 +17,7 @@ from hil.plan import make_plan
 from tests.hil.command_line import hil
 
 Arm = Callable[..., Config]
+CONFIGS = Path(__file__).parents[2] / "configs"
 KNOWN = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.180]\n")
 
 
@@ -41,6 +42,28 @@ def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known
     assert found.prediction.stop_chance <= known.safety.limit_chance
     assert (found.prediction.shares[:, :GUARDED] < 1.0).all()
     assert found.prediction.shares[:, :GUARDED].max() > 0.6, "and not for lack of trying"
+
+
+def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_file: Callable[..., Path]) -> None:
+    path = arm_file()  # the hanging one's place
+    text = (CONFIGS / "fake_horizontal.toml").read_text(encoding="utf-8")
+    for old, new in (KNOWN, ("period = 10.0 ", "held_out = false\nperiod = 4.0 "), ("[0.30, 0.18]", "[0.15, 0.09]")):
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    held_text = text.replace(
+        "[model]\n", "[stabiliser]\nstiffness = [1.0, 0.5]\ndamping = [0.02, 0.01]\n\n[model]\n", 1
+    )
+    widths = {}
+    for name, each in (("free", text), ("held", held_text)):
+        path.write_text(each, encoding="utf-8")
+        config = load_config(path)
+        plan, ensemble = make_plan(config), prior_ensemble(config, 48)
+        assert all(physics.vector[[4, 5]].tolist() == [0.0, 0.0] for physics in ensemble.physics), "nothing weighs"
+        foreseen = predict(config, plan, ensemble)
+        widths[name] = foreseen.quantile[1] - foreseen.quantile[0]
+        seen = run_on(config, Amplitude(plan, plan.segments[0].peak_torque, foreseen), path.parent / name)
+        assert seen is not None and is_within(config, seen, foreseen.quantile), name
+    assert (widths["held"] < 0.8 * widths["free"]).all()
 
 
 def test_seen_peaks_stay_within_the_predicted_ones() -> None:

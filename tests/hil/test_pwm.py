@@ -6,9 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.dry_run import is_within, run_on
 from drivers.servo_model import Mode
 from fakes.registers import load_model
+from hil.amplitude import Amplitude
 from hil.config import Config, load_config
+from hil.dry_run import predict, quantities_of
+from hil.ensemble import prior_ensemble
 from hil.errors import ConfigError
 from hil.estimate import estimate_run
 from hil.experiment import run_experiment
@@ -53,6 +57,20 @@ def test_the_model_decides_the_mode(voltage_driven: Config) -> None:
 def test_goals_are_volts(voltage_driven: Config) -> None:
     (first, *_) = make_plan(voltage_driven).segments
     assert np.abs(first.period_current).max(axis=0) == pytest.approx([0.80 / 0.125, 0.42 / 0.125], rel=1e-6)
+
+
+def test_a_dry_run_knows_what_turning_motors_generate(arm_file: ArmFile, tmp_path: Path) -> None:
+    path = by_voltage(arm_file)
+    text = path.read_text(encoding="utf-8").replace("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.180]\n", 1)
+    path.write_text(text.replace("[experiment]\n", "[experiment]\nheld_out = false\n", 1), encoding="utf-8")
+    config = load_config(path)
+    plan = make_plan(config)
+    foreseen = predict(config, plan, prior_ensemble(config, 48))
+    seen = run_on(config, Amplitude(plan, plan.segments[0].peak_torque, foreseen), tmp_path)
+    assert seen is not None and is_within(config, seen, foreseen.quantile)
+    # Without back-EMF the elbow would be foreseen to turn several times as fast.
+    assert (foreseen.median[2] < 2.0 * seen[2]).all()
+    assert quantities_of(config)[3] == ("voltage", "V") and foreseen.limits[3].tolist() == [8.0, 8.0]
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ _MEANING = {
     "ripple_cos": "torque ripple over the angle",
     "ripple_cycles": "of it per turn",
     "zero": "error of the zero angle",
+    "torque_scale": "true over supposed torque, against joint 1",
     "lag": "of the current loop",
     "delay": "of the torque",
 }

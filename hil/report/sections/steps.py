@@ -2,19 +2,11 @@
 
 from typing import Any
 
+from hil.config import Config
+from hil.dry_run import quantities_of
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import listed, number
-
-_QUANTITIES = (
-    "lowest position [rad]",
-    "highest position [rad]",
-    "velocity [rad/s]",
-    "current [A]",
-    "torque [N m]",
-    "power [W]",
-)
-"""Rows of a step's figures, as the dry run orders them."""
 
 
 def steps(data: RunData) -> Section | None:
@@ -28,18 +20,19 @@ def steps(data: RunData) -> Section | None:
         if outside
         else "Every peak with a limit stayed within what the dry run had given as the most in 99 of 100 arms."
     )
-    tables = tuple(_table(step, data.names) for step in played)
+    tables = tuple(_table(step, data.config) for step in played)
     return Section("steps", "Predicted before, seen after", (said,), tables)
 
 
-def _table(step: dict[str, Any], names: list[str]) -> Table:
+def _table(step: dict[str, Any], config: Config) -> Table:
+    names = [joint.name for joint in config.joints]
     rows = [
         (
-            f"{name}: {quantity}",
+            f"{name}: {quantity} [{unit}]",
             *(number(step[key][row][joint], 3) for key in ("predicted_median", "predicted_quantile_99", "seen")),
         )
         for joint, name in enumerate(names)
-        for row, quantity in enumerate(_QUANTITIES)
+        for row, (quantity, unit) in enumerate(quantities_of(config))
     ]
     torque = listed([f"{name} {number(peak, 3)} N m" for name, peak in zip(names, step["peak_torque"], strict=True)])
     head = ("joint and peak", "typical arm", "99 of 100 arms", "seen")

@@ -4,6 +4,7 @@ from drivers.servo_model import Mode
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
+from hil.torque_constants import torque_constants_said
 
 _TITLES = {
     "yes": ("good", "This model can be trusted"),
@@ -50,12 +51,7 @@ def _limits(data: RunData) -> str:
 
 
 def _torque_constants(data: RunData) -> str:
-    unsure = [
-        f"{joint.name} {percent(joint.torque_per_goal_std / joint.torque_per_goal)}"
-        for joint in data.model.joints
-        if joint.torque_per_goal_std
-    ]
-    return f"All values scale with their joint's torque constant, known to: {listed(unsure)}." if unsure else ""
+    return torque_constants_said(data.model.joints, data.result["extra"])
 
 
 def _by_voltage(data: RunData) -> str:

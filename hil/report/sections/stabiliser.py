@@ -1,0 +1,26 @@
+"""What the stabiliser gave of the torque that was commanded."""
+
+from hil.report.run_data import RunData
+from hil.report.section import Section, Table
+from hil.report.words import number
+from hil.stabiliser import StabiliserShare
+
+
+def stabiliser(data: RunData) -> Section | None:
+    """Where a stabiliser held the arm."""
+    if "stabiliser" not in data.result:
+        return None
+    share = StabiliserShare.from_json(data.result["stabiliser"])
+    rows = [
+        (name, number(rms, 3), number(peak, 3), number(whole, 3), f"{100 * part:.0f} %")
+        for name, rms, peak, whole, part in zip(
+            data.names, share.rms, share.peak, share.commanded_rms, share.share, strict=True
+        )
+    ]
+    head = ("joint", "stabiliser RMS [N m]", "stabiliser peak [N m]", "all torque RMS [N m]", "share of RMS")
+    words = (
+        share.said(data.names),
+        "The spring and damper in software held the arm at its pose during the periods. The estimate uses the torque "
+        "that was really commanded, theirs included, and simulates them with the arm.",
+    )
+    return Section("stabiliser", "Stabiliser", words, (Table(head, tuple(rows)),))
