@@ -69,8 +69,8 @@ def measure(folder: Path, torque: str) -> dict[str, Any]:
     config = load_csv_config(CONFIG)
     start = fit_inverse_dynamics(sines, CUSTOMARY, WIDTH).value
     began = time.perf_counter()
-    model = Model(2, config.model.friction, config.model.drive)
-    estimate = estimate_by_shooting(sines, model, start, length=config.columns.segment, zeros=True)
+    model = Model(2, config.model.friction, config.model.drive, zeros=True)
+    estimate = estimate_by_shooting(sines, model, start, length=config.columns.segment)
     seconds = time.perf_counter() - began
     length, std = length_of(estimate)
     ours = both(prediction_rms(swings, estimate.parameters, HORIZON, 2))

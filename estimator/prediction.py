@@ -25,18 +25,13 @@ def prediction_rms(
     """RMS of measured less simulated position (joints,) [rad], the simulation set on its way every `length` [s].
 
     It starts from angle and velocity as the samples right around the start show them, and then sees the torque
-    only. `parameters` [SI] by the names of `Model.names`, with zero_1 .. where the encoder's zero was found to be
-    off. A simulation that runs away counts as wrong by pi.
+    only. `parameters` [SI] by the names of `Model.names`. A simulation that runs away counts as wrong by pi.
     """
-    problem = Shooting(recordings, Model(joints), False, length)
-    known = _complete(parameters, joints)
-    physics = Physics.of(known)
-    zero = np.array([known.get(f"zero_{joint + 1}", 0.0) for joint in range(joints)])
+    problem = Shooting(recordings, Model(joints), length)
+    physics = Physics.of(_complete(parameters, joints))
     squares, samples = np.zeros(joints), 0
     for segment in problem.segments:
-        state = segment.state.copy()
-        state[0] -= zero
-        error = segment.position - zero[:, None] - problem.position(segment, physics, state)
+        error = segment.position - problem.position(segment, physics, segment.state)
         error = np.where(np.isfinite(segment.position), error, 0.0)
         error = np.clip(np.nan_to_num(error, nan=np.pi, posinf=np.pi, neginf=-np.pi), -np.pi, np.pi)
         squares += np.sum(error**2, axis=1)

@@ -58,9 +58,9 @@ def estimate_unsettled(run: RunFolder) -> dict[str, Any]:
 
 def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool) -> dict[str, Any]:
     began = time.perf_counter()
-    model = Model(recordings[0].joints, wanted.fixed_friction, wanted.drive)
+    model = Model(recordings[0].joints, wanted.fixed_friction, wanted.drive, zeros=zeros)
     start = fit_inverse_dynamics(recordings, START_CUTOFF, START_WIDTH).value
-    estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
+    estimate = estimate_by_shooting(recordings, model, start, length=segment)
     return make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
 
 

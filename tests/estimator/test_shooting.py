@@ -68,10 +68,10 @@ def test_recordings_are_used_together_and_encoder_zeros_found(ideal_arm: Arm, re
         replace(each, position=each.position + np.array([[0.05], [-0.03]]))
         for each in (recording, swing(ideal_arm, 4.0, 3))
     ]
-    estimate = estimate_by_shooting(shifted, Model(2), start(shifted[0]), zeros=True)
+    estimate = estimate_by_shooting(shifted, Model(2, zeros=True), start(shifted[0]))
     assert estimate.segments == 12
-    assert estimate.parameters["zero_1"] == pytest.approx(0.05, abs=0.002)
-    assert estimate.parameters["zero_2"] == pytest.approx(-0.03, abs=0.002)
+    assert estimate.parameters["zero_1"] == pytest.approx(-0.05, abs=0.002)
+    assert estimate.parameters["zero_2"] == pytest.approx(0.03, abs=0.002)
     assert max(map(abs, errors(estimate, ideal_arm).values())) < 0.01
 
 
