@@ -20,18 +20,25 @@ PERIODIC = 1e-6  # rad and rad/s, from one period's end to the next
 
 
 def prediction_rms(
-    recordings: Sequence[Recording], parameters: Mapping[str, float], length: float, joints: int
+    recordings: Sequence[Recording],
+    parameters: Mapping[str, float],
+    length: float,
+    joints: int,
+    zeros: Array | None = None,
 ) -> Array:
     """RMS of measured less simulated position (joints,) [rad], the simulation set on its way every `length` [s].
 
     It starts from angle and velocity as the samples right around the start show them, and then sees the torque
-    only. `parameters` [SI] by the names of `Model.names`. A simulation that runs away counts as wrong by pi.
+    only. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true less measured
+    angle of each recording, in place of what `parameters` say. A simulation that runs away counts as wrong by pi.
     """
     problem = Shooting(recordings, Model(joints), length)
-    physics = Physics.of(_complete(parameters, joints))
+    known = _complete(parameters, joints)
+    shifts: list[dict[str, float]] = [{} for _ in recordings] if zeros is None else [_zeros(row) for row in zeros]
+    physics = [Physics.of(known | shift) for shift in shifts]
     squares, samples = np.zeros(joints), 0
     for segment in problem.segments:
-        error = segment.position - problem.position(segment, physics, segment.state)
+        error = segment.position - problem.position(segment, physics[segment.recording], segment.state)
         error = np.where(np.isfinite(segment.position), error, 0.0)
         error = np.clip(np.nan_to_num(error, nan=np.pi, posinf=np.pi, neginf=-np.pi), -np.pi, np.pi)
         squares += np.sum(error**2, axis=1)
@@ -66,3 +73,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:
     """With a narrow Coulomb step where the method that found the parameters knows of no width."""
     return {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)
+
+
+def _zeros(row: Array) -> dict[str, float]:
+    return {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(row)}

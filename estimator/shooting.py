@@ -46,6 +46,10 @@ class ShootingEstimate:
     """(parameters,) [SI]."""
     covariance: Array
     """(parameters, parameters), robust against model error: see `Segmented.covariance`."""
+    zeros: Array
+    """True less measured angle of each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
+    zeros_std: Array
+    """Their standard errors, shaped alike."""
     residual_rms: Array
     """Measured less simulated position (joints,) [rad]."""
     segments: int
@@ -68,8 +72,9 @@ class ShootingEstimate:
 class Shooting:
     """The residuals of all segments by coordinates."""
 
-    def __init__(self, recordings: Sequence[Recording], model: Model, length: float) -> None:
+    def __init__(self, recordings: Sequence[Recording], model: Model, length: float, *, zeros: bool = False) -> None:
         self._recordings = recordings
+        self.zeros = len(recordings) * model.joints if zeros else 0
         self._grids = [Grid.of(recording) for recording in recordings]
         self.segments = [
             segment
@@ -98,7 +103,7 @@ class Shooting:
     def residual(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> Array:
         """Simulated less measured positions of one segment in units of their noise (rows,)."""
         segment = self.segments[number]
-        position = self.position(segment, _physics(coordinates, shared), own.reshape(2, -1) * self.state_scale)
+        position = self.position(segment, self._physics(coordinates, segment, shared), own.reshape(2, -1) * self.state_scale)
         return self._rows(segment, position)
 
     def derivative(
@@ -106,27 +111,25 @@ class Shooting:
     ) -> tuple[Array, Array]:
         """The same, and its derivatives by the shared coordinates, then by the segment's own (rows, all)."""
         segment = self.segments[number]
-        physics = _physics(coordinates, shared)
+        physics = self._physics(coordinates, segment, shared)
         joints = self._model.joints
+        zeros = tuple(f"zero_{joint + 1}" for joint in range(joints) if self.zeros)
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
         motion = Sensitive(
             physics,
             own.reshape(2, -1) * self.state_scale,
-            (*coordinates.names, *state),
+            (*coordinates.names, *zeros, *state),
             self._grids[segment.recording].step,
         )
         # The state after the last step is the sample before one more, of whatever torque.
         torque, slopes = (np.pad(each, ((0, 0),) * (each.ndim - 1) + ((0, 1),)) for each in self._torque(segment, physics))
         grid, change = motion.advance(torque[:, :, None], slopes[:, :, :, None])
         by_value = segment.at_samples(change)
-        count = shared.size
-        columns = np.concatenate(
-            (
-                by_value[:, :, :count] @ coordinates.slopes(shared),
-                by_value[:, :, count:] * self.state_scale.reshape(-1),
-            ),
-            axis=2,
-        )
+        count = len(coordinates.names)
+        columns = np.zeros((*by_value.shape[:2], shared.size + own.size))
+        columns[:, :, :count] = by_value[:, :, :count] @ coordinates.slopes(shared[:count])
+        columns[:, :, self._zeros_of(segment)] = by_value[:, :, count : count + len(zeros)] * ANGLE_SCALE
+        columns[:, :, shared.size :] = by_value[:, :, count + len(zeros) :] * self.state_scale.reshape(-1)
         known = np.isfinite(segment.position)[:, :, None]
         columns = np.where(known, columns / self.noise[:, :, None], 0.0)
         return self._rows(segment, segment.at_samples(grid)), columns.reshape(-1, columns.shape[2])
@@ -134,6 +137,20 @@ class Shooting:
     def start(self) -> Array:
         """Each segment's own coordinates as its measured positions suggest (segments, 2 joints)."""
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
+
+    def _zeros_of(self, segment: Segment) -> slice:
+        """Where a segment's encoder zeros stand among the shared coordinates; nowhere if they are known."""
+        count = len(self._model.names)
+        if not self.zeros:
+            return slice(count, count)
+        first = count + segment.recording * self._model.joints
+        return slice(first, first + self._model.joints)
+
+    def _physics(self, coordinates: Coordinates, segment: Segment, shared: Array) -> Physics:
+        count = len(coordinates.names)
+        values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
+        zeros = ANGLE_SCALE * shared[self._zeros_of(segment)]
+        return Physics.of(values | {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)})
 
     def _rows(self, segment: Segment, position: Array) -> Array:
         difference = np.where(np.isfinite(segment.position), position - segment.position, 0.0)
@@ -155,19 +172,21 @@ class Shooting:
 
 
 def estimate_by_shooting(
-    recordings: Sequence[Recording], model: Model, start: Array, *, length: float = 1.0
+    recordings: Sequence[Recording], model: Model, start: Array, *, length: float = 1.0, zeros: bool = False
 ) -> ShootingEstimate:
     """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
 
     `start`: base parameters (base parameters,) [SI], for instance of `estimator.idim`. The same recordings give
-    the same numbers. Raises RecordingError when nothing is long enough, ConvergenceError.
+    the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one offset a joint and
+    recording, as of servos whose zero is set at every start; with gravity they are seen, without they are not.
+    Raises RecordingError when nothing is long enough, ConvergenceError.
     """
     shared = None
     for part, enough in ((SHORT, COARSE), (1.0, FINE)):
-        problem = Shooting(recordings, model, part * length)
+        problem = Shooting(recordings, model, part * length, zeros=zeros)
         coordinates = problem.coordinates(max(float(start[0]), 1e-6))
         if shared is None:
-            shared = coordinates.coordinates(_start(model, start))
+            shared = np.concatenate((coordinates.coordinates(_start(model, start)), np.zeros(problem.zeros)))
         found = _fit(problem, coordinates, shared, enough)
         shared = found.shared
     return _estimate(problem, coordinates, model, found, length)
@@ -178,14 +197,13 @@ def _fit(problem: Shooting, coordinates: Coordinates, shared: Array, enough: flo
     return minimise_segmented(residual, derivative, shared, problem.start(), enough)
 
 
-def _physics(coordinates: Coordinates, shared: Array) -> Physics:
-    return Physics.of(dict(zip(coordinates.names, coordinates.values(shared).tolist(), strict=True)))
-
-
 def _estimate(
     problem: Shooting, coordinates: Coordinates, model: Model, found: Segmented, length: float
 ) -> ShootingEstimate:
-    slope = coordinates.slopes(found.shared)
+    count = len(model.names)
+    slope = np.eye(found.shared.size) * ANGLE_SCALE
+    slope[:count, :count] = coordinates.slopes(found.shared[:count])
+    covariance = slope @ found.covariance() @ slope.T
     squares = np.zeros(model.joints)
     samples = np.zeros(model.joints)
     for number, (segment, own) in enumerate(zip(problem.segments, found.own, strict=True)):
@@ -196,8 +214,10 @@ def _estimate(
         model,
         model.names,
         model.units,
-        coordinates.values(found.shared),
-        slope @ found.covariance() @ slope.T,
+        coordinates.values(found.shared[:count]),
+        covariance[:count, :count],
+        ANGLE_SCALE * found.shared[count:].reshape(-1, model.joints),
+        np.sqrt(np.diag(covariance)[count:]).reshape(-1, model.joints),
         np.sqrt(squares / samples),
         len(problem.segments),
         length,

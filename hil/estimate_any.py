@@ -32,6 +32,8 @@ def estimate_csv(paths: Sequence[Path], config_path: Path) -> dict[str, Any]:
     result = _estimate(recordings, config.model, columns.segment, columns.zeros_unknown and config.arm.gravity > 0.0)
     result["config"] = str(config_path)
     result["recordings"] = [str(path) for path in paths]
+    for path, zeros in zip(paths, result.get("zeros", []), strict=False):
+        zeros["recording"] = str(path)
     if config.known is not None:
         result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
     return result
@@ -58,20 +60,27 @@ def estimate_unsettled(run: RunFolder) -> dict[str, Any]:
 
 def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool) -> dict[str, Any]:
     began = time.perf_counter()
-    model = Model(recordings[0].joints, wanted.fixed_friction, wanted.drive, zeros=zeros)
+    model = Model(recordings[0].joints, wanted.fixed_friction, wanted.drive)
     start = fit_inverse_dynamics(recordings, START_CUTOFF, START_WIDTH).value
-    estimate = estimate_by_shooting(recordings, model, start, length=segment)
+    estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     return make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
 
 
 def make_shooting_result(estimate: ShootingEstimate, recordings: Sequence[Recording], seconds: float) -> dict[str, Any]:
-    """result.json of multiple shooting: as hil.result has it, without what only a settled period has."""
+    """result.json of multiple shooting: as hil.result has it, without what only a settled period has.
+
+    `zeros`, if they were unknown: of each recording, true less measured angle of each joint.
+    """
     base = len(estimate.model.base_names)
     entries = [
         (name, {"value": float(value), "std": float(std), "unit": unit})
         for name, value, std, unit in zip(estimate.names, estimate.value, estimate.std, estimate.units, strict=True)
     ]
     steps = np.max([recording.position_step for recording in recordings], axis=0)
+    zeros = [
+        {"zero": zero.tolist(), "std": std.tolist(), "unit": "rad"}
+        for zero, std in zip(estimate.zeros, estimate.zeros_std, strict=True)
+    ]
     return {
         "schema": SCHEMA,
         "method": f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
@@ -87,6 +96,7 @@ def make_shooting_result(estimate: ShootingEstimate, recordings: Sequence[Record
             "samples": int(sum(recording.time.size for recording in recordings)),
             "segments": estimate.segments,
         },
+        **({"zeros": zeros} if zeros else {}),
         "validation": {},
         "timing": {"estimation_seconds": seconds},
     }

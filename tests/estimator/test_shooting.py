@@ -63,16 +63,19 @@ def test_a_motion_that_never_settles_gives_the_arm_and_honest_errors(ideal_arm: 
     assert prediction_rms([other], estimate.parameters, 1.0, 2).max() < 0.01
 
 
-def test_recordings_are_used_together_and_encoder_zeros_found(ideal_arm: Arm, recording: Recording) -> None:
+def test_recordings_are_used_together_each_with_its_own_encoder_zeros(ideal_arm: Arm, recording: Recording) -> None:
+    zeros = np.array([[-0.05, 0.03], [0.04, 0.02]])
     shifted = [
-        replace(each, position=each.position + np.array([[0.05], [-0.03]]))
-        for each in (recording, swing(ideal_arm, 4.0, 3))
+        replace(each, position=each.position - zero[:, None])
+        for each, zero in zip((recording, swing(ideal_arm, 4.0, 3)), zeros, strict=True)
     ]
-    estimate = estimate_by_shooting(shifted, Model(2, zeros=True), start(shifted[0]))
+    estimate = estimate_by_shooting(shifted, Model(2), start(shifted[0]), zeros=True)
     assert estimate.segments == 12
-    assert estimate.parameters["zero_1"] == pytest.approx(-0.05, abs=0.002)
-    assert estimate.parameters["zero_2"] == pytest.approx(0.03, abs=0.002)
+    assert estimate.zeros == pytest.approx(zeros, abs=0.002)
+    assert np.all(np.abs(estimate.zeros - zeros) < 4.0 * estimate.zeros_std)
     assert max(map(abs, errors(estimate, ideal_arm).values())) < 0.01
+    known = prediction_rms(shifted, estimate.parameters, 1.0, 2, estimate.zeros)
+    assert known.max() < 0.01 < prediction_rms(shifted, estimate.parameters, 1.0, 2).max()
 
 
 def test_a_pendulum_with_lost_samples(pendulum: Arm) -> None:
