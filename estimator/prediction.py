@@ -11,7 +11,7 @@ from estimator.model import Model
 from estimator.period import SettledPeriod
 from estimator.physics import Physics
 from estimator.recording import Recording
-from estimator.shooting import Shooting
+from estimator.shooting import ALL, Shooting
 from estimator.simulation import simulate, steps_per_sample
 
 LEAST_WIDTH = 1e-3  # rad/s of a Coulomb step, where a method knows none
@@ -25,14 +25,16 @@ def prediction_rms(
     length: float,
     joints: int,
     zeros: Array | None = None,
+    of: slice = ALL,
 ) -> Array:
     """RMS of measured less simulated position (joints,) [rad], the simulation set on its way every `length` [s].
 
     It starts from angle and velocity as the samples right around the start show them, and then sees the torque
     only. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true less measured
-    angle of each recording, in place of what `parameters` say. A simulation that runs away counts as wrong by pi.
+    angle of each recording, in place of what `parameters` say; `of`: which segments. A simulation that runs away
+    counts as wrong by pi.
     """
-    problem = Shooting(recordings, Model(joints), length)
+    problem = Shooting(recordings, Model(joints), length, of=of)
     known = _complete(parameters, joints)
     shifts: list[dict[str, float]] = [{} for _ in recordings] if zeros is None else [_zeros(row) for row in zeros]
     physics = [Physics.of(known | shift) for shift in shifts]

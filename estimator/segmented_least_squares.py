@@ -25,6 +25,7 @@ LONGEST = 2.0  # change of one coordinate in one step
 ITERATIONS = 80
 UNFINISHED = 1e-3  # of the sum: less than this still to gain is no reason to give up
 ENOUGH_SEGMENTS = 3
+SEEN = 1e-12  # of the largest eigenvalue
 FIRST_DAMPING = 1e-3
 LEAST_DAMPING = 1e-8
 MOST_DAMPING = 1e5
@@ -56,14 +57,21 @@ class Segmented:
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
-        bread = np.linalg.pinv(self.information / np.outer(norm, norm), rcond=1e-12, hermitian=True)
-        bread /= np.outer(norm, norm)
+        bread = _inverse(self.information / np.outer(norm, norm)) / np.outer(norm, norm)
         few = segments / max(1, segments - 1)
         if segments < ENOUGH_SEGMENTS * size:
             pooled = float(np.einsum("si,ij,sj->", self.scores, bread, self.scores)) / size
             return np.asarray(few * pooled * bread)
         covariance: Array = few * bread @ (self.scores.T @ self.scores) @ bread
         return covariance
+
+
+def _inverse(matrix: Array) -> Array:
+    """Of a matrix that is positive semidefinite but for rounding, without what is not seen at all."""
+    size, direction = np.linalg.eigh(matrix)
+    seen = size > SEEN * size[-1]
+    inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
+    return inverse
 
 
 @dataclass(frozen=True)

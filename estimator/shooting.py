@@ -32,6 +32,7 @@ SHORT = 0.25  # of the segments' length, to begin with
 COARSE = 1e-3
 FINE = 3e-5
 ANGLE_SCALE = 0.1  # rad
+ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -72,14 +73,14 @@ class ShootingEstimate:
 class Shooting:
     """The residuals of all segments by coordinates."""
 
-    def __init__(self, recordings: Sequence[Recording], model: Model, length: float, *, zeros: bool = False) -> None:
+    def __init__(self, recordings: Sequence[Recording], model: Model, length: float, *, zeros: bool = False, of: slice = ALL) -> None:
         self._recordings = recordings
         self.zeros = len(recordings) * model.joints if zeros else 0
         self._grids = [Grid.of(recording) for recording in recordings]
         self.segments = [
             segment
             for number, (recording, grid) in enumerate(zip(recordings, self._grids, strict=True))
-            for segment in cut(recording, number, grid, length)
+            for segment in cut(recording, number, grid, length)[of]
         ]
         self.noise = np.max([recording.noise for recording in recordings], axis=0)[:, None]
         velocity = float(np.sqrt(np.mean([np.mean(segment.state[1] ** 2) for segment in self.segments]))) + 0.1
@@ -172,9 +173,11 @@ class Shooting:
 
 
 def estimate_by_shooting(
-    recordings: Sequence[Recording], model: Model, start: Array, *, length: float = 1.0, zeros: bool = False
+    recordings: Sequence[Recording], model: Model, start: Array, *, length: float = 1.0, zeros: bool = False, of: slice = ALL
 ) -> ShootingEstimate:
     """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
+
+    `of` takes some of each recording's segments and leaves the others for a check.
 
     `start`: base parameters (base parameters,) [SI], for instance of `estimator.idim`. The same recordings give
     the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one offset a joint and
@@ -183,7 +186,7 @@ def estimate_by_shooting(
     """
     shared = None
     for part, enough in ((SHORT, COARSE), (1.0, FINE)):
-        problem = Shooting(recordings, model, part * length, zeros=zeros)
+        problem = Shooting(recordings, model, part * length, zeros=zeros, of=of)
         coordinates = problem.coordinates(max(float(start[0]), 1e-6))
         if shared is None:
             shared = np.concatenate((coordinates.coordinates(_start(model, start)), np.zeros(problem.zeros)))
