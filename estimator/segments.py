@@ -40,7 +40,9 @@ class Segment:
     def at_samples(self, grid: Array) -> Array:
         """Values (joints, grid points, ...) interpolated at the times of the samples (joints, samples, ...)."""
         weight = self.weight.reshape(*self.weight.shape, *(1,) * (grid.ndim - 2))
-        values: Array = sum(grid[:, self.index[:, n]] * weight[:, n] for n in range(4))
+        values = np.zeros((grid.shape[0], len(self.index), *grid.shape[2:]))
+        for n in range(4):
+            values += grid[:, self.index[:, n]] * weight[:, n]
         return values
 
 

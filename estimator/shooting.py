@@ -6,7 +6,9 @@ identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical
 (1983). The segments are not joined: noise that a rigid arm does not have, such as play and flexing, may
 move the state between them.
 
-Short segments come first: started far from the truth, they find it; longer ones then sharpen it.
+Short segments come first: started far from the truth, they find it; longer ones then sharpen it. Where a segment then
+is off by more than usual, because a joint stuck in it, say, as no smooth friction sticks, it counts so much less: the
+errors of segments differ in size, and who counts them alike lets the worst understood of them decide.
 """
 
 from collections.abc import Sequence
@@ -32,6 +34,7 @@ SHORT = 0.25  # of the segments' length, to begin with
 COARSE = 1e-3
 FINE = 3e-5
 ANGLE_SCALE = 0.1  # rad
+REWEIGHTED = 2  # fits after the first
 ALL = slice(None)
 
 
@@ -73,7 +76,9 @@ class ShootingEstimate:
 class Shooting:
     """The residuals of all segments by coordinates."""
 
-    def __init__(self, recordings: Sequence[Recording], model: Model, length: float, *, zeros: bool = False, of: slice = ALL) -> None:
+    def __init__(
+        self, recordings: Sequence[Recording], model: Model, length: float, *, zeros: bool = False, of: slice = ALL
+    ) -> None:
         self._recordings = recordings
         self.zeros = len(recordings) * model.joints if zeros else 0
         self._grids = [Grid.of(recording) for recording in recordings]
@@ -88,6 +93,7 @@ class Shooting:
         self.state_scale = np.repeat([ANGLE_SCALE, velocity], model.joints).reshape(2, -1)
         self._scales = (torque, velocity)
         self._model = model
+        self._trust = np.ones((len(self.segments), model.joints))
         self._driven: dict[tuple[float, float], list[tuple[Array, Array]]] = {}
 
     def coordinates(self, inertia: float) -> Coordinates:
@@ -104,12 +110,12 @@ class Shooting:
     def residual(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> Array:
         """Simulated less measured positions of one segment in units of their noise (rows,)."""
         segment = self.segments[number]
-        position = self.position(segment, self._physics(coordinates, segment, shared), own.reshape(2, -1) * self.state_scale)
-        return self._rows(segment, position)
+        position = self.position(
+            segment, self._physics(coordinates, segment, shared), own.reshape(2, -1) * self.state_scale
+        )
+        return self._rows(number, position)
 
-    def derivative(
-        self, coordinates: Coordinates, number: int, shared: Array, own: Array
-    ) -> tuple[Array, Array]:
+    def derivative(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> tuple[Array, Array]:
         """The same, and its derivatives by the shared coordinates, then by the segment's own (rows, all)."""
         segment = self.segments[number]
         physics = self._physics(coordinates, segment, shared)
@@ -123,7 +129,9 @@ class Shooting:
             self._grids[segment.recording].step,
         )
         # The state after the last step is the sample before one more, of whatever torque.
-        torque, slopes = (np.pad(each, ((0, 0),) * (each.ndim - 1) + ((0, 1),)) for each in self._torque(segment, physics))
+        torque, slopes = (
+            np.pad(each, ((0, 0),) * (each.ndim - 1) + ((0, 1),)) for each in self._torque(segment, physics)
+        )
         grid, change = motion.advance(torque[:, :, None], slopes[:, :, :, None])
         by_value = segment.at_samples(change)
         count = len(coordinates.names)
@@ -132,8 +140,21 @@ class Shooting:
         columns[:, :, self._zeros_of(segment)] = by_value[:, :, count : count + len(zeros)] * ANGLE_SCALE
         columns[:, :, shared.size :] = by_value[:, :, count + len(zeros) :] * self.state_scale.reshape(-1)
         known = np.isfinite(segment.position)[:, :, None]
-        columns = np.where(known, columns / self.noise[:, :, None], 0.0)
-        return self._rows(segment, segment.at_samples(grid)), columns.reshape(-1, columns.shape[2])
+        columns = np.where(known, columns / self._noise(number)[:, :, None], 0.0)
+        return self._rows(number, segment.at_samples(grid)), columns.reshape(-1, columns.shape[2])
+
+    def errors(self, coordinates: Coordinates, found: Segmented) -> Array:
+        """RMS of simulated less measured position, segment by segment (segments, joints) [rad]."""
+        rms = np.empty_like(self._trust)
+        for number, (segment, own) in enumerate(zip(self.segments, found.own, strict=True)):
+            rows = self.residual(coordinates, number, found.shared, own).reshape(self._model.joints, -1)
+            rms[number] = np.sqrt(np.sum((rows * self._noise(number)) ** 2, axis=1) / _samples(segment))
+        return rms
+
+    def weigh_down(self, errors: Array) -> None:
+        """Trust the segments whose `errors`, as of the method of this name, are larger than usual so much less."""
+        usual = np.median(errors, axis=0)
+        self._trust = np.minimum(1.0, usual / np.maximum(errors, 1e-12))
 
     def start(self) -> Array:
         """Each segment's own coordinates as its measured positions suggest (segments, 2 joints)."""
@@ -153,9 +174,15 @@ class Shooting:
         zeros = ANGLE_SCALE * shared[self._zeros_of(segment)]
         return Physics.of(values | {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)})
 
-    def _rows(self, segment: Segment, position: Array) -> Array:
-        difference = np.where(np.isfinite(segment.position), position - segment.position, 0.0)
-        return np.asarray((difference / self.noise).reshape(-1))
+    def _noise(self, number: int) -> Array:
+        """How far a segment's samples are taken to be off (joints, 1) [rad]."""
+        noise: Array = self.noise / self._trust[number][:, None]
+        return noise
+
+    def _rows(self, number: int, position: Array) -> Array:
+        measured = self.segments[number].position
+        difference = np.where(np.isfinite(measured), position - measured, 0.0)
+        return np.asarray((difference / self._noise(number)).reshape(-1))
 
     def _torque(self, segment: Segment, physics: Physics) -> tuple[Array, Array]:
         """Motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
@@ -173,7 +200,13 @@ class Shooting:
 
 
 def estimate_by_shooting(
-    recordings: Sequence[Recording], model: Model, start: Array, *, length: float = 1.0, zeros: bool = False, of: slice = ALL
+    recordings: Sequence[Recording],
+    model: Model,
+    start: Array,
+    *,
+    length: float = 1.0,
+    zeros: bool = False,
+    of: slice = ALL,
 ) -> ShootingEstimate:
     """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
 
@@ -190,14 +223,17 @@ def estimate_by_shooting(
         coordinates = problem.coordinates(max(float(start[0]), 1e-6))
         if shared is None:
             shared = np.concatenate((coordinates.coordinates(_start(model, start)), np.zeros(problem.zeros)))
-        found = _fit(problem, coordinates, shared, enough)
+        found = _fit(problem, coordinates, shared, problem.start(), enough)
         shared = found.shared
+    for _ in range(REWEIGHTED):
+        problem.weigh_down(problem.errors(coordinates, found))
+        found = _fit(problem, coordinates, found.shared, found.own, FINE)
     return _estimate(problem, coordinates, model, found, length)
 
 
-def _fit(problem: Shooting, coordinates: Coordinates, shared: Array, enough: float) -> Segmented:
+def _fit(problem: Shooting, coordinates: Coordinates, shared: Array, own: Array, enough: float) -> Segmented:
     residual, derivative = partial(problem.residual, coordinates), partial(problem.derivative, coordinates)
-    return minimise_segmented(residual, derivative, shared, problem.start(), enough)
+    return minimise_segmented(residual, derivative, shared, own, enough)
 
 
 def _estimate(
@@ -207,12 +243,8 @@ def _estimate(
     slope = np.eye(found.shared.size) * ANGLE_SCALE
     slope[:count, :count] = coordinates.slopes(found.shared[:count])
     covariance = slope @ found.covariance() @ slope.T
-    squares = np.zeros(model.joints)
-    samples = np.zeros(model.joints)
-    for number, (segment, own) in enumerate(zip(problem.segments, found.own, strict=True)):
-        rows = problem.residual(coordinates, number, found.shared, own).reshape(model.joints, -1) * problem.noise
-        squares += np.sum(rows**2, axis=1)
-        samples += np.isfinite(segment.position).sum(axis=1)
+    samples = np.stack([_samples(segment) for segment in problem.segments])
+    squares = problem.errors(coordinates, found) ** 2 * samples
     return ShootingEstimate(
         model,
         model.names,
@@ -221,11 +253,16 @@ def _estimate(
         covariance[:count, :count],
         ANGLE_SCALE * found.shared[count:].reshape(-1, model.joints),
         np.sqrt(np.diag(covariance)[count:]).reshape(-1, model.joints),
-        np.sqrt(squares / samples),
+        np.sqrt(squares.sum(axis=0) / samples.sum(axis=0)),
         len(problem.segments),
         length,
         found.iterations,
     )
+
+
+def _samples(segment: Segment) -> Array:
+    """Samples that hold a position (joints,)."""
+    return np.asarray(np.isfinite(segment.position).sum(axis=1), dtype=np.float64)
 
 
 def _start(model: Model, base: Array) -> Array:

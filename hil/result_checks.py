@@ -6,12 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.choice import Choice
+from estimator.distortion import LineGroup
 from estimator.validation import Validation
 from estimator.verdict import Verdict
 
 
 def describe_validation(validation: Validation, held_out: NDArray[np.float64] | None) -> dict[str, Any]:
-    """Per joint; `held_out_rms` and `free_run_rms` are fractions of the motion's RMS, `levels_ticks` encoder steps."""
+    """Per joint; `held_out_rms` and `free_run_rms` are fractions of the motion's RMS, `levels_ticks` encoder steps RMS
+    of all lines together, `line_levels_ticks` of one line."""
     levels = validation.levels
     first, second, correlation = validation.confounded
     described: dict[str, Any] = {} if held_out is None else {"held_out_rms": held_out.tolist()}
@@ -25,13 +27,26 @@ def describe_validation(validation: Validation, held_out: NDArray[np.float64] | 
         "hardest_to_tell_apart": {"parameters": [first, second], "correlation": correlation},
         "levels_ticks": {
             "excited_lines": levels.excited.tolist(),
-            "odd_distortion": levels.odd.tolist(),
-            "even_distortion": levels.even.tolist(),
+            "distortion": levels.distortion.tolist(),
             "noise": levels.noise.tolist(),
             "period_scatter": levels.scatter.tolist(),
             "model_error": levels.model_error.tolist(),
         },
+        "line_levels_ticks": {
+            "noise": levels.lines.noise.tolist(),
+            "excited": _group(levels.lines.excited),
+            "odd": _group(levels.lines.odd),
+            "even": _group(levels.lines.even),
+            "other": _group(levels.lines.other),
+        },
     }
+
+
+def _group(group: LineGroup | None) -> dict[str, Any] | None:
+    """How many lines, the motion on one of them and what the fit leaves of it; None where there are none."""
+    if group is None:
+        return None
+    return {"lines": group.lines, "motion": group.motion.tolist(), "left": group.left.tolist()}
 
 
 def describe_verdict(verdict: Verdict) -> dict[str, Any]:

@@ -60,9 +60,7 @@ def _torque_constants(config: Config) -> NDArray[np.float64]:
     return np.array([joint.torque_per_goal for joint in config.joints])
 
 
-def _stabilised(
-    config: Config, rows: NDArray[np.void], torque: NDArray[np.float64], first: int
-) -> Stabilised:
+def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float64], first: int) -> Stabilised:
     """What the stabiliser gave of the `torque` (joints, samples) from row `first` on, from the samples it acted on."""
     with_former = rows[first - 1 : first + torque.shape[1]]
     given = np.nan_to_num(feedback_torque(config, with_former)).T
