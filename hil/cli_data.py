@@ -76,6 +76,9 @@ def show_any(result: dict[str, Any], json_only: bool) -> None:
         print(f"Encoder zeros of {entry['recording']}: {shown} rad.")
     print(f"{result['method']}.")
     print(f"Residual {rms} mrad RMS over {result['fit']['segments']} segments.")
+    if "model_choice" in result:
+        choice = result["model_choice"]
+        print(f"Chosen by segments left out: {choice['chosen']}, error {choice['error_divided_by']:.2f} times smaller.")
     if "physical" in result:
         print("\n".join(physical_lines(result["physical"])))
 

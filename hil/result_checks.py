@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.any_choice import SegmentChoice
 from estimator.choice import Choice
 from estimator.distortion import LineGroup
 from estimator.validation import Validation
@@ -66,6 +67,23 @@ def describe_choice(choice: Choice) -> dict[str, Any]:
                 "parameters": len(trial.model.names),
                 "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
                 "score": trial.score if np.isfinite(trial.score) else None,
+                "seconds": round(trial.seconds, 3),
+            }
+            for trial in choice.trials
+        ],
+    }
+
+
+def describe_segment_choice(choice: SegmentChoice) -> dict[str, Any]:
+    """The same for any data, judged by segments that were left out of the fit."""
+    return {
+        "chosen": choice.chosen.model.description,
+        "error_divided_by": choice.gained,
+        "tried": [
+            {
+                "model": trial.model.description,
+                "parameters": len(trial.model.names),
+                "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
                 "seconds": round(trial.seconds, 3),
             }
             for trial in choice.trials

@@ -19,7 +19,7 @@ Recorder = Callable[[Arm, Multisine], SettledPeriod]
 
 @pytest.fixture(scope="module")
 def odd_wave() -> Multisine:
-    return design_multisine(400.0, 5.0, detecting_lines(5.0, (0.2, 5.0), 1, 1), (0.4,), 1)
+    return design_multisine(400.0, 10.0, detecting_lines(10.0, (0.1, 5.0), 2, 1), (0.8, 0.42), 1)
 
 
 def changed(arm: Arm, **terms: float) -> Arm:
@@ -28,32 +28,33 @@ def changed(arm: Arm, **terms: float) -> Arm:
 
 
 def levels(period: SettledPeriod, friction: Friction = "coulomb") -> Distortion:
-    return distortion(period, identify(period, Model(1, friction, "delay")))
+    return distortion(period, identify(period, Model(2, friction, "delay")))
 
 
-def test_friction_is_odd_and_an_offset_even(pendulum: Arm, recorded: Recorder, odd_wave: Multisine) -> None:
-    found = levels(recorded(changed(pendulum, offset=0.0), odd_wave))
+def test_friction_is_odd_and_an_offset_even(ideal_arm: Arm, recorded: Recorder, odd_wave: Multisine) -> None:
+    found = levels(recorded(changed(ideal_arm, offset=0.0), odd_wave))
     assert found.odd is not None and found.even is not None
-    assert found.odd.motion > 100.0 * found.noise
-    assert found.even.motion < 2.0 * found.noise, "a hanging arm whose friction is the same both ways is odd"
-    assert found.odd.left < 2.0 * found.noise, "and the model has it"
-    aside = levels(recorded(changed(pendulum, offset=0.03), odd_wave))
+    assert np.all(found.odd.motion > 100.0 * found.noise)
+    assert np.all(found.even.motion < 2.0 * found.noise), "a hanging arm whose friction is the same both ways is odd"
+    assert np.all(found.odd.left < 2.0 * found.noise), "and the model has it"
+    aside = levels(recorded(changed(ideal_arm, offset=0.03), odd_wave))
     assert aside.even is not None
-    assert aside.even.motion > 20.0 * aside.noise
-    assert aside.even.left < 2.0 * aside.noise
+    assert np.all(aside.even.motion > 20.0 * aside.noise)
+    assert np.all(aside.even.left < 2.0 * aside.noise)
 
 
 def test_what_the_model_lacks_stands_on_the_lines_that_it_makes(
-    pendulum: Arm, recorded: Recorder, odd_wave: Multisine
+    ideal_arm: Arm, recorded: Recorder, odd_wave: Multisine
 ) -> None:
-    rising = changed(pendulum, offset=0.0, coulomb_width=0.0, stribeck_rise=0.6, stribeck_velocity=0.3)
+    rising = changed(ideal_arm, offset=0.0, coulomb_width=0.0, stribeck_rise=0.6, stribeck_velocity=0.3)
     period = recorded(rising, odd_wave)
-    estimate = identify(period, Model(1, "coulomb", "delay"))
+    estimate = identify(period, Model(2, "coulomb", "delay"), hasty=True)
     found = distortion(period, estimate)
     assert found.odd is not None and found.even is not None
-    assert found.odd.left > 5.0 * found.noise > found.even.left
+    assert np.all(found.odd.left > 5.0 * found.noise)
+    assert np.all(found.odd.left > 4.0 * found.even.left)
     said = " ".join(judge(estimate, validate(period, estimate), None).sentences)
-    assert "odd lines asks for richer friction" in said and "even lines asks" not in said
+    assert "odd lines asks for richer friction" in said
 
 
 def test_with_every_line_driven_odd_and_even_cannot_be_told(ideal_period: SettledPeriod) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from estimator.any_choice import choose_by_shooting
 from estimator.errors import RecordingError, ShapeError, StandstillError
 from estimator.idim import fit_inverse_dynamics
 from estimator.model import Model
@@ -76,6 +77,18 @@ def test_recordings_are_used_together_each_with_its_own_encoder_zeros(ideal_arm:
     assert max(map(abs, errors(estimate, ideal_arm).values())) < 0.01
     known = prediction_rms(shifted, estimate.parameters, 1.0, 2, estimate.zeros)
     assert known.max() < 0.01 < prediction_rms(shifted, estimate.parameters, 1.0, 2).max()
+
+
+def test_friction_is_chosen_by_segments_left_out(pendulum: Arm) -> None:
+    rising = {"coulomb_width": 0.03, "stribeck_rise": 0.6, "stribeck_velocity": 0.4}
+    drives = tuple(drive.model_copy(update=rising) for drive in pendulum.drives)
+    recorded = swing(pendulum.model_copy(update={"drives": drives}), 6.0, 5)
+    choice = choose_by_shooting([recorded], "delay", start(recorded))
+    assert choice.chosen.model.friction == "stribeck" and choice.gained > 1.5
+    assert choice.estimate.parameters["stribeck_rise_1"] == pytest.approx(0.6, rel=0.1)
+    assert len(choice.trials) == 4
+    with pytest.raises(RecordingError, match="two segments"):
+        choose_by_shooting([recorded], "delay", start(recorded), length=6.0)
 
 
 def test_a_pendulum_with_lost_samples(pendulum: Arm) -> None:
