@@ -13,7 +13,7 @@ import numpy as np
 from estimator.arrays import Array
 from estimator.errors import ConvergenceError, RecordingError
 from estimator.model import Drive, Friction, Model
-from estimator.prediction import prediction_rms
+from estimator.prediction import prediction_errors
 from estimator.recording import Recording
 from estimator.segments import Grid, cut
 from estimator.shooting import ShootingEstimate, estimate_by_shooting
@@ -31,7 +31,7 @@ class SegmentTrial:
     held_out: Array | None
     """RMS error over the motion's RMS (joints,); None where the fit found no end."""
     score: float
-    """Both joints together."""
+    """Of the usual segment, the median, all joints together: where an arm turns over, one can be off by any amount."""
     seconds: float
 
 
@@ -86,7 +86,9 @@ def _try(recordings: Sequence[Recording], model: Model, start: Array, length: fl
     except ConvergenceError:
         return SegmentTrial(model, None, np.inf, time.perf_counter() - began)
     shifts = found.zeros if zeros else None
-    error = prediction_rms(recordings, found.parameters, length, model.joints, shifts, PREDICTED)
+    errors, _ = prediction_errors(recordings, found.parameters, length, model.joints, shifts, PREDICTED)
     motion = np.sqrt(np.mean([np.var(each.filled(), axis=1) for each in recordings], axis=0))
-    relative = error / motion
-    return SegmentTrial(model, relative, float(np.sqrt(np.mean(relative**2))), time.perf_counter() - began)
+    relative = errors / motion
+    score = float(np.median(np.sqrt(np.mean(relative**2, axis=1))))
+    held_out = np.sqrt(np.mean(relative**2, axis=0))
+    return SegmentTrial(model, held_out, score, time.perf_counter() - began)

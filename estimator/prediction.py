@@ -27,7 +27,26 @@ def prediction_rms(
     zeros: Array | None = None,
     of: slice = ALL,
 ) -> Array:
-    """RMS of measured less simulated position (joints,) [rad], the simulation set on its way every `length` [s].
+    """RMS of measured less simulated position (joints,) [rad] over all that `prediction_errors` looks at.
+
+    Arguments as there.
+    """
+    errors, samples = prediction_errors(recordings, parameters, length, joints, zeros, of)
+    rms: Array = np.sqrt(samples @ errors**2 / samples.sum())
+    return rms
+
+
+def prediction_errors(
+    recordings: Sequence[Recording],
+    parameters: Mapping[str, float],
+    length: float,
+    joints: int,
+    zeros: Array | None = None,
+    of: slice = ALL,
+) -> tuple[Array, Array]:
+    """RMS of measured less simulated position (segments, joints) [rad], and samples (segments,) of each segment.
+
+    The simulation is set on its way every `length` [s].
 
     It starts from angle and velocity as the samples right around the start show them, and then sees the torque
     only. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true less measured
@@ -38,15 +57,14 @@ def prediction_rms(
     known = _complete(parameters, joints)
     shifts: list[dict[str, float]] = [{} for _ in recordings] if zeros is None else [_zeros(row) for row in zeros]
     physics = [Physics.of(known | shift) for shift in shifts]
-    squares, samples = np.zeros(joints), 0
+    rms, samples = [], []
     for segment in problem.segments:
         error = segment.position - problem.position(segment, physics[segment.recording], segment.state)
         error = np.where(np.isfinite(segment.position), error, 0.0)
         error = np.clip(np.nan_to_num(error, nan=np.pi, posinf=np.pi, neginf=-np.pi), -np.pi, np.pi)
-        squares += np.sum(error**2, axis=1)
-        samples += error.shape[1]
-    rms: Array = np.sqrt(squares / samples)
-    return rms
+        rms.append(np.sqrt(np.mean(error**2, axis=1)))
+        samples.append(error.shape[1])
+    return np.stack(rms), np.array(samples, dtype=np.float64)
 
 
 def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, float]) -> Array:

@@ -76,6 +76,8 @@ def show_any(result: dict[str, Any], json_only: bool) -> None:
         print(f"Encoder zeros of {entry['recording']}: {shown} rad.")
     print(f"{result['method']}.")
     print(f"Residual {rms} mrad RMS over {result['fit']['segments']} segments.")
+    for warning in result["warnings"]:
+        print(f"Warning: {warning}")
     if "model_choice" in result:
         choice = result["model_choice"]
         print(f"Chosen by segments left out: {choice['chosen']}, error {choice['error_divided_by']:.2f} times smaller.")

@@ -12,6 +12,7 @@ from estimator.idim import fit_inverse_dynamics
 from estimator.model import Model
 from estimator.recording import Recording
 from estimator.shooting import ShootingEstimate, estimate_by_shooting
+from hil.any_warnings import any_warnings
 from hil.config import ModelConfig
 from hil.csv_config import load_csv_config
 from hil.csv_recording import read_csv
@@ -20,6 +21,7 @@ from hil.physical import physical_entries
 from hil.recording import load_samples
 from hil.result_checks import describe_segment_choice
 from hil.run_folder import RunFolder
+from hil.warnings import clipping_warnings
 
 SCHEMA = 1
 START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
@@ -58,6 +60,7 @@ def estimate_unsettled(run: RunFolder) -> dict[str, Any]:
     )
     result = _estimate([recording], config.model, 1.0, config.model.zeros)
     result["config"] = facts.config
+    result["warnings"] += clipping_warnings(config, samples)
     run.write_result(result)
     return result
 
@@ -75,6 +78,7 @@ def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: flo
         model = Model(recordings[0].joints, wanted.friction, wanted.drive, asymmetry=wanted.asymmetry)
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
+    result["warnings"] = any_warnings(recordings, estimate)
     return result if choice is None else {**result, "model_choice": describe_segment_choice(choice)}
 
 

@@ -84,6 +84,7 @@ def describe_segment_choice(choice: SegmentChoice) -> dict[str, Any]:
                 "model": trial.model.description,
                 "parameters": len(trial.model.names),
                 "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
+                "score": trial.score if np.isfinite(trial.score) else None,
                 "seconds": round(trial.seconds, 3),
             }
             for trial in choice.trials

@@ -25,6 +25,10 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     whole = len(rows) // count
     periods = rows[: whole * count].reshape(whole, count)
     position = np.moveaxis(periods["position"], 2, 1)
+    position = np.where(np.isfinite(position), position, np.nan)
+    for joint, received in zip(config.joints, np.isfinite(position).any(axis=(0, 2)), strict=True):
+        if whole and not received:
+            raise RecordingCutShort(f"{joint.name} never said where it is during {role!r}: look at its cable and ID.")
     first = _first_settled(position, experiment.settle_within)
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
@@ -41,14 +45,21 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     period = SettledPeriod(
         rate=experiment.rate,
         torque=_by_period(torque, count).mean(axis=0),
-        position=np.nanmean(angle, axis=0),
+        position=_mean_of_periods(angle),
         command_to_sample=facts.command_to_sample,
         position_step=np.array(facts.position_step),
         periods=experiment.periods,
         stabiliser=None if config.stabiliser is None else _stabilised(config, rows, torque, begin),
     )
     on_time = angle - velocity_of(period) * _by_period(late[None], count)
-    return replace(period, position=np.nanmean(on_time, axis=0), position_std=_scatter(on_time))
+    return replace(period, position=_mean_of_periods(on_time), position_std=_scatter(on_time))
+
+
+def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean (joints, samples) over those of the periods (periods, joints, samples) that have the sample, or NaN."""
+    count = np.isfinite(position).sum(axis=0)
+    mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
+    return mean
 
 
 def _by_period(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
