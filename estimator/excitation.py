@@ -21,6 +21,7 @@ from estimator.quasi_newton import descend
 
 Harmonics = npt.NDArray[np.int64]
 
+DETECTION = 4  # odd lines of which one is not driven
 NORMS = (4, 16, 64)  # p of the L2p norms, one after the other
 FINAL_NORMS = (64, 256)  # for the best start
 STARTS = 4  # random phases besides Schroeder's
@@ -76,6 +77,26 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
             f"of {period:g} s and {joints} joints need one each: widen the band or lengthen the period"
         )
     return tuple(tuple(range(first + joint, last + 1, joints)) for joint in range(joints))
+
+
+def detecting_lines(period: float, band: tuple[float, float], joints: int, seed: int) -> tuple[tuple[int, ...], ...]:
+    """The odd harmonics of `zippered_lines` without one of every DETECTION, drawn by `seed`, shared out in turn.
+
+    Where nothing was driven the arm's distortion shows, odd or even: see `estimator.distortion`. Raises
+    ExcitationError when fewer lines than joints are left.
+    """
+    every = sorted(line for lines in zippered_lines(period, band, 1) for line in lines if line % 2 == 1)
+    random = np.random.default_rng(seed)
+    groups = [every[first : first + DETECTION] for first in range(0, len(every), DETECTION)]
+    # The highest group may be incomplete; then it keeps its lines.
+    silent = {int(random.choice(group)) for group in groups if len(group) == DETECTION}
+    kept = [line for line in every if line not in silent]
+    if len(kept) < joints:
+        raise ExcitationError(
+            f"the band {band[0]:g} to {band[1]:g} Hz holds {len(kept)} odd harmonics of a period of {period:g} s to "
+            f"drive and {joints} joints need one each: widen the band or lengthen the period"
+        )
+    return tuple(tuple(kept[joint::joints]) for joint in range(joints))
 
 
 def design_multisine(

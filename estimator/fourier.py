@@ -31,10 +31,12 @@ def noise_power(lines: Lines) -> Array:
     """Mean |c|^2 of the noise in one line (joints,), from the upper half of the lines, where nothing was
     excited.
 
-    The median of an exponentially distributed power is log 2 of its mean, and shrugs off single lines.
+    The median of an exponentially distributed power is log 2 of its mean, and shrugs off single lines. Odd and even
+    lines are looked at apart: rounding of a motion whose second half mirrors its first has no even lines at all.
     """
     upper = np.abs(lines[:, lines.shape[1] // 2 :]) ** 2
-    noise: Array = np.median(upper, axis=1) / np.log(2.0)
+    medians = [np.median(upper[:, first::2], axis=1) for first in (0, 1)]
+    noise: Array = np.mean(medians, axis=0) / np.log(2.0)
     return noise
 
 

@@ -11,7 +11,7 @@ from estimator.model import Model
 from estimator.period import SettledPeriod
 from estimator.physics import Physics
 from estimator.recording import Recording
-from estimator.shooting import Shooting
+from estimator.shooting import ALL, Shooting
 from estimator.simulation import simulate, steps_per_sample
 
 LEAST_WIDTH = 1e-3  # rad/s of a Coulomb step, where a method knows none
@@ -20,29 +20,51 @@ PERIODIC = 1e-6  # rad and rad/s, from one period's end to the next
 
 
 def prediction_rms(
-    recordings: Sequence[Recording], parameters: Mapping[str, float], length: float, joints: int
+    recordings: Sequence[Recording],
+    parameters: Mapping[str, float],
+    length: float,
+    joints: int,
+    zeros: Array | None = None,
+    of: slice = ALL,
 ) -> Array:
-    """RMS of measured less simulated position (joints,) [rad], the simulation set on its way every `length` [s].
+    """RMS of measured less simulated position (joints,) [rad] over all that `prediction_errors` looks at.
+
+    Arguments as there.
+    """
+    errors, samples = prediction_errors(recordings, parameters, length, joints, zeros, of)
+    rms: Array = np.sqrt(samples @ errors**2 / samples.sum())
+    return rms
+
+
+def prediction_errors(
+    recordings: Sequence[Recording],
+    parameters: Mapping[str, float],
+    length: float,
+    joints: int,
+    zeros: Array | None = None,
+    of: slice = ALL,
+) -> tuple[Array, Array]:
+    """RMS of measured less simulated position (segments, joints) [rad], and samples (segments,) of each segment.
+
+    The simulation is set on its way every `length` [s].
 
     It starts from angle and velocity as the samples right around the start show them, and then sees the torque
-    only. `parameters` [SI] by the names of `Model.names`, with zero_1 .. where the encoder's zero was found to be
-    off. A simulation that runs away counts as wrong by pi.
+    only. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true less measured
+    angle of each recording, in place of what `parameters` say; `of`: which segments. A simulation that runs away
+    counts as wrong by pi.
     """
-    problem = Shooting(recordings, Model(joints), False, length)
+    problem = Shooting(recordings, Model(joints), length, of=of)
     known = _complete(parameters, joints)
-    physics = Physics.of(known)
-    zero = np.array([known.get(f"zero_{joint + 1}", 0.0) for joint in range(joints)])
-    squares, samples = np.zeros(joints), 0
+    shifts: list[dict[str, float]] = [{} for _ in recordings] if zeros is None else [_zeros(row) for row in zeros]
+    physics = [Physics.of(known | shift) for shift in shifts]
+    rms, samples = [], []
     for segment in problem.segments:
-        state = segment.state.copy()
-        state[0] -= zero
-        error = segment.position - zero[:, None] - problem.position(segment, physics, state)
+        error = segment.position - problem.position(segment, physics[segment.recording], segment.state)
         error = np.where(np.isfinite(segment.position), error, 0.0)
         error = np.clip(np.nan_to_num(error, nan=np.pi, posinf=np.pi, neginf=-np.pi), -np.pi, np.pi)
-        squares += np.sum(error**2, axis=1)
-        samples += error.shape[1]
-    rms: Array = np.sqrt(squares / samples)
-    return rms
+        rms.append(np.sqrt(np.mean(error**2, axis=1)))
+        samples.append(error.shape[1])
+    return np.stack(rms), np.array(samples, dtype=np.float64)
 
 
 def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, float]) -> Array:
@@ -71,3 +93,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:
     """With a narrow Coulomb step where the method that found the parameters knows of no width."""
     return {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)
+
+
+def _zeros(row: Array) -> dict[str, float]:
+    return {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(row)}

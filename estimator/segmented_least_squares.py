@@ -18,11 +18,14 @@ from estimator.errors import ConvergenceError
 Residual = Callable[[int, Array, Array], Array]
 """Residuals (rows,) of one segment at shared coordinates (shared,) and its own (own,)."""
 
-DIFFERENCE = 1e-4  # of a coordinate, which is of the size of 1
+Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
+"""The same residuals and their derivatives by shared coordinates, then by its own (rows, shared + own)."""
+
 LONGEST = 2.0  # change of one coordinate in one step
 ITERATIONS = 80
 UNFINISHED = 1e-3  # of the sum: less than this still to gain is no reason to give up
 ENOUGH_SEGMENTS = 3
+SEEN = 1e-12  # of the largest eigenvalue
 FIRST_DAMPING = 1e-3
 LEAST_DAMPING = 1e-8
 MOST_DAMPING = 1e5
@@ -54,14 +57,21 @@ class Segmented:
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
-        bread = np.linalg.pinv(self.information / np.outer(norm, norm), rcond=1e-12, hermitian=True)
-        bread /= np.outer(norm, norm)
+        bread = _inverse(self.information / np.outer(norm, norm)) / np.outer(norm, norm)
         few = segments / max(1, segments - 1)
         if segments < ENOUGH_SEGMENTS * size:
             pooled = float(np.einsum("si,ij,sj->", self.scores, bread, self.scores)) / size
             return np.asarray(few * pooled * bread)
         covariance: Array = few * bread @ (self.scores.T @ self.scores) @ bread
         return covariance
+
+
+def _inverse(matrix: Array) -> Array:
+    """Of a matrix that is positive semidefinite but for rounding, without what is not seen at all."""
+    size, direction = np.linalg.eigh(matrix)
+    seen = size > SEEN * size[-1]
+    inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
+    return inverse
 
 
 @dataclass(frozen=True)
@@ -91,12 +101,15 @@ class _Blocks:
         return information, scores, solve, known
 
 
-def minimise_segmented(residual: Residual, shared: Array, own: Array, enough: float) -> Segmented:
+def minimise_segmented(
+    residual: Residual, derivative: Derivative, shared: Array, own: Array, enough: float
+) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
     `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when a step gains
-    less than `enough` of the sum, or after ITERATIONS when it gained less than UNFINISHED. `residual` is called
-    from several threads; the result does not depend on their number. Raises ConvergenceError.
+    less than `enough` of the sum, or after ITERATIONS when it gained less than UNFINISHED. `residual` and
+    `derivative` are called from several threads; the result does not depend on their number. Raises
+    ConvergenceError.
     """
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         rows = _residuals(residual, shared, own, threads)
@@ -105,7 +118,7 @@ def minimise_segmented(residual: Residual, shared: Array, own: Array, enough: fl
             raise ConvergenceError("the starting values give no finite motion: check the units of torque and time")
         damping = FIRST_DAMPING
         for iteration in range(1, ITERATIONS + 1):
-            blocks = _blocks(residual, shared, own, rows, threads)
+            blocks = _blocks(derivative, shared, own, threads)
             gained = 0.0
             while damping < MOST_DAMPING:
                 there = _stepped(blocks, shared, own, damping)
@@ -117,7 +130,7 @@ def minimise_segmented(residual: Residual, shared: Array, own: Array, enough: fl
                     break
                 damping = max(8.0 * damping, FIRST_DAMPING)
             if gained < enough * cost or (iteration == ITERATIONS and gained < UNFINISHED * cost):
-                blocks = _blocks(residual, shared, own, rows, threads)
+                blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
                 return Segmented(shared, own, cost, information, scores, iteration)
     raise ConvergenceError(
@@ -134,21 +147,9 @@ def _residuals(residual: Residual, shared: Array, own: Array, threads: ThreadPoo
     return list(threads.map(lambda s: residual(s, shared, own[s]), range(len(own))))
 
 
-def _blocks(
-    residual: Residual, shared: Array, own: Array, rows: Sequence[Array], threads: ThreadPoolExecutor
-) -> _Blocks:
+def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPoolExecutor) -> _Blocks:
     def block(segment: int) -> tuple[Array, Array]:
-        r = rows[segment]
-        columns = []
-        for i in range(shared.size):
-            moved = shared.copy()
-            moved[i] += DIFFERENCE
-            columns.append((residual(segment, moved, own[segment]) - r) / DIFFERENCE)
-        for i in range(own.shape[1]):
-            moved = own[segment].copy()
-            moved[i] += DIFFERENCE
-            columns.append((residual(segment, shared, moved) - r) / DIFFERENCE)
-        J = np.stack(columns, axis=1)
+        r, J = derivative(segment, shared, own[segment])
         return J.T @ J, J.T @ r
 
     products = list(threads.map(block, range(len(own))))

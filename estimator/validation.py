@@ -1,23 +1,17 @@
-"""How far an estimate can be trusted: residual against rounding, whiteness, conditioning, free simulation, lines.
-
-Where the motion's power sits tells noise, nonlinear distortion and model error apart (Pintelon and Schoukens,
-System Identification, 2nd ed., chapter 4): excited lines hold what was asked for; lines that were not excited hold
-what the arm's nonlinearity made, odd or even; the highest lines hold the noise; and what a fit leaves beyond the
-noise is the error of its model.
-"""
+"""How far an estimate can be trusted: residual against rounding, whiteness, conditioning, free simulation, lines."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.arrays import Array
+from estimator.arrays import Array, Mask
 from estimator.covariance import autocorrelation
+from estimator.distortion import Distortion, distortion, excited_lines
 from estimator.errors import PeriodicityError
 from estimator.fourier import cut_off, lines_of, noise_power
 from estimator.identify import Estimate, predict
 from estimator.period import SettledPeriod
 
-EXCITED = 1e-4  # of the strongest line's power; a command's rounding leaves 1e-7
 LAGS = 100
 
 
@@ -27,16 +21,16 @@ class Levels:
 
     excited: Array
     """Motion on the lines that some joint was driven with."""
-    odd: Array
-    """Motion on the other odd lines: odd distortion, such as friction's."""
-    even: Array
-    """Motion on the other even lines: even distortion, such as gravity's on a pose that is not symmetric."""
+    distortion: Array
+    """Motion on the other lines, which is what the arm's nonlinearity made."""
     noise: Array
     """Of a sample, from the upper half of the lines."""
     scatter: Array
     """Of a sample of the mean period, from the scatter between periods; 0 if only one was kept."""
     model_error: Array
     """What the fit leaves beyond rounding and scatter."""
+    lines: Distortion
+    """Line by line, odd and even told apart where the excitation allows it."""
 
 
 @dataclass(frozen=True)
@@ -93,15 +87,13 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
 def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
     """Noise, distortion and model error of one period told apart."""
     lines = lines_of(period.filled())
-    drive = np.abs(lines_of(period.torque)) ** 2
-    last = cut_off(lines)
     order = np.arange(lines.shape[1])
-    excited = (drive > EXCITED * drive[:, 1:].max(axis=1, keepdims=True)).any(axis=0) & (order > 0)
-    other = ~excited & (order > 0) & (order <= last)
+    excited = excited_lines(period)
+    other = ~excited & (order > 0) & (order <= cut_off(lines))
     noise = noise_power(lines)
     step = period.position_step
 
-    def rms(chosen: Array) -> Array:
+    def rms(chosen: Mask) -> Array:
         power = 2.0 * np.sum(np.abs(lines[:, chosen]) ** 2 - noise[:, None], axis=1)
         return np.asarray(np.sqrt(np.maximum(power, 0.0)) / step)
 
@@ -109,11 +101,11 @@ def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
     left = np.nanmean(estimate.residual**2, axis=1) - period.noise**2
     return Levels(
         rms(excited),
-        rms(other & (order % 2 == 1)),
-        rms(other & (order % 2 == 0)),
+        rms(other),
         np.sqrt(noise * period.samples) / step,
         scatter,
         np.sqrt(np.maximum(left, 0.0)) / step,
+        distortion(period, estimate),
     )
 
 

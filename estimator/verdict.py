@@ -23,6 +23,10 @@ MEND = {
     "coulomb": "more slow reversals: lower the lower edge of experiment.band, or lengthen the period",
 }
 
+ODD_MEND = "What it leaves on odd lines asks for richer friction or ripple."
+EVEN_MEND = "What it leaves on even lines asks for model.asymmetry or model.zeros."
+BEYOND_NOISE = 2.0
+
 Trust = Literal["yes", "with care", "no"]
 
 
@@ -39,6 +43,7 @@ def judge(estimate: Estimate, validation: Validation, held_out: Array | None) ->
     """`held_out`: RMS error of the free prediction of a motion not fitted, over that motion's RMS (joints,)."""
     sentences = (
         _explained(validation),
+        *_distorted(validation),
         *_predicted(held_out),
         *_weak(validation),
         *_alike(validation),
@@ -71,6 +76,33 @@ def _explained(validation: Validation) -> str:
         f'of {error:.2g} encoder steps RMS. Let [model] friction = "auto" choose, and look for play, a dragging cable '
         "or a loose screw."
     )
+
+
+def _distorted(validation: Validation) -> tuple[str, ...]:
+    """Where the excitation left lines out: what answers there, and what of it the model does not have."""
+    levels = validation.levels.lines
+    if levels.odd is None or levels.even is None:
+        if validation.residual_over_floor.max() <= EXPLAINED:
+            return ()
+        return ("Whether that is odd (friction) or even (offsets, direction), experiment.detection = true would tell.",)
+    driven = levels.excited.motion
+    joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
+
+    def share(level: Array) -> str:
+        return f"{100.0 * float(level[joint] / driven[joint]):.2g} %"
+
+    found = (
+        f"On lines that nothing drove, joint {joint + 1} answers with {share(levels.odd.motion)} of a driven line's "
+        f"motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, what differs "
+        f"with direction); noise is {share(levels.noise)}. The model leaves {share(levels.odd.left)} and "
+        f"{share(levels.even.left)}."
+    )
+    beyond = [
+        mend
+        for group, mend in ((levels.odd, ODD_MEND), (levels.even, EVEN_MEND))
+        if np.any(group.left > BEYOND_NOISE * levels.noise)
+    ]
+    return (" ".join((found, *beyond)),)
 
 
 def _predicted(held_out: Array | None) -> tuple[str, ...]:

@@ -71,8 +71,16 @@ def show_any(result: dict[str, Any], json_only: bool) -> None:
     for name, entry in (*result["parameters"].items(), *result["extra"].items()):
         print(f"{name:20s} {entry['unit']:10s} {entry['value']:12.5g} {entry['std']:9.1e}")
     rms = ", ".join(f"{1000 * value:.3g}" for value in result["fit"]["residual_rms_rad"])
+    for entry in result.get("zeros", ()):
+        shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(entry["zero"], entry["std"], strict=True))
+        print(f"Encoder zeros of {entry['recording']}: {shown} rad.")
     print(f"{result['method']}.")
     print(f"Residual {rms} mrad RMS over {result['fit']['segments']} segments.")
+    for warning in result["warnings"]:
+        print(f"Warning: {warning}")
+    if "model_choice" in result:
+        choice = result["model_choice"]
+        print(f"Chosen by segments left out: {choice['chosen']}, error {choice['error_divided_by']:.2f} times smaller.")
     if "physical" in result:
         print("\n".join(physical_lines(result["physical"])))
 

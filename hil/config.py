@@ -145,6 +145,7 @@ class ExperimentConfig(_Table):
     period: float = Field(gt=0, le=1000, description="s")
     band: Range | None = Field(None, description="Hz: lines shared out between the joints in turn")
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
+    detection: bool = Field(False, description="drive odd lines only, not all: what is left out shows the distortion")
     peak_torque: list[PositiveFloat] | None = Field(None, description="N m per joint; with pilot, found by dry runs")
     pilot: bool = Field(False, description="find peak_torque by a small pilot run first, then raise it to the limits")
     design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" designs on the pilot\'s model')
@@ -163,6 +164,8 @@ class ExperimentConfig(_Table):
             raise ValueError(f"rate * period = {samples:g}: must be a whole number of samples")
         if (self.band is None) == (self.lines is None):
             raise ValueError("give either band or lines")
+        if self.detection and self.band is None:
+            raise ValueError("detection chooses lines from a band; with lines, leave the ones out that shall detect")
         if self.band is not None:
             low, high = self.band
             if not 0 < low < high < self.rate / 4:

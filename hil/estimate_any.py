@@ -7,16 +7,21 @@ from typing import Any
 
 import numpy as np
 
+from estimator.any_choice import choose_by_shooting
 from estimator.idim import fit_inverse_dynamics
 from estimator.model import Model
 from estimator.recording import Recording
 from estimator.shooting import ShootingEstimate, estimate_by_shooting
+from hil.any_warnings import any_warnings
 from hil.config import ModelConfig
 from hil.csv_config import load_csv_config
 from hil.csv_recording import read_csv
+from hil.errors import ConfigError
 from hil.physical import physical_entries
 from hil.recording import load_samples
+from hil.result_checks import describe_segment_choice
 from hil.run_folder import RunFolder
+from hil.warnings import clipping_warnings
 
 SCHEMA = 1
 START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
@@ -29,9 +34,12 @@ def estimate_csv(paths: Sequence[Path], config_path: Path) -> dict[str, Any]:
     config = load_csv_config(config_path)
     columns = config.columns
     recordings = [read_csv(path, columns) for path in paths]
-    result = _estimate(recordings, config.model, columns.segment, columns.zeros_unknown and config.arm.gravity > 0.0)
+    zeros = (columns.zeros_unknown or config.model.zeros) and config.arm.gravity > 0.0
+    result = _estimate(recordings, config.model, columns.segment, zeros)
     result["config"] = str(config_path)
     result["recordings"] = [str(path) for path in paths]
+    for path, zeros in zip(paths, result.get("zeros", []), strict=False):
+        zeros["recording"] = str(path)
     if config.known is not None:
         result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
     return result
@@ -50,32 +58,49 @@ def estimate_unsettled(run: RunFolder) -> dict[str, Any]:
         between="held",
         command_to_sample=facts.command_to_sample,
     )
-    result = _estimate([recording], config.model, 1.0, zeros=False)
+    result = _estimate([recording], config.model, 1.0, config.model.zeros)
     result["config"] = facts.config
+    result["warnings"] += clipping_warnings(config, samples)
     run.write_result(result)
     return result
 
 
 def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool) -> dict[str, Any]:
+    if wanted.ripple:
+        raise ConfigError("model.ripple needs a settled period to find where it repeats: leave it out for any data.")
     began = time.perf_counter()
-    model = Model(recordings[0].joints, wanted.fixed_friction, wanted.drive)
     start = fit_inverse_dynamics(recordings, START_CUTOFF, START_WIDTH).value
-    estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
-    return make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
+    choice = None
+    if wanted.friction == "auto":
+        choice = choose_by_shooting(recordings, wanted.drive, start, length=segment, zeros=zeros)
+        estimate = choice.estimate
+    else:
+        model = Model(recordings[0].joints, wanted.friction, wanted.drive, asymmetry=wanted.asymmetry)
+        estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
+    result = make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
+    result["warnings"] = any_warnings(recordings, estimate)
+    return result if choice is None else {**result, "model_choice": describe_segment_choice(choice)}
 
 
 def make_shooting_result(estimate: ShootingEstimate, recordings: Sequence[Recording], seconds: float) -> dict[str, Any]:
-    """result.json of multiple shooting: as hil.result has it, without what only a settled period has."""
+    """result.json of multiple shooting: as hil.result has it, without what only a settled period has.
+
+    `zeros`, if they were unknown: of each recording, true less measured angle of each joint.
+    """
     base = len(estimate.model.base_names)
     entries = [
         (name, {"value": float(value), "std": float(std), "unit": unit})
         for name, value, std, unit in zip(estimate.names, estimate.value, estimate.std, estimate.units, strict=True)
     ]
     steps = np.max([recording.position_step for recording in recordings], axis=0)
+    zeros = [
+        {"zero": zero.tolist(), "std": std.tolist(), "unit": "rad"}
+        for zero, std in zip(estimate.zeros, estimate.zeros_std, strict=True)
+    ]
     return {
         "schema": SCHEMA,
         "method": f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
-        f"starting states; {estimate.model.friction} friction, {estimate.model.drive} drive; standard errors robust "
+        f"starting states; {estimate.model.description}; standard errors robust "
         "against model error",
         "joints": estimate.model.joints,
         "parameters": dict(entries[:base]),
@@ -87,6 +112,7 @@ def make_shooting_result(estimate: ShootingEstimate, recordings: Sequence[Record
             "samples": int(sum(recording.time.size for recording in recordings)),
             "segments": estimate.segments,
         },
+        **({"zeros": zeros} if zeros else {}),
         "validation": {},
         "timing": {"estimation_seconds": seconds},
     }

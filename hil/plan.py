@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.excitation import Multisine, design_multisine, zippered_lines
+from estimator.excitation import Multisine, design_multisine, detecting_lines, zippered_lines
 from hil.config import Config
 from hil.errors import ConfigError
 
@@ -134,6 +134,8 @@ def _lines(config: Config) -> Sequence[Sequence[int]]:
     if experiment.band is None:
         return experiment.lines or []
     low, high = experiment.band
+    if experiment.detection:
+        return detecting_lines(experiment.period, (low, high), len(config.joints), experiment.seed)
     return zippered_lines(experiment.period, (low, high), len(config.joints))
 
 

@@ -5,13 +5,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.any_choice import SegmentChoice
 from estimator.choice import Choice
+from estimator.distortion import LineGroup
 from estimator.validation import Validation
 from estimator.verdict import Verdict
 
 
 def describe_validation(validation: Validation, held_out: NDArray[np.float64] | None) -> dict[str, Any]:
-    """Per joint; `held_out_rms` and `free_run_rms` are fractions of the motion's RMS, `levels_ticks` encoder steps."""
+    """Per joint; `held_out_rms` and `free_run_rms` are fractions of the motion's RMS, `levels_ticks` encoder steps RMS
+    of all lines together, `line_levels_ticks` of one line."""
     levels = validation.levels
     first, second, correlation = validation.confounded
     described: dict[str, Any] = {} if held_out is None else {"held_out_rms": held_out.tolist()}
@@ -25,13 +28,26 @@ def describe_validation(validation: Validation, held_out: NDArray[np.float64] | 
         "hardest_to_tell_apart": {"parameters": [first, second], "correlation": correlation},
         "levels_ticks": {
             "excited_lines": levels.excited.tolist(),
-            "odd_distortion": levels.odd.tolist(),
-            "even_distortion": levels.even.tolist(),
+            "distortion": levels.distortion.tolist(),
             "noise": levels.noise.tolist(),
             "period_scatter": levels.scatter.tolist(),
             "model_error": levels.model_error.tolist(),
         },
+        "line_levels_ticks": {
+            "noise": levels.lines.noise.tolist(),
+            "excited": _group(levels.lines.excited),
+            "odd": _group(levels.lines.odd),
+            "even": _group(levels.lines.even),
+            "other": _group(levels.lines.other),
+        },
     }
+
+
+def _group(group: LineGroup | None) -> dict[str, Any] | None:
+    """How many lines, the motion on one of them and what the fit leaves of it; None where there are none."""
+    if group is None:
+        return None
+    return {"lines": group.lines, "motion": group.motion.tolist(), "left": group.left.tolist()}
 
 
 def describe_verdict(verdict: Verdict) -> dict[str, Any]:
@@ -45,6 +61,24 @@ def describe_choice(choice: Choice) -> dict[str, Any]:
         "chosen": choice.chosen.model.description,
         "error_divided_by": choice.gained,
         "standard_errors_times": choice.cost,
+        "tried": [
+            {
+                "model": trial.model.description,
+                "parameters": len(trial.model.names),
+                "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
+                "score": trial.score if np.isfinite(trial.score) else None,
+                "seconds": round(trial.seconds, 3),
+            }
+            for trial in choice.trials
+        ],
+    }
+
+
+def describe_segment_choice(choice: SegmentChoice) -> dict[str, Any]:
+    """The same for any data, judged by segments that were left out of the fit."""
+    return {
+        "chosen": choice.chosen.model.description,
+        "error_divided_by": choice.gained,
         "tried": [
             {
                 "model": trial.model.description,

@@ -1,5 +1,7 @@
 """From a recording to what the estimator takes: the settled periods of one multisine."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,7 @@ from estimator.period import SettledPeriod
 from estimator.settling import period_difference
 from hil.config import Config
 from hil.errors import RecordingCutShort
+from hil.real_times import acting_torque, lateness, velocity_of
 from hil.recording import Phase
 from hil.run_folder import RunFacts
 from hil.stabiliser import feedback_of, feedback_torque
@@ -22,6 +25,10 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     whole = len(rows) // count
     periods = rows[: whole * count].reshape(whole, count)
     position = np.moveaxis(periods["position"], 2, 1)
+    position = np.where(np.isfinite(position), position, np.nan)
+    for joint, received in zip(config.joints, np.isfinite(position).any(axis=(0, 2)), strict=True):
+        if whole and not received:
+            raise RecordingCutShort(f"{joint.name} never said where it is during {role!r}: look at its cable and ID.")
     first = _first_settled(position, experiment.settle_within)
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
@@ -29,32 +36,49 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
             f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods, and among "
             f"them no {experiment.periods} settled ones; {wanted * count} samples are the least. Record again."
         )
-    used = periods[first : first + experiment.periods]
-    constants = np.array([joint.torque_per_goal for joint in config.joints])
-    torque = np.moveaxis(used["goal_current"] * constants, 2, 1).mean(axis=0)
-    angle = np.moveaxis(used["position"], 2, 1)
-    return SettledPeriod(
+    begin, end = first * count, (first + experiment.periods) * count
+    # With the row before: its goal holds until the first write.
+    goals = rows["goal_current"][begin - 1 : end].T * _torque_constants(config)[:, None]
+    late = lateness(rows[begin:end])
+    torque = acting_torque(goals, late, experiment.rate)
+    angle = position[first : first + experiment.periods]
+    period = SettledPeriod(
         rate=experiment.rate,
-        torque=torque,
-        position=np.nanmean(angle, axis=0),
+        torque=_by_period(torque, count).mean(axis=0),
+        position=_mean_of_periods(angle),
         command_to_sample=facts.command_to_sample,
         position_step=np.array(facts.position_step),
         periods=experiment.periods,
-        position_std=_scatter(angle),
-        stabiliser=None if config.stabiliser is None else _stabilised(config, rows, first * count, used.size),
+        stabiliser=None if config.stabiliser is None else _stabilised(config, rows, torque, begin),
     )
+    on_time = angle - velocity_of(period) * _by_period(late[None], count)
+    return replace(period, position=_mean_of_periods(on_time), position_std=_scatter(on_time))
 
 
-def _stabilised(config: Config, rows: NDArray[np.void], first: int, count: int) -> Stabilised:
-    """What the stabiliser gave of the torque, from the samples that it acted on."""
-    with_former = rows[first - 1 : first + count]
-    constants = np.array([joint.torque_per_goal for joint in config.joints])
-    given = np.nan_to_num(feedback_torque(config, with_former))
-    commanded = with_former["goal_current"] * constants
-    period = config.experiment.samples
-    excitation = (commanded[1:] - given).reshape(-1, period, len(constants)).mean(axis=0).T
+def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean (joints, samples) over those of the periods (periods, joints, samples) that have the sample, or NaN."""
+    count = np.isfinite(position).sum(axis=0)
+    mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _by_period(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """(joints, samples) of several periods of `count` samples as (periods, joints, count)."""
+    return np.moveaxis(values.reshape(len(values), -1, count), 1, 0)
+
+
+def _torque_constants(config: Config) -> NDArray[np.float64]:
+    return np.array([joint.torque_per_goal for joint in config.joints])
+
+
+def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float64], first: int) -> Stabilised:
+    """What the stabiliser gave of the `torque` (joints, samples) from row `first` on, from the samples it acted on."""
+    with_former = rows[first - 1 : first + torque.shape[1]]
+    given = np.nan_to_num(feedback_torque(config, with_former)).T
+    excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)
     former = np.nan_to_num(np.stack((with_former["position"][0], with_former["velocity"][0])))
-    return Stabilised(feedback_of(config), np.ascontiguousarray(excitation), former, commanded[0])
+    commanded = with_former["goal_current"][0] * _torque_constants(config)
+    return Stabilised(feedback_of(config), np.ascontiguousarray(excitation), former, commanded)
 
 
 def _scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -18,11 +18,8 @@ LOST = 0.01  # of the samples
 
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
     """One sentence for each thing."""
-    periodic = samples[samples["phase"] == Phase.PERIODIC]
-    found = []
+    found = clipping_warnings(config, samples[samples["phase"] == Phase.PERIODIC])
     for index, joint in enumerate(config.joints):
-        if joint.drive_mode is Mode.CURRENT:
-            found += _clipped(joint.name, periodic["goal_current"][:, index], periodic["current"][:, index])
         swing = float(np.nanmax(period.position[index]) - np.nanmin(period.position[index]))
         steps = swing / facts.position_step[index]
         if steps < LEAST_SWING:
@@ -34,6 +31,16 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         if lost > LOST:
             found.append(f"{joint.name}: {100 * lost:.1f} % of the samples are missing; look at cable, baud and rate.")
     return found
+
+
+def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
+    """Of joints that got less current than they were told."""
+    return [
+        said
+        for index, joint in enumerate(config.joints)
+        if joint.drive_mode is Mode.CURRENT
+        for said in _clipped(joint.name, samples["goal_current"][:, index], samples["current"][:, index])
+    ]
 
 
 def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]) -> list[str]:

@@ -102,7 +102,7 @@ def test_a_good_estimate_is_trusted(ideal_period: SettledPeriod) -> None:
     validation = validate(ideal_period, estimate)
     assert validation.correlated_lags.max() < 0.15
     assert validation.free_run is not None and validation.free_run.max() < 0.002
-    assert validation.levels.excited.min() > 100.0 * validation.levels.odd.max()
+    assert validation.levels.excited.min() > 100.0 * validation.levels.distortion.max()
     assert judge(estimate, validation, np.array([0.001, 0.001])).trust == "yes"
 
 

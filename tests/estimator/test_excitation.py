@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimator.errors import ExcitationError
-from estimator.excitation import design_multisine, zippered_lines
+from estimator.excitation import design_multisine, detecting_lines, zippered_lines
 
 
 @given(st.floats(1.0, 50.0), st.floats(0.0, 2.0), st.floats(2.5, 20.0), st.integers(1, 4))
@@ -21,6 +21,20 @@ def test_lines_are_shared_out_and_belong_to_one_joint(period: float, low: float,
     assert max(map(len, lines)) - min(map(len, lines)) <= 1
     assert low * period - 1e-6 <= every[0] < low * period + 1.0 + 1e-6 or every[0] == 1
     assert high * period - 1.0 - 1e-6 < every[-1] <= high * period + 1e-6
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+def test_detecting_lines_are_odd_and_leave_one_in_four_out(joints: int) -> None:
+    lines = detecting_lines(10.0, (0.1, 5.0), joints, seed=3)
+    driven = sorted(line for joint in lines for line in joint)
+    odd = list(range(1, 51, 2))
+    assert set(driven) <= set(odd) and len(set(driven)) == len(driven) == 19
+    for first in range(0, 24, 4):
+        assert len(set(odd[first : first + 4]) - set(driven)) == 1
+    assert max(map(len, lines)) - min(map(len, lines)) <= 1
+    assert lines == detecting_lines(10.0, (0.1, 5.0), joints, seed=3) != detecting_lines(10.0, (0.1, 5.0), joints, 4)
+    with pytest.raises(ExcitationError, match="odd harmonics"):
+        detecting_lines(1.0, (2.0, 4.5), 2, 1)
 
 
 @settings(max_examples=10, deadline=None)

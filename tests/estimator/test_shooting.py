@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from estimator.any_choice import choose_by_shooting
 from estimator.errors import RecordingError, ShapeError, StandstillError
 from estimator.idim import fit_inverse_dynamics
 from estimator.model import Model
@@ -63,16 +64,31 @@ def test_a_motion_that_never_settles_gives_the_arm_and_honest_errors(ideal_arm: 
     assert prediction_rms([other], estimate.parameters, 1.0, 2).max() < 0.01
 
 
-def test_recordings_are_used_together_and_encoder_zeros_found(ideal_arm: Arm, recording: Recording) -> None:
+def test_recordings_are_used_together_each_with_its_own_encoder_zeros(ideal_arm: Arm, recording: Recording) -> None:
+    zeros = np.array([[-0.05, 0.03], [0.04, 0.02]])
     shifted = [
-        replace(each, position=each.position + np.array([[0.05], [-0.03]]))
-        for each in (recording, swing(ideal_arm, 4.0, 3))
+        replace(each, position=each.position - zero[:, None])
+        for each, zero in zip((recording, swing(ideal_arm, 4.0, 3)), zeros, strict=True)
     ]
     estimate = estimate_by_shooting(shifted, Model(2), start(shifted[0]), zeros=True)
     assert estimate.segments == 12
-    assert estimate.parameters["zero_1"] == pytest.approx(0.05, abs=0.002)
-    assert estimate.parameters["zero_2"] == pytest.approx(-0.03, abs=0.002)
+    assert estimate.zeros == pytest.approx(zeros, abs=0.002)
+    assert np.all(np.abs(estimate.zeros - zeros) < 4.0 * estimate.zeros_std)
     assert max(map(abs, errors(estimate, ideal_arm).values())) < 0.01
+    known = prediction_rms(shifted, estimate.parameters, 1.0, 2, estimate.zeros)
+    assert known.max() < 0.01 < prediction_rms(shifted, estimate.parameters, 1.0, 2).max()
+
+
+def test_friction_is_chosen_by_segments_left_out(pendulum: Arm) -> None:
+    rising = {"coulomb_width": 0.03, "stribeck_rise": 0.6, "stribeck_velocity": 0.4}
+    drives = tuple(drive.model_copy(update=rising) for drive in pendulum.drives)
+    recorded = swing(pendulum.model_copy(update={"drives": drives}), 6.0, 5)
+    choice = choose_by_shooting([recorded], "delay", start(recorded))
+    assert choice.chosen.model.friction == "stribeck" and choice.gained > 1.5
+    assert choice.estimate.parameters["stribeck_rise_1"] == pytest.approx(0.6, rel=0.1)
+    assert len(choice.trials) == 4
+    with pytest.raises(RecordingError, match="two segments"):
+        choose_by_shooting([recorded], "delay", start(recorded), length=6.0)
 
 
 def test_a_pendulum_with_lost_samples(pendulum: Arm) -> None:

@@ -94,6 +94,41 @@ def test_a_csv_that_is_wrong_is_named(
     assert said in error and "Traceback" not in error
 
 
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda columns: columns | {"tau1": -columns["tau1"]}, "check the units, signs"),
+        (
+            lambda columns: columns | {"q1": np.degrees(columns["q1"])},
+            "if it did not, its positions are not in the unit",
+        ),
+        (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
+        (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),
+        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "encoder steps only"),
+    ],
+)
+def test_data_that_is_doubtful_comes_with_a_warning(
+    spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A pendulum swinging as 0.02 q'' + 0.5 cos q + 0.03 q' = tau; one column is then wrong."""
+    time = 0.0025 * np.arange(2000)
+    torque = 0.25 * np.sin(2.0 * time) + 0.2 * np.sin(7.1 * time + 1.0)
+    angle, velocity = np.empty(2000), 0.0
+    angle[0] = -np.pi / 2
+    for k in range(1999):
+        velocity += 0.0025 * (torque[k] - 0.5 * np.cos(angle[k]) - 0.03 * velocity) / 0.02
+        angle[k + 1] = angle[k] + 0.0025 * velocity
+    columns = spoil({"t": time, "q1": angle, "tau1": torque})
+    rows = np.column_stack(list(columns.values())).tolist()
+    Path("data.csv").write_text(
+        "t,q1,tau1\n" + "".join(",".join(map(str, row)) + "\n" for row in rows), encoding="utf-8"
+    )
+    toml = '[model]\nfriction = "coulomb"\n[columns]\ntime = "t"\nposition = ["q1"]\ntorque = ["tau1"]\n'
+    Path("arm.toml").write_text(toml + "position_step = 0.0015\n", encoding="utf-8")
+    assert hil("estimate", "data.csv", "--config", "arm.toml", "--json") == 0
+    assert said in " ".join(json.loads(capsys.readouterr().out)["warnings"])
+
+
 def test_a_csv_needs_its_config_and_no_run_beside_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("estimate", "data.csv") == 2
     assert "--config ARM.toml" in capsys.readouterr().err

@@ -7,9 +7,16 @@ from hil.period_file import PlayedPeriod
 from hil.plan import IDENTIFY
 from hil.report.chart import BLUE, GREEN, GREY, ORANGE, Array, Chart, Series
 from hil.report.run_data import RunData
-from hil.report.section import Picture, Section
+from hil.report.section import Picture, Section, Table
+from hil.report.words import steps
 
 _COLOURS = (BLUE, ORANGE)
+_KINDS = {
+    "excited": "driven",
+    "odd": "odd, not driven (friction, gravity)",
+    "even": "even, not driven (offsets, direction)",
+    "other": "not driven",
+}
 _BEYOND = 3.0  # times the highest excited line are shown
 
 
@@ -25,7 +32,23 @@ def spectra(data: RunData) -> Section | None:
     )
     pictures = [_excitation(data, data.fitted, excited)]
     pictures += [_response(data.fitted, joint, name, excited) for joint, name in enumerate(data.names)]
-    return Section("spectra", "Excitation and response", words, pictures=tuple(pictures))
+    return Section("spectra", "Excitation and response", words, _levels(data), tuple(pictures))
+
+
+def _levels(data: RunData) -> tuple[Table, ...]:
+    """Motion on one line of each kind, and what the model leaves of it; older results do not have it."""
+    levels = data.result["validation"].get("line_levels_ticks")
+    if not levels:
+        return ()
+    rows = [
+        (f"{said}, {name}", str(group["lines"]), steps(group["motion"][joint]), steps(group["left"][joint]))
+        for key, said in _KINDS.items()
+        if (group := levels[key])
+        for joint, name in enumerate(data.names)
+    ]
+    rows += [(f"noise, {name}", "", steps(levels["noise"][joint]), "") for joint, name in enumerate(data.names)]
+    head = ("lines", "how many", "motion on one [steps]", "left by the model [steps]")
+    return (Table(head, tuple(rows), caption="RMS of one line, by kind"),)
 
 
 def _excited(data: RunData) -> list[list[int]]:
