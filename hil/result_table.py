@@ -6,11 +6,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from drivers.servo_model import Mode
 from hil.config import Config
 from hil.physical import physical_lines
 from hil.stabiliser import StabiliserShare
-from hil.torque_constants import torque_constants_said
+from hil.torque_constants import by_voltage_said, torque_constants_said
 
 
 def print_result(result: dict[str, Any], config: Config, run: Path, console: Console) -> None:
@@ -95,11 +94,8 @@ def _stabiliser(result: dict[str, Any], config: Config) -> list[str]:
 
 
 def _torque_constants(result: dict[str, Any], config: Config) -> list[str]:
-    lines = []
-    if any(joint.drive_mode is Mode.PWM for joint in config.joints):
-        lines.append("Driven by voltage: the viscous friction includes what the motor generates when it turns.")
-    said = torque_constants_said(config.joints, result["extra"])
-    return [*lines, said] if said else lines
+    said = [by_voltage_said(config.joints), torque_constants_said(config.joints, result["extra"])]
+    return [each for each in said if each]
 
 
 def _next(result: dict[str, Any], run: Path) -> list[str]:

@@ -1,7 +1,10 @@
-"""What the joints' torque constants leave open in a result, in one sentence for terminal and report."""
+"""What the joints' torque constants leave open in a result, in sentences for terminal and report."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol
+
+from drivers.servo_model import Mode
+from hil.config import JointConfig
 
 RATIO = "torque_scale_2"
 
@@ -42,3 +45,10 @@ def torque_constants_said(joints: Sequence[Driven], extra: dict[str, Any]) -> st
     if not first.torque_per_goal_std:
         return f"{found}."
     return f"{found}, known to {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
+
+
+def by_voltage_said(joints: Sequence[JointConfig]) -> str:
+    """What viscous friction holds where the joints are driven by voltage; empty where they are not."""
+    if all(joint.drive_mode is not Mode.PWM for joint in joints):
+        return ""
+    return "Driven by voltage: the viscous friction includes what the motor generates when it turns."

@@ -32,7 +32,9 @@ def _write_table(lines: list[str], path: tuple[str, ...], table: dict[str, Any])
     """A table's own values, then its tables, then its arrays of tables."""
     tables = {key: value for key, value in table.items() if isinstance(value, dict)}
     arrays = {key: value for key, value in table.items() if _is_array_of_tables(value)}
-    lines += [f"{key} = {_value(table[key])}" for key in table if key not in tables and key not in arrays]
+    # TOML has no null: what a result does not hold is left out.
+    plain = [key for key in table if key not in tables and key not in arrays and table[key] is not None]
+    lines += [f"{key} = {_value(table[key])}" for key in plain]
     for key, value in tables.items():
         lines += ["", f"[{'.'.join((*path, key))}]"]
         _write_table(lines, (*path, key), value)

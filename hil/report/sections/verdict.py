@@ -1,10 +1,9 @@
 """The verdict in words: can this model be trusted, why, and what to do if not. The judgement is the result's own."""
 
-from drivers.servo_model import Mode
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
-from hil.torque_constants import torque_constants_said
+from hil.torque_constants import by_voltage_said, torque_constants_said
 
 _TITLES = {
     "yes": ("good", "This model can be trusted"),
@@ -18,7 +17,10 @@ def verdict(data: RunData) -> Section:
     judged = data.result["verdict"]
     tone, title = _TITLES[judged["trust"]]
     warnings = [f"Warning: {warning}" for warning in data.result.get("warnings", [])]
-    words = [_residual(data), _truth(data), _limits(data), _torque_constants(data), _by_voltage(data), _hardware(data)]
+    words = [
+        *(_residual(data), _truth(data), _limits(data)),
+        *(_torque_constants(data), by_voltage_said(data.config.joints), _hardware(data)),
+    ]
     bullets = (*judged["sentences"], *warnings, *(word for word in words if word))
     return Section("verdict", title, tone=tone, bullets=bullets)
 
@@ -52,12 +54,6 @@ def _limits(data: RunData) -> str:
 
 def _torque_constants(data: RunData) -> str:
     return torque_constants_said(data.model.joints, data.result["extra"])
-
-
-def _by_voltage(data: RunData) -> str:
-    if all(joint.drive_mode is not Mode.PWM for joint in data.config.joints):
-        return ""
-    return "The joints were driven by voltage: viscous friction includes what the motors generate when they turn."
 
 
 def _hardware(data: RunData) -> str:
