@@ -108,7 +108,7 @@ def beyond_when_passed(
 ) -> dict[Way, Array]:
     """Stopped because a limit was passed at up to `velocity` (joints,) [rad/s], under the plan's largest torque.
 
-    pose: where the other joint was (joints,) [rad]; anywhere unless given.
+    pose: where the arm was then (joints,) [rad]; unless given, one joint is on a limit and the other anywhere.
     """
     stops = _Stops(config)
     peak = np.abs(_planned_goals(config, plan)).max(axis=1)
@@ -173,20 +173,16 @@ def _felt(config: Config, scale: Array) -> Feedback:
 
 
 def _limit_starts(config: Config, physics: Physics, peak: Array, velocity: Array, pose: Array | None) -> list[_Start]:
-    """One joint on a limit and outwards at its velocity, driven outwards; the other at any speed, or jammed."""
+    """One joint outwards at its velocity and driven outwards; the other at any speed, or jammed."""
     starts = []
     joints = range(len(config.joints))
-    elsewhere = (
-        [[rest, *joint.position_limit] for rest, joint in zip(config.arm.rest_pose, config.joints, strict=True)]
-        if pose is None
-        else [[angle] for angle in pose.tolist()]
-    )
+    rest = config.arm.rest_pose
     for joint, outward in product(joints, (-1.0, 1.0)):
         limit = config.joints[joint].position_limit[0 if outward < 0 else 1]
-        poses = [[limit] if k == joint else elsewhere[k] for k in joints]
+        corners = product(*([limit] if k == joint else [rest[k], *config.joints[k].position_limit] for k in joints))
         speeds = [[outward] if k == joint else [-1.0, 0.0, 1.0] for k in joints]
         goal = outward * np.where(np.arange(len(joints)) == joint, peak, 0.0)
-        for at in map(np.array, product(*poses)):
+        for at in map(np.array, corners) if pose is None else [pose]:
             starts += [_Start(_moving(at, np.array(each) * velocity), goal) for each in product(*speeds)]
             if len(joints) == 2:
                 handed = _handed_on(physics, at, joint, outward, velocity)
@@ -262,7 +258,7 @@ class _Stops:
             yield from self.cut(start)
 
     def reversed(self, start: _Start) -> Iterator[list[_Piece]]:
-        pushed = np.sign(start.state[1]) * self._clamp
+        pushed = np.clip(self._brake.damping * start.state[1], -self._clamp, self._clamp)
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:
