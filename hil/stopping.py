@@ -115,9 +115,9 @@ def beyond_when_passed(
     faster = velocity + GETS_FASTER * np.array([joint.velocity_limit for joint in config.joints])
     ways = {Way.CUT: stops.cut, Way.BRAKED: stops.braked}
     held = _farthest(stops, ways, ensemble, lambda physics, _: _limit_starts(config, physics, peak, velocity, pose))
-    ways = {Way.REVERSED: stops.reversed}
+    pushed = {Way.REVERSED: stops.reversed}
     return held | _farthest(
-        stops, ways, ensemble, lambda physics, _: _limit_starts(config, physics, peak, faster, pose)
+        stops, pushed, ensemble, lambda physics, _: _limit_starts(config, physics, peak, faster, pose)
     )
 
 
@@ -147,13 +147,13 @@ def _planned_goals(config: Config, plan: Plan) -> Array:
 
 
 def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
-    """Moments of the planned motion: those that lead farthest, and some at even distances."""
+    """Moments of the planned motion, up to a limit: those that lead farthest, and some at even distances."""
     rest = resting(np.array(config.arm.rest_pose))
     moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale))
-    samples = goals.shape[1]
-    chosen = set(np.linspace(1, samples - 1, _EVENLY).astype(int).tolist())
+    until = _within_limits(config, moved)
+    chosen = set(np.linspace(1, until - 1, _EVENLY).astype(int).tolist())
     for ahead in _AHEAD_S:
-        carried = moved.position[:, 1:] + ahead * moved.velocity[:, 1:]
+        carried = moved.position[:, 1:until] + ahead * moved.velocity[:, 1:until]
         chosen |= {1 + int(at) for at in (*carried.argmin(axis=1), *carried.argmax(axis=1))}
     return [
         _Start(
@@ -162,6 +162,15 @@ def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array
         )
         for at in sorted(chosen)
     ]
+
+
+def _within_limits(config: Config, moved: Response) -> int:
+    """Samples, two at least, before the guard stops the motion because it passes a limit."""
+    low, high = (np.array(side)[:, None] for side in zip(*(j.position_limit for j in config.joints), strict=True))
+    fastest = np.array([joint.velocity_limit for joint in config.joints])[:, None]
+    passed = (moved.position < low) | (moved.position > high) | (np.abs(moved.velocity) > fastest)
+    first = np.flatnonzero(passed.any(axis=0))
+    return max(2, int(first[0])) if first.size else passed.shape[1]
 
 
 def _at(moved: Response, sample: int) -> tuple[Array, Array]:

@@ -10,15 +10,17 @@ import pytest
 
 from benchmarks.faults import CONFIG, short_config
 from drivers.state import State
+from estimator.closed_loop import Feedback, respond, resting
 from estimator.physics import Physics
 from fakes.arm import base_parameters
 from fakes.two_link import TwoLink
 from hil.config import Config
 from hil.damping import GETS_FASTER, Brake
 from hil.ensemble import Ensemble
-from hil.plan import make_plan
+from hil.plan import Plan, make_plan, scaled
 from hil.stopping import LONGEST_S, Stopping, Way, beyond_when_passed, stopping_distance
 
+NONE = Feedback.none(2)
 SPEEDS = np.array([3.0, 2.0])
 CLOSE = (("[-4.2, 1.06]", "[-2.6, -0.3]"), ("[-3.1, 3.1]", "[-0.4, 0.4]"))
 
@@ -106,10 +108,27 @@ def test_the_ways_of_stopping_in_their_order() -> None:
     assert all((slower[way] < ways.passed[way]).all() for way in slower)
 
 
+def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
+    """The motion beyond it will not be played; the guard stops the arm."""
+    config = close_config()
+    harder = scaled(config, make_plan(config), np.array([2.1, 1.4]))
+    moved = respond(
+        fake_itself().physics[0], resting(np.array(config.arm.rest_pose)), torque(config, harder), 200.0, NONE
+    )
+    beyond = float((moved.position[0] - config.joints[0].position_limit[1]).max())
+    ways = stopping_distance(config, harder, fake_itself(), SPEEDS)
+    assert ways.planned[Way.BRAKED][0] < 0.5 * beyond
+
+
 def test_without_braking_braked_is_cut() -> None:
     ways = predicted(("[model]\n", '[safety]\nstop = "cut"\n\n[model]\n'))
     assert (ways.passed[Way.BRAKED] == ways.passed[Way.CUT]).all()
     assert (ways.planned[Way.BRAKED] == ways.planned[Way.CUT]).all()
+
+
+def torque(config: Config, plan: Plan) -> np.ndarray:
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    return np.ascontiguousarray((plan.segments[0].period_current * constants).T)
 
 
 def moving(*velocity: float) -> State:
