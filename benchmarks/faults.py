@@ -1,6 +1,6 @@
 """The fault campaign: every fault of the fake bus, and some of the program's own, in every phase of the experiment.
 
-    python benchmarks/faults.py [--json] [--seeds N]
+    python benchmarks/faults.py [--json] [--seeds N] [--jobs N]
 
 All in virtual time on the realistic fake arm with position limits 0.15 rad and velocity limits 30 % beyond its
 undisturbed motion. After each run the emulated servos themselves are asked. An injection is
