@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from hil import __version__, cli_data, cli_dry_run, cli_init, cli_results
+from hil import __version__, cli_data, cli_dry_run, cli_init, cli_results, strict_json
 
 if TYPE_CHECKING:
     from hil.config import Config
@@ -29,7 +29,6 @@ app = typer.Typer(
 ConfigPath = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="TOML file of the arm, or the name of a bundled one.")
 ]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
 PortOrConfig = Annotated[
     str | None,
     typer.Argument(metavar="[PORT]", help="Serial port or pyserial URL, or a TOML file; without it: list the ports."),
@@ -75,6 +74,36 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
         result = estimate_run(run)
         cli_results.write_report(run.path)
     _show(result, checked, run.path, json_only)
+
+
+@app.command(epilog="Example: hil record configs/fake_two_link.toml --out runs/monday")
+def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> None:
+    """Play the experiment and keep its recording, for `hil estimate`."""
+    from hil.config import load_config
+    from hil.errors import ConfigError
+    from hil.experiment import run_experiment
+    from hil.recording import load_samples
+    from hil.run_folder import RunFolder
+    from hil.terminal import Terminal
+    from hil.timing import timing
+
+    checked = load_config(config)
+    if checked.experiment.pilot:
+        raise ConfigError(
+            f"{config}: experiment.pilot = true: each step's torque follows from an estimate of the one before, which "
+            "`hil identify` does. To record alone, give experiment.peak_torque and set pilot = false."
+        )
+    run = RunFolder.create(out or _default_folder(config), checked)
+    terminal = Terminal(quiet=json_only)
+    with terminal.streaming(checked) as watch:
+        torque = run_experiment(checked, run, config, watch)
+    terminal.say(torque)
+    samples = load_samples(run.samples_path, len(checked.joints))
+    recorded = {"run": str(run.path), "samples": len(samples), "timing": timing(samples, checked.experiment.rate)}
+    if json_only:
+        print(strict_json.dumps(recorded))
+        return
+    print(f"Run folder: {run.path}, {len(samples)} samples.\nEstimate from it: hil estimate {run.path}")
 
 
 @app.command(epilog="Example: hil estimate runs/20261121-153000-fake_two_link")
@@ -206,6 +235,14 @@ app.command(epilog="Example: hil calibrate runs/bare runs/with_mass --mass 0.1 -
 )
 
 
+def _list_faults(wanted: bool) -> None:
+    if wanted:
+        from hil import fake_command
+
+        fake_command.list_faults()
+        raise typer.Exit
+
+
 @app.command(epilog="Example: hil fake configs/fake_two_link.toml --pty --link /tmp/arm")
 def fake(
     config: ConfigPath,
@@ -217,14 +254,15 @@ def fake(
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of noise and faults, instead of the file's.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No status line.")] = False,
-    list_faults: Annotated[bool, typer.Option("--list-faults", help="Print the kinds of faults and exit.")] = False,
+    _: Annotated[
+        bool,
+        typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="Print the kinds of faults and exit."),
+    ] = False,
 ) -> None:
     """Serve the fake arm of a file to any program, in real time; without --pty, say what it is made of."""
     from hil import fake_command
 
-    if list_faults:
-        fake_command.list_faults()
-    elif pty:
+    if pty:
         fake_command.serve_fake(config, link, fault or [], seed, quiet)
     else:
         fake_command.describe_fake(config, fault or [], seed)
@@ -245,7 +283,7 @@ def main() -> NoReturn:
 
 def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool) -> None:
     if json_only:
-        print(json.dumps(result, ensure_ascii=False))
+        print(strict_json.dumps(result))
         return
     from rich.console import Console
 

@@ -3,13 +3,13 @@
 The modules that do the work are imported inside the commands, as in hil.cli.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hil import strict_json
 from hil.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ ArmPath = Annotated[
 AllSamples = Annotated[
     bool, typer.Option("--all-samples", help="No settled period is needed: every sample, by multiple shooting.")
 ]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of a former `hil identify`.")]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
 
 
@@ -63,7 +63,7 @@ def estimate_all_samples(run: "RunFolder", json_only: bool) -> None:
 def show_any(result: dict[str, Any], json_only: bool) -> None:
     """Print a result of multiple shooting."""
     if json_only:
-        print(json.dumps(result, ensure_ascii=False))
+        print(strict_json.dumps(result))
         return
     from hil.physical import physical_lines
 
@@ -91,7 +91,7 @@ def compare(
     with Terminal(quiet=json_only).busy("Running the peers"):
         compared = compare_run(folder, mujoco)
     if json_only:
-        print(json.dumps(compared, ensure_ascii=False))
+        print(strict_json.dumps(compared))
         return
     print(f"{'method':14s} {'seconds':>8s} {'worst error':>20s} {'held out':>9s}  settings")
     for name, entry in compared["methods"].items():
@@ -126,4 +126,4 @@ def calibrate(
         length = known.quantities()["length_1"].value
     with Terminal(quiet=json_only).busy("Calibrating"):
         result = calibrate_runs(*runs, KnownMass(mass, distance, inertia, length or 0.0))
-    print(json.dumps(result, ensure_ascii=False) if json_only else "\n".join(calibration_lines(result)))
+    print(strict_json.dumps(result) if json_only else "\n".join(calibration_lines(result)))

@@ -1,10 +1,11 @@
 """The command `hil dry-run`: its options; `hil.dry_run_command` does the work."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from hil import strict_json
 
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file that describes the arm.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
@@ -39,7 +40,7 @@ def dry_run(
     if picture is not None:
         draw(checked, run.largest.prediction if run.asked is None else run.asked, picture)
     if json_only:
-        print(json.dumps(dry_run_json(checked, run), ensure_ascii=False))
+        print(strict_json.dumps(dry_run_json(checked, run)))
     else:
         print_dry_run(checked, run, Console(highlight=False))
     if not run.is_safe(checked):

@@ -12,13 +12,13 @@ from estimator.model import Model
 from estimator.peers import Peer, compare_peers
 from estimator.period import SettledPeriod
 from estimator.prediction import settled_prediction_error
-from fakes.arm import base_parameters
 from hil.config import Config
 from hil.errors import ConfigError
 from hil.plan import HELD_OUT, IDENTIFY
 from hil.recording import load_samples
 from hil.run_folder import RunFolder, write_json
 from hil.settled import settled_period
+from hil.truth import true_parameters
 
 SCHEMA = 1
 OURS = "hil"
@@ -37,7 +37,7 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> dict[str, Any]:
     samples = load_samples(run.samples_path, len(config.joints))
     period = settled_period(config, facts, samples, IDENTIFY)
     held_out = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
-    truth = base_parameters(config.fake.arm) if config.is_fake and config.fake is not None else None
+    truth = true_parameters(config)
     methods = {peer.name: judged(peer, truth, held_out) for peer in all_methods(config, period, truth, mujoco, seed)}
     compared = {"schema": SCHEMA, "config": facts.config, "truth": truth, "methods": methods}
     write_json(run.path / "compare.json", compared)

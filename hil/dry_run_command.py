@@ -1,15 +1,13 @@
 """What `hil dry-run` does: an ensemble, the experiment on it, the largest safe torque."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 from hil.amplitude import largest_amplitude
 from hil.config import Config
 from hil.dry_run import predict
 from hil.dry_run_report import DryRun
 from hil.ensemble import Ensemble, prior_ensemble, result_ensemble
-from hil.errors import RunFolderError
+from hil.model_file import read_result
 from hil.plan import make_plan
 from hil.quiet_stream import quiet_stream
 from hil.stopping import stopping_distance
@@ -20,7 +18,7 @@ ARMS = 128
 def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos: bool = False) -> DryRun:
     """Simulate the configured experiment. result: run folder or result.json of a former identification.
 
-    Raises ConfigError, RunFolderError, ExperimentError; with `servos`, DriverError.
+    Raises ConfigError, ResultError, RunFolderError, ExperimentError; with `servos`, DriverError.
     """
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
@@ -34,15 +32,4 @@ def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos
 
 def ensemble_of(config: Config, result: Path | None, arms: int) -> Ensemble:
     """From the prior, or from a former result."""
-    return prior_ensemble(config, arms) if result is None else result_ensemble(_read(result), arms)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    file = path / "result.json" if path.is_dir() else path
-    try:
-        value = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{file} cannot be read as a result: {error}.") from error
-    if not isinstance(value, dict):
-        raise RunFolderError(f"{file} holds no JSON object.")
-    return value
+    return prior_ensemble(config, arms) if result is None else result_ensemble(read_result(result), arms)

@@ -50,6 +50,17 @@ def read_result(path: Path) -> dict[str, Any]:
             f"{file}: schema {result['schema']!r} is not {SCHEMA}, which this hil reads; it was written by "
             f"{'a newer' if _newer(result['schema']) else 'another'} hil. Install that one, or estimate again."
         )
+    return _with_infinities(result)
+
+
+def _with_infinities(result: dict[str, Any]) -> dict[str, Any]:
+    """An error bar that is infinite (nothing was seen of the parameter) is null in strict JSON."""
+    for entry in [*result.get("parameters", {}).values(), *result.get("extra", {}).values()]:
+        if isinstance(entry, dict) and entry.get("std", 0.0) is None:
+            entry["std"] = math.inf
+    covariance = result.get("covariance", {})
+    if "matrix" in covariance:
+        covariance["matrix"] = [[math.inf if each is None else each for each in row] for row in covariance["matrix"]]
     return result
 
 
@@ -67,8 +78,7 @@ def model_of(result: dict[str, Any], path: Path) -> ArmModel:
         rest_pose = tuple(float(angle) for angle in result["arm"]["rest_pose"])
         entries = {**result["parameters"], **result.get("extra", {})}
         values = {name: float(entry["value"]) for name, entry in entries.items()}
-        # An error bar that is infinite (nothing was seen of the parameter) has no number in strict JSON.
-        stds = {name: math.inf if entry["std"] is None else float(entry["std"]) for name, entry in entries.items()}
+        stds = {name: float(entry["std"]) for name, entry in entries.items()}
     except (KeyError, TypeError, ValueError) as error:
         what = f"has no {error}" if isinstance(error, KeyError) else str(error)
         raise ResultError(f"{file}: is damaged or from an older hil: it {what}. Run hil estimate again.") from error

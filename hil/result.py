@@ -1,7 +1,7 @@
 """result.json: what an identification found, in one dictionary that a person and a program can read.
 
 schema, method, config, joints
-parameters   the base parameters: value, std, unit
+parameters   the base parameters: value, std (null on file where the recording shows nothing of it), unit
 extra        what the model needed beside them (friction's shape, drive's lag): value, std, unit
 covariance   of parameters and extra together, rows in the order of `names`
 fit          residual of the settled period, in encoder steps, against the encoder's own rounding
@@ -21,8 +21,8 @@ from typing import Any
 
 from estimator.identify import Estimate
 from estimator.period import SettledPeriod
-from fakes.arm import base_parameters
 from hil.config import Config
+from hil.truth import true_parameters
 
 SCHEMA = 1
 QUANTISATION_FLOOR_TICKS = 1 / math.sqrt(12)
@@ -65,8 +65,9 @@ def make_result(
         "timing": timing,
         "arm": _arm(config),
     }
-    if config.is_fake and config.fake is not None:
-        result["truth"] = base_parameters(config.fake.arm)
+    truth = true_parameters(config)
+    if truth is not None:
+        result["truth"] = truth
     return result
 
 

@@ -10,9 +10,6 @@ from drivers.servo_model import Mode
 from hil.config import Config
 from hil.physical import physical_lines
 
-GOOD_RESIDUAL_TICKS = 0.30
-"""A residual up to here is the encoder's own rounding; what is above it the model has not explained."""
-
 
 def print_result(result: dict[str, Any], config: Config, run: Path, console: Console) -> None:
     """The table, the fit and what to do next."""

@@ -20,7 +20,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from hil import __version__
+from hil import __version__, strict_json
 from hil.config import Config, ExperimentConfig, parse_config
 from hil.errors import RunFolderError
 from hil.plan import Plan
@@ -166,7 +166,7 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
     """Write a JSON file whole or not at all."""
     temporary = path.with_suffix(".partial")
     try:
-        temporary.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.write_text(strict_json.dumps(value, indent=2) + "\n", encoding="utf-8")
         temporary.replace(path)
     except OSError as error:
         raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error

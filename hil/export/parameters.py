@@ -1,10 +1,10 @@
 """TOML and JSON of the identified parameters; `hil.load_model` reads both back to the last digit."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
+from hil import strict_json
 from hil.export.source import Source, write_text
 
 _KEPT = ("schema", "method", "config", "joints", "arm", "parameters", "extra", "covariance", "fit", "validation")
@@ -12,7 +12,7 @@ _KEPT = ("schema", "method", "config", "joints", "arm", "parameters", "extra", "
 
 def export_json(source: Source, path: Path) -> list[str]:
     """Write `path`; JSON holds all of it."""
-    write_text(path, json.dumps(_strict(_kept(source)), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(path, strict_json.dumps(_kept(source), indent=2) + "\n")
     return []
 
 
@@ -26,15 +26,6 @@ def export_toml(source: Source, path: Path) -> list[str]:
 
 def _kept(source: Source) -> dict[str, Any]:
     return {key: source.result[key] for key in _KEPT if key in source.result}
-
-
-def _strict(value: Any) -> Any:
-    """Strict JSON has no infinity: an error bar that is infinite becomes null."""
-    if isinstance(value, dict):
-        return {key: _strict(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_strict(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _write_table(lines: list[str], path: tuple[str, ...], table: dict[str, Any]) -> None:

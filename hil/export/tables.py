@@ -2,11 +2,11 @@
 
 import csv
 import io
-import json
 from pathlib import Path
 
 import numpy as np
 
+from hil import strict_json
 from hil.errors import ExportError, RunFolderError
 from hil.export.columns import columns, unit
 from hil.export.source import Source, write_text
@@ -37,7 +37,7 @@ def export_parquet(source: Source, path: Path) -> list[str]:
     fields = [
         pa.field(name, pa.from_numpy_dtype(col.dtype), metadata={"unit": unit(name)}) for name, col in table.items()
     ]
-    schema = pa.schema(fields, metadata={"hil_result": json.dumps(source.result)})
+    schema = pa.schema(fields, metadata={"hil_result": strict_json.dumps(source.result)})
     arrays = [pa.array(np.ascontiguousarray(column)) for column in table.values()]
     try:
         parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), path)
@@ -56,7 +56,7 @@ def export_mat(source: Source, path: Path) -> list[str]:
         "units": {name: unit(name) for name in table},
         "parameters": dict(source.model.values),
         "std": dict(source.model.stds),
-        "result_json": json.dumps(source.result),
+        "result_json": strict_json.dumps(source.result),
     }
     try:
         savemat(path, content, oned_as="column", do_compression=True, long_field_names=True)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from drivers.bus import BusConfig, ServoBus
-from drivers.errors import ServoFault, WrongSetting
+from drivers.errors import PortLost, ServoFault, ServoRefused, WrongSetting
 from drivers.joint import Joint
 from drivers.packet import HardwareError
 from drivers.servo_model import Mode, servo_model
@@ -140,6 +140,63 @@ def test_servos_that_do_not_confirm_writes_are_driven_and_let_go_all_the_same(fa
         bus.prepare()
         with bus.torque(watchdog=0.5):
             assert all(servo.torque_enabled for servo in servos(bus).values())
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
+def test_a_register_that_does_not_take_a_value_is_refused(fake_config: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ServoBus.connect(fake_config()) as bus:
+        servo = bus.servo(bus.joints[0])
+        monkeypatch.setattr(servo, "write_only", lambda *_: None)
+        with pytest.raises(ServoRefused, match=r"Bus Watchdog was written as 5 but reads back as 0"):
+            servo.write("Bus Watchdog", 5)
+
+
+def test_a_watchdog_that_has_tripped_is_cleared_before_the_next_start(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        for joint in bus.joints:
+            bus.servo(joint).write("Torque Enable", 1)
+            bus.servo(joint).write("Bus Watchdog", 5)
+        # As after a program that was killed.
+        bus.port.clock.wait_until(bus.port.clock.now() + 0.2)
+        assert all(servo.watchdog_tripped for servo in servos(bus).values())
+        with bus.torque(watchdog=0.1):
+            bus.exchange([0.1, 0.0])
+            assert all(servo.torque_enabled and not servo.watchdog_tripped for servo in servos(bus).values())
+        assert not any(servo.watchdog_tripped for servo in servos(bus).values())
+
+
+def test_the_first_packet_of_a_stop_takes_torque_off_everywhere(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus, bus.torque(watchdog=0.5):
+        write = bus.port.write
+        written = []
+
+        def only_one(data: bytes) -> None:
+            written.append(data)
+            if len(written) > 1:
+                raise PortLost("pulled")
+            write(data)
+
+        monkeypatch.setattr(bus.port, "write", only_one)
+        report = bus.torque_off()
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+        assert [joint.name for joint, _ in report.unconfirmed] == ["shoulder", "elbow"]
+        assert "SHOULDER" in str(report).upper() and "TORQUE OFF IS NOT CONFIRMED" in str(report)
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize(("watchdog", "ticks"), [(0.02, 1), (2.54, 127)])
+def test_the_shortest_and_the_longest_watchdog(fake_config: Make, watchdog: float, ticks: int) -> None:
+    with ServoBus.open(fake_config()) as bus, bus.torque(watchdog):
+        assert [servo.read(98, 1)[1][0] for servo in servos(bus).values()] == [ticks, ticks]
+
+
+@pytest.mark.parametrize("watchdog", [0.0, 0.009, 2.56])
+def test_a_watchdog_that_no_servo_can_keep_is_refused_before_torque(fake_config: Make, watchdog: float) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        with pytest.raises(ValueError, match=r"0\.02 to 2\.54 s"), bus.torque(watchdog):
+            raise AssertionError("torque came on")
         assert not any(servo.torque_enabled for servo in servos(bus).values())
 
 

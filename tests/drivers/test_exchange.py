@@ -14,7 +14,7 @@ from drivers.packet import HEADER, Framer, Instruction, crc, encode_status
 from drivers.port import Port
 from drivers.servo_model import Mode
 from drivers.state import spans
-from drivers.sync_read import Span
+from drivers.sync_read import FastSyncRead, Span, SyncRead
 
 XM430 = load_control_table("XM430-W350")
 XL430 = load_control_table("XL430-W250")
@@ -139,6 +139,23 @@ def test_every_fast_answer_is_read_back(servos: list[tuple[int, int, int, int]],
     assert exchange(wire, list(ids), fast=True).cycle([0] * len(servos)).servos == servos
 
 
+@pytest.mark.parametrize("fast", [False, True])
+def test_the_usual_answer_is_unpacked_at_once_without_a_search(fast: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def search(*_: object) -> None:
+        raise AssertionError("searched")
+
+    monkeypatch.setattr(SyncRead, "search", search)
+    monkeypatch.setattr(FastSyncRead, "search", search)
+    separate = answer(1, 3, 2, 1) + answer(2, -1, 4, 5, 0x80)
+    wire = Wire([fast_answer((1, 0, state(3, 2, 1)), (2, 0x80, state(-1, 4, 5))) if fast else separate])
+    assert exchange(wire, fast=fast).cycle([0, 0]).servos == [(0, 3, 2, 1), (0x80, -1, 4, 5)]
+
+
+def test_a_fast_answer_from_other_servos_is_not_believed() -> None:
+    wire = Wire([fast_answer((1, 0, state(3, 2, 1)), (3, 0, state(-1, 4, 5)))])
+    assert exchange(wire, fast=True).cycle([0, 0]).servos == [(0, 3, 2, 1), None]
+
+
 def test_a_stuffed_answer_is_understood() -> None:
     # Present Current -1 before a velocity whose low byte is FD: FF FF FD inside the packet.
     wire = Wire([answer(1, -1, 0xFD, 7) + answer(2, 1, 2, 3)])
@@ -225,11 +242,29 @@ def test_after_a_loss_in_a_slow_turn_the_usual_registers_are_asked_for() -> None
     assert [cycle([0, 0]).span for _ in range(4)] == [0, 1, 0, 2]
 
 
+def test_after_a_loss_and_an_answer_the_usual_registers_are_asked_for_again() -> None:
+    with_tick = struct.pack("<Hxxxxhii", 500, 0, 0, 1)
+    good = answer(1, 0, 0, 1) + answer(2, 0, 0, 1)
+    wire = Wire([b"", encode_status(1, 0, with_tick) + encode_status(2, 0, with_tick), good, good])
+    cycle = exchange(wire).cycle
+    assert [cycle([0, 0]).span for _ in range(4)] == [0, 1, 0, 0]
+
+
 @pytest.mark.parametrize(("count", "at_most_s"), [(2, 3e-3), (6, 4.5e-3)])
 def test_a_cycle_without_answers_is_bounded(count: int, at_most_s: float) -> None:
     wire = Wire()
     exchange(wire, range(1, count + 1)).cycle([0] * count)
     assert 0.78e-3 < wire.time < at_most_s
+
+
+def test_servos_and_adapter_are_given_the_time_that_they_may_take() -> None:
+    wire = Wire()
+    wire.latency = 16e-3
+    slow = Exchange(wire, (1, 2), XM430["Goal Current"], spans(Mode.CURRENT, [XM430] * 2), 0.5e-3)
+    slow.cycle([0, 0])
+    on_the_wire = (20 + 16 + 42) * 10 / 1e6  # both requests, both answers
+    needed = on_the_wire + 2 * 0.5e-3 + 16e-3
+    assert needed < wire.time < needed + 1e-3
 
 
 def test_alerts_are_kept() -> None:

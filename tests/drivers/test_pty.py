@@ -2,6 +2,9 @@
 
 import gc
 import os
+import random
+import threading
+import tty
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -130,7 +133,28 @@ def test_a_device_that_takes_no_more_bytes_is_lost_and_does_not_wedge() -> None:
     os.close(master)
 
 
-def test_a_big_write_is_finished_as_the_device_makes_room(served_pty: Serve) -> None:
-    port = open_port(served_pty().name, 1_000_000)
-    port.write(bytes(100_000))
+@pytest.mark.parametrize("way", ["write", "ask"])
+def test_a_big_write_is_finished_as_the_device_makes_room(way: str) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    port = open_port(os.ttyname(slave), 1_000_000)
+    sent = random.Random(1).randbytes(30_000)
+    arrived = bytearray()
+
+    def receive() -> None:
+        while len(arrived) < len(sent):
+            arrived.extend(os.read(master, 4096))
+        os.write(master, b"all of it")
+
+    receiver = threading.Thread(target=receive, daemon=True)
+    receiver.start()
+    if way == "write":
+        port.write(sent)
+        received = port.read(9, 5.0)
+    else:
+        received = port.ask(sent, 9, 5.0, port.clock.now())
+    receiver.join(5.0)
+    assert received == b"all of it" and bytes(arrived) == sent
     port.close()
+    os.close(slave)
+    os.close(master)

@@ -62,6 +62,23 @@ def test_identify_prints_a_table_and_estimate_gives_the_same_numbers_again(
     assert first["schema"] == 1 and first["joints"] == 2
 
 
+def test_a_recording_alone_is_estimated_later(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("record", arm_file(), "--out", "run", "--json") == 0
+    recorded = json.loads(capsys.readouterr().out)
+    assert recorded["samples"] == len(load_samples(Path("run/samples.npy"), 2)) > 1000
+    assert recorded["timing"]["lost_replies"] == 0
+    assert not Path("run/result.json").exists()
+    assert hil("estimate", "run") == 0
+    assert "gravity_1" in capsys.readouterr().out
+
+
+def test_a_pilot_is_not_recorded_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    config = Path(__file__).parents[2] / "configs" / "first_time.toml"
+    assert hil("record", config, "--out", "run") == 2
+    assert "give experiment.peak_torque and set pilot = false" in capsys.readouterr().err
+    assert not Path("run").exists()
+
+
 def test_json_is_the_only_thing_on_standard_output_and_a_seed_gives_one_result(
     arm_file: ArmFile, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ from estimator.arm_model import inverse_dynamics, parameter_names
 from hil import load_model
 from hil.dynamics import ArmModel
 from hil.errors import ResultError
+from hil.model_file import read_result
+from hil.run_folder import RunFolder
 
 
 def motions(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
@@ -119,3 +122,18 @@ def test_it_needs_numpy_only_and_hil_itself_not_even_that(identified: Path) -> N
         "assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_an_infinite_error_bar_is_null_on_file_and_infinite_again_when_read(identified: Path) -> None:
+    result = read_result(identified)
+    result["parameters"]["offset_1"]["std"] = math.inf
+    result["covariance"]["matrix"][0][0] = math.inf
+    RunFolder.open(identified).write_result(result)
+
+    def refuse(constant: str) -> float:
+        raise AssertionError(f"{constant} is not JSON")
+
+    on_file = json.loads((identified / "result.json").read_text(encoding="utf-8"), parse_constant=refuse)
+    assert on_file["parameters"]["offset_1"]["std"] is None
+    assert read_result(identified) == result
+    assert load_model(identified).stds["offset_1"] == math.inf

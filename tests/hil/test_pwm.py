@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 
 from drivers.servo_model import Mode
+from fakes.registers import load_model
 from hil.config import Config, load_config
 from hil.errors import ConfigError
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
 from hil.plan import make_plan
+from hil.run_folder import RunFolder
 
 ArmFile = Callable[..., Path]
 
@@ -79,3 +83,34 @@ def test_all_joints_are_driven_alike(arm_file: ArmFile) -> None:
     path.write_text(mixed, encoding="utf-8")
     with pytest.raises(ConfigError, match="all in current mode or all in pwm mode"):
         load_config(path)
+
+
+def test_an_arm_driven_by_voltage_is_identified(arm_file: ArmFile, tmp_path: Path) -> None:
+    motor = load_model("XL430-W250")
+    path = by_voltage(arm_file)
+    text = path.read_text(encoding="utf-8")
+    for old, new in (
+        ("torque_per_volt = 0.125", f"torque_per_volt = {1.80 / motor.resistance_ohm}"),
+        ("torque_per_volt = 0.125", f"torque_per_volt = {1.80 / motor.resistance_ohm}"),
+        ("rate = 400.0 ", "rate = 200.0 "),
+        ("period = 2.0 ", "period = 6.0 "),
+        ("band = [0.5, 6.0]", "band = [0.17, 6.0]"),
+        # Back-EMF damps so strongly that the arm creeps into its periodic motion.
+        ("[experiment]\n", "[experiment]\nheld_out = false\nmax_settling_periods = 8\n"),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text, encoding="utf-8")
+    config = load_config(path)
+    run = RunFolder.create(tmp_path / "run", config)
+    run_experiment(config, run, path, lambda _: None)
+    result = estimate_run(run)
+    assert max(result["fit"]["residual_rms_ticks"]) <= 0.30
+    found, truth = result["parameters"], result["truth"]
+    by_back_emf = 1.80 * motor.back_emf_v_s / motor.resistance_ohm
+    assert truth["viscous_1"] == pytest.approx(0.045 + by_back_emf)
+    for name, within in (("gravity", 0.002), ("viscous", 0.005), ("coulomb", 0.02)):
+        for joint in (1, 2):
+            assert found[f"{name}_{joint}"]["value"] == pytest.approx(truth[f"{name}_{joint}"], rel=within)
+    for name, entry in found.items():
+        assert abs(entry["value"] - truth[name]) <= 3.5 * entry["std"], name

@@ -1,56 +1,32 @@
-"""The verdict in words: can this model be trusted, why, and what to do if not."""
+"""The verdict in words: can this model be trusted, why, and what to do if not. The judgement is the result's own."""
 
+from drivers.servo_model import Mode
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
-from hil.result_table import GOOD_RESIDUAL_TICKS
 
-GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05
-"""Error of the free prediction, of the motion's RMS, up to which a model is called good, and usable."""
+_TITLES = {
+    "yes": ("good", "This model can be trusted"),
+    "with care": ("fair", "This model can be used with care"),
+    "no": ("poor", "Do not trust this model yet"),
+}
 
 
 def verdict(data: RunData) -> Section:
     """Always there."""
-    tone, title = _judgement(data)
-    words = [_residual(data), _prediction(data), _truth(data), _limits(data), _torque_constants(data), _hardware(data)]
-    return Section(
-        "verdict", title, tone=tone, bullets=tuple(word for word in words if word), words=_advice(data, tone)
-    )
-
-
-def _judgement(data: RunData) -> tuple[str, str]:
-    explained = max(data.result["fit"]["residual_rms_ticks"]) <= GOOD_RESIDUAL_TICKS
-    predicted = data.result["validation"].get("held_out_rms")
-    worst = max(predicted) if predicted else None
-    if worst is None:
-        return ("good", "The model explains this motion; nothing else checked it") if explained else _UNSURE
-    if worst <= GOOD_PREDICTION:
-        return "good", "This model can be trusted" if explained else "This model predicts well"
-    if worst <= USABLE_PREDICTION:
-        return "fair", "Usable, but something moves that the model does not have"
-    return "poor", "Do not trust this model yet"
-
-
-_UNSURE = ("fair", "Something moves that the model does not have, and nothing checked how much it matters")
+    judged = data.result["verdict"]
+    tone, title = _TITLES[judged["trust"]]
+    warnings = [f"Warning: {warning}" for warning in data.result.get("warnings", [])]
+    words = [_residual(data), _truth(data), _limits(data), _torque_constants(data), _by_voltage(data), _hardware(data)]
+    bullets = (*judged["sentences"], *warnings, *(word for word in words if word))
+    return Section("verdict", title, tone=tone, bullets=bullets)
 
 
 def _residual(data: RunData) -> str:
     fit = data.result["fit"]
     left = listed([steps(value) for value in fit["residual_rms_ticks"]])
     floor = fit["quantisation_floor_ticks"]
-    if max(fit["residual_rms_ticks"]) <= GOOD_RESIDUAL_TICKS:
-        return f"It explains the motion down to the encoder's rounding: {left} steps are left, rounding is {floor}."
-    return f"It leaves {left} encoder steps of the motion unexplained; the encoder's rounding is {floor} of them."
-
-
-def _prediction(data: RunData) -> str:
-    errors = data.result["validation"].get("held_out_rms")
-    if not errors:
-        return ""
-    return (
-        f"It predicts another motion, which it never saw, to within {listed([percent(value) for value in errors])} of "
-        f"that motion's RMS ({listed(data.names)})."
-    )
+    return f"{left} encoder steps of the motion are left unexplained; rounding alone leaves {floor}."
 
 
 def _truth(data: RunData) -> str:
@@ -82,13 +58,11 @@ def _torque_constants(data: RunData) -> str:
     return f"All values scale with their joint's torque constant, known to: {listed(unsure)}." if unsure else ""
 
 
+def _by_voltage(data: RunData) -> str:
+    if all(joint.drive_mode is not Mode.PWM for joint in data.config.joints):
+        return ""
+    return "The joints were driven by voltage: viscous friction includes what the motors generate when they turn."
+
+
 def _hardware(data: RunData) -> str:
     return "The servos were a fake bus: nothing here was measured on hardware." if data.config.is_fake else ""
-
-
-def _advice(data: RunData, tone: str) -> tuple[str, ...]:
-    if tone == "good":
-        return ()
-    richer = {"coulomb": "stribeck", "stribeck": "stribeck_load"}.get(data.config.model.friction)
-    friction = f'Try friction = "{richer}" under [model] and hil estimate. ' if richer else ""
-    return (f"{friction}Try a larger experiment.peak_torque; look for play, a dragging cable or a loose screw.",)
