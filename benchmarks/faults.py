@@ -1,6 +1,6 @@
 """The fault campaign: every fault of the fake bus, and some of the program's own, in every phase of the experiment.
 
-    python benchmarks/faults.py [--json] [--seeds N]
+    python benchmarks/faults.py [--json] [--seeds N] [--jobs N]
 
 All in virtual time on the realistic fake arm with position limits 0.15 rad and velocity limits 30 % beyond its
 undisturbed motion. After each run the emulated servos themselves are asked. An injection is
@@ -54,6 +54,7 @@ coulomb = [0.055, 0.050]
 """
 DEADLINE_S = 0.1
 BEFORE, AFTER, BRAKING = "before torque", "torque off", "braking"
+PASSED = "passed, "
 PHASES = (BEFORE, "rest", "ramp in", "settling", "used period", "ramp out", "coming to rest", AFTER, BRAKING)
 OWN = ("wrong_sign", "torque_taken", "stall", "exception", "SIGINT", "SIGTERM", "SIGHUP", "SIGINT twice")
 GRADUAL = {"wrong_sign", "torque_taken", FaultKind.STUCK_JOINT, FaultKind.LOST_REPLY, FaultKind.CORRUPTED_REPLY}
@@ -322,14 +323,17 @@ def _judge(
     beyond = np.maximum(limits[:, 0] - spy.low, np.array(spy.high) - limits[:, 1])
     named = error is None or bool(re.search(NAMED[kind], text)) or (phase == BRAKING and "Ctrl-C" in text)
     unreadable = spy.live_until > 0 and not len(samples)
-    way, predicted = _way(campaign, kind, error, samples, spy, bool((beyond > 0).any()))
+    started = samples if phase == BRAKING or not len(samples) else samples[samples["phase"] != Phase.BRAKING]
+    way, predicted = _way(campaign, kind, error, samples, spy)
+    if way.startswith(PASSED) and (beyond > 0).any():
+        predicted = _from_there(campaign, started)[Way(way.removeprefix(PASSED))]
     return Outcome(kind, phase, unsafe, unreadable, not named, text, way, beyond, predicted)
 
 
 def _way(
-    campaign: Campaign, kind: str, error: BaseException | None, samples: np.ndarray, spy: Spy, beyond: bool
+    campaign: Campaign, kind: str, error: BaseException | None, samples: np.ndarray, spy: Spy
 ) -> tuple[str, np.ndarray]:
-    """How the run was stopped, and how far beyond the limits that may lead (joints,) [rad]."""
+    """How the run was stopped, and how far beyond the limits that may lead at most (joints,) [rad]."""
     if error is None:
         return "ran on", np.zeros(2)
     braked = bool(len(samples)) and bool((samples["phase"] == Phase.BRAKING).any())
@@ -338,13 +342,13 @@ def _way(
         way = tripped if spy.tripped else Way.BRAKED if braked else Way.CUT
         return f"planned, {way}", campaign.stopping.planned[way]
     way = Way.REVERSED if braked and kind == "wrong_sign" else Way.BRAKED if braked else Way.CUT
-    return f"passed, {way}", (_at_these_speeds(campaign, samples) if beyond else campaign.stopping.passed)[way]
+    return f"{PASSED}{way}", campaign.stopping.passed[way]
 
 
-def _at_these_speeds(campaign: Campaign, samples: np.ndarray) -> dict[Way, np.ndarray]:
-    """From a limit at the speeds of the last tenth of a second before the stop, with the other joint where it was."""
-    looked = samples[(samples["phase"] != Phase.BRAKING) & ~samples["missing"].any(axis=1)]
-    latest = looked[looked["deadline"] > looked["deadline"][-1] - 0.1]
+def _from_there(campaign: Campaign, samples: np.ndarray) -> dict[Way, np.ndarray]:
+    """From where the arm was at the last of these samples, at the speeds of the tenth of a second before it."""
+    seen = samples[~samples["missing"].any(axis=1)]
+    latest = seen[seen["deadline"] > seen["deadline"][-1] - 0.1]
     speeds = np.abs(latest["velocity"]).max(axis=0)
     return beyond_when_passed(campaign.config, campaign.plan, campaign.arms, speeds, latest["position"][-1])
 

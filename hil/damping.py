@@ -15,8 +15,8 @@ throws the arm back much farther where the connection is lost while it brakes.
 """
 
 
-GETS_FASTER = 0.1
-"""Share of the velocity limit by which a braked joint may get faster before the brake is given up: gravity and its
+GETS_FASTER = 0.2
+"""Share of the velocity limit by which a joint may get faster than it was before the brake is given up: gravity and its
 neighbour's brake pull at it.
 """
 
@@ -44,7 +44,7 @@ class Brake:
         self._limits = [joint.goal_limit for joint in config.joints]
         self._allowed = [GETS_FASTER * joint.velocity_limit for joint in config.joints]
         self._enough = config.safety.rest_velocity
-        self._slowest: list[float] | None = None
+        self._first: list[float] | None = None
 
     def goals(self, state: State) -> list[float] | None:
         """Goal currents [A] for this sample; None when it is over: at rest, a joint cannot be felt, or it pushes."""
@@ -59,7 +59,7 @@ class Brake:
         ]
 
     def _pushes(self, speeds: list[float]) -> bool:
-        """Whether a joint has become faster than it was before in this braking."""
-        former = speeds if self._slowest is None else self._slowest
-        self._slowest = [min(pair) for pair in zip(former, speeds, strict=True)]
-        return any(now > before + allowed for now, before, allowed in zip(speeds, former, self._allowed, strict=True))
+        """Whether a joint is faster than when the braking began."""
+        if self._first is None:
+            self._first = speeds
+        return any(now > first + more for now, first, more in zip(speeds, self._first, self._allowed, strict=True))

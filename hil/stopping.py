@@ -108,16 +108,16 @@ def beyond_when_passed(
 ) -> dict[Way, Array]:
     """Stopped because a limit was passed at up to `velocity` (joints,) [rad/s], under the plan's largest torque.
 
-    pose: where the other joint was (joints,) [rad]; anywhere unless given.
+    pose: where the arm was then (joints,) [rad]; unless given, one joint is on a limit and the other anywhere.
     """
     stops = _Stops(config)
     peak = np.abs(_planned_goals(config, plan)).max(axis=1)
     faster = velocity + GETS_FASTER * np.array([joint.velocity_limit for joint in config.joints])
     ways = {Way.CUT: stops.cut, Way.BRAKED: stops.braked}
     held = _farthest(stops, ways, ensemble, lambda physics, _: _limit_starts(config, physics, peak, velocity, pose))
-    ways = {Way.REVERSED: stops.reversed}
+    pushed = {Way.REVERSED: stops.reversed}
     return held | _farthest(
-        stops, ways, ensemble, lambda physics, _: _limit_starts(config, physics, peak, faster, pose)
+        stops, pushed, ensemble, lambda physics, _: _limit_starts(config, physics, peak, faster, pose)
     )
 
 
@@ -147,13 +147,13 @@ def _planned_goals(config: Config, plan: Plan) -> Array:
 
 
 def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
-    """Moments of the planned motion: those that lead farthest, and some at even distances."""
+    """Moments of the planned motion, up to a limit: those that lead farthest, and some at even distances."""
     rest = resting(np.array(config.arm.rest_pose))
     moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale))
-    samples = goals.shape[1]
-    chosen = set(np.linspace(1, samples - 1, _EVENLY).astype(int).tolist())
+    until = _within_limits(config, moved)
+    chosen = set(np.linspace(1, until - 1, _EVENLY).astype(int).tolist())
     for ahead in _AHEAD_S:
-        carried = moved.position[:, 1:] + ahead * moved.velocity[:, 1:]
+        carried = moved.position[:, 1:until] + ahead * moved.velocity[:, 1:until]
         chosen |= {1 + int(at) for at in (*carried.argmin(axis=1), *carried.argmax(axis=1))}
     return [
         _Start(
@@ -162,6 +162,15 @@ def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array
         )
         for at in sorted(chosen)
     ]
+
+
+def _within_limits(config: Config, moved: Response) -> int:
+    """Samples, two at least, before the guard stops the motion because it passes a limit."""
+    low, high = (np.array(side)[:, None] for side in zip(*(j.position_limit for j in config.joints), strict=True))
+    fastest = np.array([joint.velocity_limit for joint in config.joints])[:, None]
+    passed = (moved.position < low) | (moved.position > high) | (np.abs(moved.velocity) > fastest)
+    first = np.flatnonzero(passed.any(axis=0))
+    return max(2, int(first[0])) if first.size else passed.shape[1]
 
 
 def _at(moved: Response, sample: int) -> tuple[Array, Array]:
@@ -173,20 +182,16 @@ def _felt(config: Config, scale: Array) -> Feedback:
 
 
 def _limit_starts(config: Config, physics: Physics, peak: Array, velocity: Array, pose: Array | None) -> list[_Start]:
-    """One joint on a limit and outwards at its velocity, driven outwards; the other at any speed, or jammed."""
+    """One joint outwards at its velocity and driven outwards; the other at any speed, or jammed."""
     starts = []
     joints = range(len(config.joints))
-    elsewhere = (
-        [[rest, *joint.position_limit] for rest, joint in zip(config.arm.rest_pose, config.joints, strict=True)]
-        if pose is None
-        else [[angle] for angle in pose.tolist()]
-    )
+    rest = config.arm.rest_pose
     for joint, outward in product(joints, (-1.0, 1.0)):
         limit = config.joints[joint].position_limit[0 if outward < 0 else 1]
-        poses = [[limit] if k == joint else elsewhere[k] for k in joints]
+        corners = product(*([limit] if k == joint else [rest[k], *config.joints[k].position_limit] for k in joints))
         speeds = [[outward] if k == joint else [-1.0, 0.0, 1.0] for k in joints]
         goal = outward * np.where(np.arange(len(joints)) == joint, peak, 0.0)
-        for at in map(np.array, product(*poses)):
+        for at in map(np.array, corners) if pose is None else [pose]:
             starts += [_Start(_moving(at, np.array(each) * velocity), goal) for each in product(*speeds)]
             if len(joints) == 2:
                 handed = _handed_on(physics, at, joint, outward, velocity)
@@ -262,7 +267,7 @@ class _Stops:
             yield from self.cut(start)
 
     def reversed(self, start: _Start) -> Iterator[list[_Piece]]:
-        pushed = np.sign(start.state[1]) * self._clamp
+        pushed = np.clip(self._brake.damping * start.state[1], -self._clamp, self._clamp)
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:

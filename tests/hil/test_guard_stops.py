@@ -235,6 +235,26 @@ def test_a_joint_whose_replies_are_missing_is_not_taken_to_be_at_rest(
     assert_stopped(ports[0])
 
 
+# The servos' own limit
+
+
+def test_the_servos_own_current_limit_is_lowered_for_the_run_and_restored_after_a_stop(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    seen: list[list[int]] = []
+
+    def limits() -> list[int]:
+        return [servo.value("Current Limit") for servo in ports[0].bus.servos.values()]
+
+    def look() -> None:
+        seen.append(limits())
+        fault(ports, FaultKind.ENCODER_JUMP, servo=2, amount=-120)
+
+    run_until_stopped(arm(), tmp_path / "run", once(look), plan)
+    assert seen == [[447, 298]], "1.2 and 0.8 A in ticks of 2.69 mA, rounded up"
+    assert limits() == [1193, 1193]
+
+
 # Watchdogs
 
 

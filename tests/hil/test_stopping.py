@@ -10,15 +10,17 @@ import pytest
 
 from benchmarks.faults import CONFIG, short_config
 from drivers.state import State
+from estimator.closed_loop import Feedback, respond, resting
 from estimator.physics import Physics
 from fakes.arm import base_parameters
 from fakes.two_link import TwoLink
 from hil.config import Config
 from hil.damping import GETS_FASTER, Brake
 from hil.ensemble import Ensemble
-from hil.plan import make_plan
+from hil.plan import Plan, make_plan, scaled
 from hil.stopping import LONGEST_S, Stopping, Way, beyond_when_passed, stopping_distance
 
+NONE = Feedback.none(2)
 SPEEDS = np.array([3.0, 2.0])
 CLOSE = (("[-4.2, 1.06]", "[-2.6, -0.3]"), ("[-3.1, 3.1]", "[-0.4, 0.4]"))
 
@@ -65,35 +67,34 @@ def seen_beyond(config: Config, plant: TwoLink, current: np.ndarray) -> np.ndarr
     return beyond
 
 
-def test_a_cut_arm_goes_as_far_as_predicted_and_no_farther() -> None:
-    config = close_config()
-    peak = np.abs(make_plan(config).segments[0].period_current).max(axis=0)
-    rest = np.array(config.arm.rest_pose)
+@pytest.mark.parametrize("pose", [(-0.3, 0.0), (-1.57, -0.4)], ids=["shoulder", "elbow"])
+def test_a_cut_arm_goes_as_far_as_predicted_and_no_farther(pose: tuple[float, float]) -> None:
+    config, plan = close_config(), make_plan(close_config())
+    peak = np.abs(plan.segments[0].period_current).max(axis=0)
     seen = []
-    for joint, side, other, jams in product((0, 1), (0, 1), (-1.0, 0.0, 1.0), (False, True)):
-        pose, speed, current = rest.copy(), np.full(2, other) * SPEEDS, np.zeros(2)
-        outward = 1.0 if side else -1.0
-        pose[joint], speed[joint] = config.joints[joint].position_limit[side], outward * SPEEDS[joint]
-        current[joint] = outward * peak[joint]
-        plant = plant_of(config, pose, speed)
+    for joint, outward, other, jams in product((0, 1), (-1.0, 1.0), (-1.0, 0.0, 1.0), (False, True)):
+        speed, current = np.full(2, other) * SPEEDS, np.zeros(2)
+        speed[joint], current[joint] = outward * SPEEDS[joint], outward * peak[joint]
+        plant = plant_of(config, np.array(pose), speed)
         plant.jam(1 - joint, jams)
         seen.append(seen_beyond(config, plant, current))
-    most = beyond_when_passed(config, make_plan(config), fake_itself(), SPEEDS, rest)[Way.CUT]
+    most = beyond_when_passed(config, plan, fake_itself(), SPEEDS, np.array(pose))[Way.CUT]
+    assert most.max() > 0.1
     assert (np.max(seen, axis=0) <= 1.02 * most).all()
     assert (np.max(seen, axis=0) >= 0.9 * most).all()
 
 
 def test_an_arm_whose_shoulder_jams_upwards_lets_its_elbow_fall_and_that_is_foreseen() -> None:
     config = close_config()
-    pose = np.array([-0.3, -0.4])
-    plant = plant_of(config, pose, np.zeros(2))
+    raised, slow = np.array([-0.3, -0.4]), np.full(2, 0.05)
+    plant = plant_of(config, raised, np.zeros(2))
     plant.jam(0, True)
     fallen = seen_beyond(config, plant, np.zeros(2))[1]
-    slow = np.full(2, 0.05)
-    foreseen = beyond_when_passed(config, make_plan(config), fake_itself(), slow, np.array([-0.3, 0.0]))[Way.CUT][1]
-    held_below = beyond_when_passed(config, make_plan(config), fake_itself(), slow, np.array([-1.57, 0.0]))[Way.CUT][1]
+    foreseen = beyond_when_passed(config, make_plan(config), fake_itself(), slow, raised)[Way.CUT][1]
+    hanging = np.array([-1.57, -0.4])
+    no_fall = beyond_when_passed(config, make_plan(config), fake_itself(), slow, hanging)[Way.CUT][1]
     assert 0.0 < fallen <= 1.02 * foreseen
-    assert held_below < 0.5 * foreseen
+    assert no_fall < 0.5 * foreseen
 
 
 def test_the_ways_of_stopping_in_their_order() -> None:
@@ -107,10 +108,27 @@ def test_the_ways_of_stopping_in_their_order() -> None:
     assert all((slower[way] < ways.passed[way]).all() for way in slower)
 
 
+def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
+    """The motion beyond it will not be played; the guard stops the arm."""
+    config = close_config()
+    harder = scaled(config, make_plan(config), np.array([2.1, 1.4]))
+    moved = respond(
+        fake_itself().physics[0], resting(np.array(config.arm.rest_pose)), torque(config, harder), 200.0, NONE
+    )
+    beyond = float((moved.position[0] - config.joints[0].position_limit[1]).max())
+    ways = stopping_distance(config, harder, fake_itself(), SPEEDS)
+    assert ways.planned[Way.BRAKED][0] < 0.5 * beyond
+
+
 def test_without_braking_braked_is_cut() -> None:
     ways = predicted(("[model]\n", '[safety]\nstop = "cut"\n\n[model]\n'))
     assert (ways.passed[Way.BRAKED] == ways.passed[Way.CUT]).all()
     assert (ways.planned[Way.BRAKED] == ways.planned[Way.CUT]).all()
+
+
+def torque(config: Config, plan: Plan) -> np.ndarray:
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    return np.ascontiguousarray((plan.segments[0].period_current * constants).T)
 
 
 def moving(*velocity: float) -> State:
@@ -130,7 +148,7 @@ def test_a_brake_that_makes_a_joint_faster_is_given_up(faster: int) -> None:
     allowed = GETS_FASTER * 20.0
     assert brake.goals(moving(5.0, -2.0)) is not None
     assert brake.goals(moving(4.0, -2.0 - 0.9 * allowed)) is not None
-    gone = moving(4.0 + 1.1 * GETS_FASTER * 15.0, -2.0) if faster == 1 else moving(3.0, -2.0 - 1.1 * allowed)
+    gone = moving(5.0 + 1.1 * GETS_FASTER * 15.0, -2.0) if faster == 1 else moving(3.0, -2.0 - 1.1 * allowed)
     assert brake.goals(gone) is None
 
 
