@@ -19,6 +19,7 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
+from estimator.errors import ConvergenceError
 from estimator.model import Model
 from estimator.physics import Physics
 from estimator.recording import Recording
@@ -211,20 +212,25 @@ def estimate_by_shooting(
 ) -> ShootingEstimate:
     """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
 
-    `of` takes some of each recording's segments and leaves the others for a check.
-
     `start`: base parameters (base parameters,) [SI], for instance of `estimator.idim`. The same recordings give
     the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one offset a joint and
     recording, as of servos whose zero is set at every start; with gravity they are seen, without they are not.
-    Raises RecordingError when nothing is long enough, ConvergenceError.
+    `of` takes some of each recording's segments and leaves the others for a check. Raises RecordingError when nothing
+    is long enough, ConvergenceError.
     """
     short, problem = (Shooting(recordings, model, part * length, zeros=zeros, of=of) for part in (SHORT, 1.0))
     coordinates = problem.coordinates(max(float(start[0]), 1e-6))
     # Friction's rise has local minima: several starts, and the best end is kept.
-    ends = []
+    ends: list[Segmented] = []
+    lost: list[ConvergenceError] = []
     for x in _starts(problem, coordinates, model, start):
-        near = _fit(short, coordinates, x, short.start(), COARSE)
-        ends.append(_fit(problem, coordinates, near.shared, problem.start(), FINE))
+        try:
+            near = _fit(short, coordinates, x, short.start(), COARSE)
+            ends.append(_fit(problem, coordinates, near.shared, problem.start(), FINE))
+        except ConvergenceError as error:
+            lost.append(error)
+    if not ends:
+        raise lost[0]
     found = min(ends, key=lambda end: end.cost)
     for _ in range(REWEIGHTED):
         problem.weigh_down(problem.errors(coordinates, found))
