@@ -1,7 +1,8 @@
 """Which friction model, for recordings that hold no settled period: judged by segments that were not fitted.
 
 Every other segment of each recording is fitted and the others are predicted, each from the state that its first samples
-show. The model that predicts them best is fitted once more to all.
+show. The model that predicts them best is fitted once more to all. (The short segments that only find a start are not
+kept apart so; what is judged has seen none but its own half.)
 """
 
 import time

@@ -11,7 +11,7 @@ is off by more than usual, because a joint stuck in it, say, as no smooth fricti
 errors of segments differ in size, and who counts them alike lets the worst understood of them decide.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
+from estimator.errors import ConvergenceError
 from estimator.model import Model
 from estimator.physics import Physics
 from estimator.recording import Recording
@@ -29,7 +30,8 @@ from estimator.simulation import simulate
 
 WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a second of motion
 STARTING_WIDTH = 0.05  # rad/s
-START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "delay": 0.0, "lag": 1e-3}
+RISES_FADE = (0.2, 2.0)  # rad/s
+START = {"stribeck_rise": 0.2, "load": 0.02, "delay": 0.0, "lag": 1e-3}
 SHORT = 0.25  # of the segments' length, to begin with
 COARSE = 1e-3
 FINE = 3e-5
@@ -210,21 +212,26 @@ def estimate_by_shooting(
 ) -> ShootingEstimate:
     """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
 
-    `of` takes some of each recording's segments and leaves the others for a check.
-
     `start`: base parameters (base parameters,) [SI], for instance of `estimator.idim`. The same recordings give
     the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one offset a joint and
     recording, as of servos whose zero is set at every start; with gravity they are seen, without they are not.
-    Raises RecordingError when nothing is long enough, ConvergenceError.
+    `of` takes some of each recording's segments and leaves the others for a check. Raises RecordingError when nothing
+    is long enough, ConvergenceError.
     """
-    shared = None
-    for part, enough in ((SHORT, COARSE), (1.0, FINE)):
-        problem = Shooting(recordings, model, part * length, zeros=zeros, of=of)
-        coordinates = problem.coordinates(max(float(start[0]), 1e-6))
-        if shared is None:
-            shared = np.concatenate((coordinates.coordinates(_start(model, start)), np.zeros(problem.zeros)))
-        found = _fit(problem, coordinates, shared, problem.start(), enough)
-        shared = found.shared
+    short, problem = (Shooting(recordings, model, part * length, zeros=zeros, of=of) for part in (SHORT, 1.0))
+    coordinates = problem.coordinates(max(float(start[0]), 1e-6))
+    # Friction's rise has local minima: several starts, and the best end is kept.
+    ends: list[Segmented] = []
+    lost: list[ConvergenceError] = []
+    for x in _starts(problem, coordinates, model, start):
+        try:
+            near = _fit(short, coordinates, x, short.start(), COARSE)
+            ends.append(_fit(problem, coordinates, near.shared, problem.start(), FINE))
+        except ConvergenceError as error:
+            lost.append(error)
+    if not ends:
+        raise lost[0]
+    found = min(ends, key=lambda end: end.cost)
     for _ in range(REWEIGHTED):
         problem.weigh_down(problem.errors(coordinates, found))
         found = _fit(problem, coordinates, found.shared, found.own, FINE)
@@ -265,7 +272,12 @@ def _samples(segment: Segment) -> Array:
     return np.asarray(np.isfinite(segment.position).sum(axis=1), dtype=np.float64)
 
 
-def _start(model: Model, base: Array) -> Array:
+def _starts(problem: Shooting, coordinates: Coordinates, model: Model, base: Array) -> Iterator[Array]:
+    """Shared coordinates to start from: `base`, and what it does not say of friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), STARTING_WIDTH)
-    return np.array([known.get(name, START.get(name.rstrip("_12"), 0.0)) for name in model.names])
+    rising = "stribeck_velocity_1" in model.names
+    for velocity in RISES_FADE if rising else RISES_FADE[:1]:
+        unknown = START | {"stribeck_velocity": velocity}
+        value = np.array([known.get(name, unknown.get(name.rstrip("_12"), 0.0)) for name in model.names])
+        yield np.concatenate((coordinates.coordinates(value), np.zeros(problem.zeros)))

@@ -35,19 +35,19 @@ def describe_validation(validation: Validation, held_out: NDArray[np.float64] | 
         },
         "line_levels_ticks": {
             "noise": levels.lines.noise.tolist(),
-            "excited": _group(levels.lines.excited),
-            "odd": _group(levels.lines.odd),
-            "even": _group(levels.lines.even),
-            "other": _group(levels.lines.other),
+            **_group("excited", levels.lines.excited),
+            **_group("odd", levels.lines.odd),
+            **_group("even", levels.lines.even),
+            **_group("other", levels.lines.other),
         },
     }
 
 
-def _group(group: LineGroup | None) -> dict[str, Any] | None:
-    """How many lines, the motion on one of them and what the fit leaves of it; None where there are none."""
+def _group(name: str, group: LineGroup | None) -> dict[str, Any]:
+    """How many lines, the motion on one of them and what the fit leaves of it; nothing where there are none."""
     if group is None:
-        return None
-    return {"lines": group.lines, "motion": group.motion.tolist(), "left": group.left.tolist()}
+        return {}
+    return {name: {"lines": group.lines, "motion": group.motion.tolist(), "left": group.left.tolist()}}
 
 
 def describe_verdict(verdict: Verdict) -> dict[str, Any]:

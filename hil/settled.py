@@ -26,8 +26,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     periods = rows[: whole * count].reshape(whole, count)
     position = np.moveaxis(periods["position"], 2, 1)
     position = np.where(np.isfinite(position), position, np.nan)
-    for joint, received in zip(config.joints, np.isfinite(position).any(axis=(0, 2)), strict=True):
-        if whole and not received:
+    for index, joint in enumerate(config.joints):
+        if whole and not np.isfinite(position[:, index]).any():
             raise RecordingCutShort(f"{joint.name} never said where it is during {role!r}: look at its cable and ID.")
     first = _first_settled(position, experiment.settle_within)
     if first is None or whole - first < experiment.periods:

@@ -43,7 +43,7 @@ def _levels(data: RunData) -> tuple[Table, ...]:
     rows = [
         (f"{said}, {name}", str(group["lines"]), steps(group["motion"][joint]), steps(group["left"][joint]))
         for key, said in _KINDS.items()
-        if (group := levels[key])
+        if (group := levels.get(key))
         for joint, name in enumerate(data.names)
     ]
     rows += [(f"noise, {name}", "", steps(levels["noise"][joint]), "") for joint, name in enumerate(data.names)]

@@ -1,0 +1,65 @@
+"""What play in the gears costs an estimator that has none: the realistic fake arm with more and more of it.
+
+    python benchmarks/backlash.py [--json] [--play 0 0.0005 0.0015 0.004]
+
+Play [rad] is from flank to flank, on both joints, between a rotor of its own and the output shaft with the encoder.
+"""
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hil.config import load_config
+from hil.estimate import estimate_run
+from hil.experiment import run_experiment
+from hil.run_folder import RunFolder
+
+CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
+GROUPS = {"inertia": ("inertia", "coupling", "armature"), "gravity": ("gravity",), "friction": ("viscous", "coulomb")}
+
+
+def measure(play: float) -> dict[str, float]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "arm.toml"
+        drives = "[[fake.arm.drives]]\n"
+        text = CONFIG.read_text(encoding="utf-8")
+        path.write_text(text.replace(drives, f"{drives}backlash = {play}\n") if play else text, encoding="utf-8")
+        config = load_config(path)
+        run = RunFolder.create(Path(folder) / "run", config)
+        run_experiment(config, run, config.path, lambda _: None)
+        result = estimate_run(run)
+    return figures(result)
+
+
+def figures(result: dict[str, Any]) -> dict[str, float]:
+    found, truth = result["parameters"], result["truth"]
+    errors = {name: abs(found[name]["value"] / true - 1.0) for name, true in truth.items() if true}
+    worst = {
+        f"{group}_error": max(error for name, error in errors.items() if name.split("_")[0] in kinds)
+        for group, kinds in GROUPS.items()
+    }
+    over = {"residual_over_floor": max(result["validation"]["residual_over_floor"])}
+    return {**worst, **over, "held_out_rms": max(result["validation"]["held_out_rms"])}
+
+
+def main() -> None:
+    from machine import machine
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--play", type=float, nargs="+", default=[0.0, 0.0005, 0.0015, 0.004])
+    options = parser.parse_args()
+    found = {f"{play:g}": measure(play) for play in options.play}
+    if options.json:
+        print(json.dumps(found))
+        return
+    print(machine())
+    for play, entry in found.items():
+        shown = ", ".join(f"{name} {100 * value:.2f} %" for name, value in entry.items() if "floor" not in name)
+        print(f"play {play:>6s} rad: {shown}, residual {entry['residual_over_floor']:.1f} times the noise")
+
+
+if __name__ == "__main__":
+    main()
