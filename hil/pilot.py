@@ -106,7 +106,7 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
         _play(between, folder, shown_path, watch, say, f"Step {len(steps) + 1}", full, steps)
         try:
             latest = _estimate(config, folder, full.plan, steps[-1], [_values(result)])
-            full = _next_amplitude(config, latest, full.plan, steps[-1])
+            full = next_amplitude(config, latest, full.plan, steps[-1])
         except (EstimationError, NoSafeTorque) as error:
             say(f"This step's estimate is not used, and the full run goes no farther than it did: {error}")
             break
@@ -135,7 +135,7 @@ def _pilot(
             samples = load_samples(folder.samples_path, len(config.joints))
             starts = likely_arms(played, ensemble, found.plan, samples, _STARTS)
             result = _estimate(played, folder, found.plan, steps[-1], starts)
-            return result, _next_amplitude(config, result, found.plan, steps[-1])
+            return result, next_amplitude(config, result, found.plan, steps[-1])
         except (EstimationError, NoSafeTorque) as error:
             reason = error
             say(f"The pilot did not move the arm enough: {error}")
@@ -174,7 +174,7 @@ def _estimate(
     return result
 
 
-def _next_amplitude(config: Config, result: dict[str, Any], played: Plan, step: Step) -> Amplitude:
+def next_amplitude(config: Config, result: dict[str, Any], played: Plan, step: Step) -> Amplitude:
     """As far as what `result` of `step`, in which `played` was, leaves open allows. Raises NoSafeTorque."""
     arm = nominal(result)
     astray = _astray(config, arm, played, step)
