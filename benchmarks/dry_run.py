@@ -236,7 +236,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=200)
-    parser.add_argument("--pilots", type=int, default=1)
+    parser.add_argument("--pilots", type=int, default=6)
     options = parser.parse_args()
     measured = {**prior_study(options.arms), **pilot_study(options.pilots), **design_study()}
     if options.json:

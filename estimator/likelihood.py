@@ -16,6 +16,7 @@ import numpy as np
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
 from estimator.covariance import Scatter, correlation_time, robust_covariance, structured_share
+from estimator.errors import ConvergenceError
 from estimator.least_squares import LinearEstimate
 from estimator.levenberg_marquardt import Minimum, Quadratic, minimise
 from estimator.model import Model
@@ -172,14 +173,21 @@ def fit_runs(
     ripple = find_ripple(periods, linear) if model.ripple else {}
     enough = HASTY if hasty else COARSE
     tries: list[Minimum] = []
+    lost = ConvergenceError("no start was given")
     own = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
     for start in (*given, *own):
         x = np.concatenate((problem.coordinates.coordinates(start), states))
-        tries.append(_approach(problem, x, samples, enough))
+        try:
+            tries.append(_approach(problem, x, samples, enough))
+        except ConvergenceError as error:
+            lost = error
+            continue
         if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
             break
+    if not tries:
+        raise lost
     # What explains the motion may still have its friction's step in the wrong place, by a little of the sum.
     best = min(tries, key=lambda found: found.at.cost)
     wide = _with_width(problem, best.x, STARTING_WIDTHS[-1])

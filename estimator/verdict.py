@@ -42,7 +42,7 @@ class Verdict:
 def judge(estimate: Estimate, validation: Validation, held_out: Array | None) -> Verdict:
     """`held_out`: RMS error of the free prediction of a motion not fitted, over that motion's RMS (joints,)."""
     sentences = (
-        _explained(validation),
+        _explained(estimate, validation),
         *_distorted(validation),
         *_predicted(held_out),
         *_weak(validation),
@@ -65,16 +65,18 @@ def _trust(validation: Validation, held_out: Array | None) -> Trust:
     return "yes" if worst <= GOOD_PREDICTION and left <= MUCH_LEFT and not weak else "with care"
 
 
-def _explained(validation: Validation) -> str:
+def _explained(estimate: Estimate, validation: Validation) -> str:
     left = float(validation.residual_over_floor.max())
     if left <= EXPLAINED:
         return "The model explains the motion down to the encoder's rounding and the scatter between periods."
     joint = int(np.argmax(validation.residual_over_floor)) + 1
     error = float(validation.levels.model_error.max())
+    model = estimate.model
+    ratio = "set torque_scale = true there, " if model.joints == 2 and not model.torque_scale else ""
     return (
         f"Joint {joint} moves in a way that the model does not have: {left:.1f} times the noise is left, a model error "
-        f'of {error:.2g} encoder steps RMS. Let [model] friction = "auto" choose, and look for play, a dragging cable '
-        "or a loose screw."
+        f'of {error:.2g} encoder steps RMS. Let [model] friction = "auto" choose, {ratio}and look for play, a '
+        "dragging cable or a loose screw."
     )
 
 

@@ -76,8 +76,8 @@ class Prediction:
         One common number of deviations above the medians, so that it moves smoothly with the amplitude.
         """
         shares = self.share_at(self._simultaneous())
-        toward = self.limits - self._origin
-        return np.asarray(self._origin + shares * toward)
+        toward = self.limits - self.origin
+        return np.asarray(self.origin + shares * toward)
 
     @property
     def stop_chance(self) -> float:
@@ -97,7 +97,8 @@ class Prediction:
         return np.asarray(middle + deviations * spread)
 
     @property
-    def _origin(self) -> Array:
+    def origin(self) -> Array:
+        """From where the way to a limit counts (quantities, joints)."""
         origin = np.zeros_like(self.limits)
         origin[0] = origin[1] = self.rest
         return origin

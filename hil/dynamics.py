@@ -112,11 +112,15 @@ class ArmModel:
     def goal(self, torque: ArrayLike) -> Array:
         """Goals (..., joints) [A, or V in pwm mode] for motor torques (..., joints) [N m]; no limit is applied."""
         (torque,) = self._motion(torque=torque)
-        return np.asarray(torque / np.array([joint.torque_per_goal for joint in self.joints]))
+        return np.asarray(torque / [self.torque_per_goal(number) for number in range(1, len(self.joints) + 1)])
 
     def torque_scale(self, joint: int) -> float:
-        """Of `joint`, from 1: torque in units of the first joint's torque constant, over supposed torque."""
+        """Of `joint`, from 1: true over supposed torque, as far as the first joint's is right."""
         return self.values.get(f"torque_scale_{joint}", 1.0)
+
+    def torque_per_goal(self, joint: int) -> float:
+        """Of `joint`, from 1: what was supposed, times torque_scale [N m/A, or N m/V in pwm mode]."""
+        return self.joints[joint - 1].torque_per_goal * self.torque_scale(joint)
 
     def _motion(self, **arrays: ArrayLike) -> list[Array]:
         """The arguments as arrays of one shape; raises ValueError."""
@@ -172,7 +176,7 @@ class ArmModel:
         """Motor torque over what the current stands for, at the angles q."""
         cycles = self.values.get(f"ripple_cycles_{joint}", 0.0) * q
         sine, cosine = (self.values.get(f"ripple_{part}_{joint}", 0.0) for part in ("sin", "cos"))
-        return np.asarray(self.torque_scale(joint) * (1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles)))
+        return np.asarray(1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles))
 
     def _step(self, joint: int, v: Array) -> Array:
         width = self.values.get(f"coulomb_width_{joint}", 0.0)

@@ -13,15 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.errors import EstimationError
+from estimator.physics import Physics
 from hil.amplitude import Amplitude, largest_amplitude
 from hil.config import Config
 from hil.design import designed_plan, roomy_plan
-from hil.dry_run import GUARDED, QUANTITIES, UNITS, peaks_of
-from hil.ensemble import nominal, prior_ensemble, result_ensemble
+from hil.dry_run import GUARDED, QUANTITIES, UNITS, peaks_of, predict
+from hil.ensemble import Ensemble, nominal, prior_ensemble, result_ensemble
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimate import estimate_run
 from hil.experiment import run_experiment
 from hil.likely_arms import likely_arms
+from hil.plan import Plan
 from hil.recording import load_samples
 from hil.run_folder import RunFolder
 from hil.stream import Watch
@@ -37,7 +39,11 @@ MOST_STEPS = 4
 CERTAIN = 0.8
 """A typical arm should come this far on its way to a limit; where it stays below, uncertainty costs too much range."""
 
+REPLAYED = 0.05
+"""Of the way to a limit: how far an identified arm's peaks may be from those of its own run and still be built upon."""
+
 _PILOT_PERIOD_SHARE = 0.5
+_SHAPE = ("coulomb_width", "stribeck", "load")
 _STARTS = 3
 """Arms of the prior from which the pilot's estimate starts, beside the regression's."""
 
@@ -97,15 +103,18 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
         say("What is known so far is too uncertain to go to the limits at once: one more run on the way.")
         between = _without_held_out(config)
         folder = run.below(f"step-{len(steps) + 1}", between)
-        folder.write_starts([_values(result)])
         _play(between, folder, shown_path, watch, say, f"Step {len(steps) + 1}", full, steps)
-        result = estimate_run(folder)
-        full = _next_amplitude(config, result, steps[-1])
+        try:
+            latest = _estimate(config, folder, full.plan, steps[-1], [_values(result)])
+            full = next_amplitude(config, latest, full.plan, steps[-1])
+        except (EstimationError, NoSafeTorque) as error:
+            say(f"This step's estimate is not used, and the full run goes no farther than it did: {error}")
+            break
+        result = latest
     played = _with_torque(config, full.peak_torque)
     run.write_played(played)
-    run.write_starts([_values(result)])
     torque = _play(played, run, shown_path, watch, say, "Full run", full, steps)
-    result = estimate_run(run)
+    result = _estimate(played, run, full.plan, steps[-1], [_values(result)])
     result["steps"] = [step.as_json() for step in steps]
     run.write_result(result)
     return torque, result
@@ -124,9 +133,9 @@ def _pilot(
         try:
             _play(played, folder, shown_path, watch, say, "Pilot", found, steps)
             samples = load_samples(folder.samples_path, len(config.joints))
-            folder.write_starts(likely_arms(played, ensemble, found.plan, samples, _STARTS))
-            result = estimate_run(folder)
-            return result, _next_amplitude(config, result, steps[-1])
+            starts = likely_arms(played, ensemble, found.plan, samples, _STARTS)
+            result = _estimate(played, folder, found.plan, steps[-1], starts)
+            return result, next_amplitude(config, result, found.plan, steps[-1])
         except (EstimationError, NoSafeTorque) as error:
             reason = error
             say(f"The pilot did not move the arm enough: {error}")
@@ -148,13 +157,45 @@ def pilot_config(config: Config) -> Config:
     return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
 
 
-def _next_amplitude(config: Config, result: dict[str, Any], step: Step) -> Amplitude:
-    """As far as what `result` of `step` leaves open allows."""
-    ensemble = result_ensemble(result, RESULT_ARMS, _farther(config, step))
+def _estimate(
+    config: Config, folder: RunFolder, played: Plan, step: Step, starts: list[dict[str, float]]
+) -> dict[str, Any]:
+    """Estimate the run in `folder`, started from `starts` too; once more where the arm found does not move as it did.
+
+    A fit may end with friction so odd that it leaves the settled motion alone and holds the arm at rest. The second
+    time it starts from what was found, with the friction of `starts`.
+    """
+    folder.write_starts(starts)
+    result = estimate_run(folder)
+    if _astray(config, nominal(result), played, step) > REPLAYED:
+        shape = {name: value for name, value in starts[0].items() if name.startswith(_SHAPE)}
+        folder.write_starts([{**_values(result), **shape}])
+        result = estimate_run(folder)
+    return result
+
+
+def next_amplitude(config: Config, result: dict[str, Any], played: Plan, step: Step) -> Amplitude:
+    """As far as what `result` of `step`, in which `played` was, leaves open allows. Raises NoSafeTorque."""
     arm = nominal(result)
+    astray = _astray(config, arm, played, step)
+    if astray > REPLAYED:
+        raise NoSafeTorque(
+            f"The identified arm does not replay the motion that it was identified from: a peak is off by "
+            f"{100 * astray:.0f} % of the way to its limit."
+        )
+    ensemble = result_ensemble(result, RESULT_ARMS, _farther(config, step))
     optimal = config.experiment.design == "optimal"
     plan = designed_plan(config, arm, list(result["parameters"])) if optimal else roomy_plan(config, arm)
     return largest_amplitude(config, ensemble, plan=plan)
+
+
+def _astray(config: Config, arm: Physics, played: Plan, step: Step) -> float:
+    """How far the worst peak of `arm`, simulated from rest, is from that seen, as a share of the way to its limit."""
+    alone = Ensemble((arm,), np.ones((1, len(config.joints))), "result")
+    prediction = predict(config, played, alone)
+    way = prediction.limits - prediction.origin
+    off = np.abs((prediction.values[0] - step.seen) / way)[:GUARDED]
+    return float(np.nan_to_num(off, nan=np.inf).max())
 
 
 def _farther(config: Config, step: Step) -> float:

@@ -48,5 +48,6 @@ def left_out(model: ArmModel, terms: tuple[str, ...]) -> list[str]:
 def torque_constants(model: ArmModel) -> list[str]:
     """One sentence per joint about its torque constant."""
     return [
-        f"torque per goal of {joint.name} = {joint.torque_per_goal:.6g} N m/{joint.goal_unit}" for joint in model.joints
+        f"torque per goal of {joint.name} = {model.torque_per_goal(number):.6g} N m/{joint.goal_unit}"
+        for number, joint in enumerate(model.joints, start=1)
     ]

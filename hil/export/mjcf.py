@@ -68,7 +68,7 @@ def _add_actuators(root: ET.Element, model: ArmModel) -> None:
             drive,
             name=facts.name,
             joint=facts.name,
-            gainprm=numbers(facts.torque_per_goal * model.torque_scale(number)),
+            gainprm=numbers(model.torque_per_goal(number)),
             biastype="affine",
             biasprm=numbers(-model.values[f"offset_{number}"], 0, 0),
             ctrlrange=numbers(-facts.goal_limit, facts.goal_limit),

@@ -59,7 +59,7 @@ def _add_joint(root: ET.Element, model: ArmModel, index: int, along: float) -> N
         lower=numbers(low),
         upper=numbers(high),
         velocity=numbers(facts.velocity_limit),
-        effort=numbers(facts.goal_limit * facts.torque_per_goal * model.torque_scale(number)),
+        effort=numbers(facts.goal_limit * model.torque_per_goal(number)),
     )
     friction = {"damping": f"viscous_{number}", "friction": f"coulomb_{number}"}
     ET.SubElement(element, "dynamics", {key: numbers(model.values[name]) for key, name in friction.items()})

@@ -57,12 +57,20 @@ def test_every_ready_file_is_right(path: Path) -> None:
             r"safety\.watchdog.*steps of 0\.02 s, so a multiple",
         ),
         ("url =", "url ", r"not valid TOML"),
+        ("[model]", "[model]\ntorque_scale = 1", r"model\.torque_scale = 1: must be true or false"),
     ],
 )
 def test_a_fault_names_key_value_and_what_is_allowed(old: str, new: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said) as caught:
         parse_config(change(old, new), Path("arm.toml"))
     assert str(caught.value).startswith("arm.toml: ")
+
+
+def test_one_joint_has_no_ratio_of_torque_constants() -> None:
+    path = CONFIGS / "fake_pendulum.toml"
+    text = path.read_text(encoding="utf-8").replace("[model]\n", "[model]\ntorque_scale = true\n")
+    with pytest.raises(ConfigError, match=r"model\.torque_scale compares two joints' torque constants"):
+        parse_config(text, path)
 
 
 def test_all_faults_are_told_at_once() -> None:

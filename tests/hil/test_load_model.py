@@ -47,6 +47,15 @@ def test_forward_is_the_inverse_of_inverse(identified: Path) -> None:
     np.testing.assert_allclose(model.forward_dynamics(q, dq, torque), ddq, atol=1e-9)
 
 
+def test_a_torque_constant_found_wrong_changes_goals_and_no_torque(identified: Path) -> None:
+    model = load_model(identified)
+    weaker = dataclasses.replace(model, values={**model.values, "torque_scale_2": 0.8})
+    q, dq, ddq = motions((50, 2))
+    torque = model.inverse_dynamics(q, dq, ddq)
+    np.testing.assert_array_equal(weaker.inverse_dynamics(q, dq, ddq), torque)
+    np.testing.assert_allclose(weaker.goal(torque), model.goal(torque) / [1.0, 0.8])
+
+
 def test_any_shape_and_its_parts_add_up(identified: Path) -> None:
     model = load_model(identified)
     q, dq, ddq = motions((4, 5, 2))

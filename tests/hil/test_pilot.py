@@ -1,18 +1,26 @@
 """Pilot, then full, from joint limits and link lengths only; and arms that need a stabiliser."""
 
 import json
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from benchmarks.dry_run import worst_relative_std
 from hil.config import load_config
+from hil.errors import NoSafeTorque
 from hil.estimate import estimate_run
 from hil.experiment import run_experiment
-from hil.pilot import identify_in_steps
+from hil.pilot import Step, identify_in_steps, next_amplitude
+from hil.plan import make_plan
+from hil.report.page import make_page
+from hil.report.run_data import RunData
+from hil.result_table import print_result
 from hil.run_folder import RunFolder
+from hil.stabiliser import StabiliserShare
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -60,6 +68,20 @@ def test_the_run_folder_estimates_again_with_the_torque_that_was_found(in_steps:
     assert estimate_run(folder)["parameters"] == result["parameters"]
 
 
+def test_an_arm_that_does_not_replay_its_own_run_is_not_built_upon(in_steps: Any) -> None:
+    result, path, _ = in_steps
+    folder = RunFolder.open(path / "pilot-1")
+    config = folder.load_config()
+    pilot = json.loads(folder.result_path.read_text(encoding="utf-8"))
+    told = result["steps"][0]
+    figures = (np.array(told[key]) for key in ("peak_torque", "predicted_median", "predicted_quantile_99", "seen"))
+    step, plan = Step("Pilot", *figures), make_plan(config)
+    assert next_amplitude(config, pilot, plan, step).peak_torque.min() > 0.0
+    pilot["extra"]["stribeck_rise_1"]["value"] = 8e3  # holds the joint at rest for ever
+    with pytest.raises(NoSafeTorque, match="does not replay the motion"):
+        next_amplitude(config, pilot, plan, step)
+
+
 def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None:
     config = load_config(CONFIGS / "fake_inverted.toml")
     run = RunFolder.create(tmp_path / "run", config)
@@ -68,4 +90,12 @@ def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None
     for name in ("inertia_1", "inertia_2", "armature_2", "gravity_1", "gravity_2", "viscous_1", "coulomb_1"):
         assert abs(result["parameters"][name]["value"] / result["truth"][name] - 1) <= 0.02, name
     assert max(result["validation"]["held_out_rms"]) <= 0.01
-    assert all(rms > 0.0 for rms in result["stabiliser"]["rms_torque"])
+    share = StabiliserShare.from_json(result["stabiliser"])
+    assert (share.rms > 0.0).all() and (share.peak > share.rms).all()
+    console = Console(record=True, width=200, file=StringIO())
+    print_result(result, config, run.path, console)
+    shoulder = f"shoulder {share.rms[0]:.3f} of {share.commanded_rms[0]:.3f} N m RMS"
+    page = make_page(RunData.load(run.path))
+    for said in (console.export_text(), page):
+        assert "Of the torque, the stabiliser gave" in said and shoulder in said
+    assert "that was really commanded" in page

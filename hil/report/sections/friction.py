@@ -37,7 +37,8 @@ def _left_to_friction(model: ArmModel, period: PlayedPeriod) -> tuple[Array, Arr
     rigid = model.rigid_body_torque(motion.position.T, motion.velocity.T, motion.acceleration.T).T
     offset = np.array([[model.values[f"offset_{joint + 1}"]] for joint in range(len(filled))])
     # The command is held: at the middle between two commands the mean of both is in force.
-    held = 0.5 * (period.torque + np.roll(period.torque, 1, axis=1))
+    scale = np.array([[model.torque_scale(joint + 1)] for joint in range(len(filled))])
+    held = 0.5 * scale * (period.torque + np.roll(period.torque, 1, axis=1))
     chosen = slice(None, None, max(1, samples // _DOTS))
     return motion.velocity[:, chosen], (held - rigid - offset)[:, chosen]
 
