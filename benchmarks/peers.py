@@ -5,7 +5,10 @@
 `seconds`, `worst_relative_error` and `held_out_rms`, each by method. The worst relative error is over inertias,
 gravity, viscous and Coulomb friction. How each peer was tuned stands in estimator/peers.py and hil/mujoco_peer.py;
 mujoco.sysid takes part where it is installed (extra `peers`), started within 50 % of the truth. This project's own
-estimate is timed in the same process, after one run to compile and before the peers.
+estimate is timed in the same process, after one run to compile and before the peers; building mujoco.sysid's model and
+residual is not counted either. `hil` has the Stribeck friction and current lag of the demo's configuration,
+mujoco.sysid the Coulomb friction and no lag that it can have, `hil_coulomb` the same; mujoco.sysid spreads its rollouts
+over all cores, this project's estimate uses one, so that a busy machine says little about their ratio.
 """
 
 import argparse

@@ -16,7 +16,7 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.physics import Physics
-from estimator.simulation import GAMMA, _forces, _pieces, steps_per_sample
+from estimator.simulation import finer_pieces, pieces_now, step_on, steps_per_sample
 
 SETTLING_PERIODS = 4
 
@@ -110,7 +110,9 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     full[:, :joints] = state
     position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
     lag = physics.lag + max(physics.delay, 0.0)
-    _respond(physics.vector, full, both, gains, lag, step, steps, _pieces(physics, step), position, velocity, torque)
+    _respond(
+        physics.vector, full, both, gains, lag, step, steps, finer_pieces(physics, step), position, velocity, torque
+    )
     return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
 
 
@@ -132,7 +134,7 @@ def _loop(
     t1, t2 = state[2, 0], state[2, 1]
     s1, s2, w1, w2 = state[3, 0], state[3, 1], state[4, 0], state[4, 1]
     a1 = a2 = 0.0
-    m22 = p[2] + p[3]
+    piece = step / pieces
     fallen = 1.0 - math.exp(-step / lag) if lag > 0.0 else 1.0
     share = fallen * lag / step if lag > 0.0 else 0.0
     for k in range(command.shape[1]):
@@ -153,34 +155,14 @@ def _loop(
             m2 = c2 + (t2 - c2) * share
             t1 += (c1 - t1) * fallen
             t2 += (c2 - t2) * fallen
-            near_1 = p[8] > 0.0 and abs(v1) < 6.0 * p[12] + 2.0 * step * abs(a1)
-            near_2 = p[9] > 0.0 and abs(v2) < 6.0 * p[13] + 2.0 * step * abs(a2)
-            cuts = pieces if near_1 or near_2 else 1
-            h = step / cuts
-            for _ in range(cuts):
-                m11, m12, f1, f2, slope_1, slope_2 = _forces(p, q1, q2, v1, v2, m1, m2)
-                w11 = m11 + GAMMA * h * slope_1
-                w22 = m22 + GAMMA * h * slope_2
-                w = w11 * w22 - m12 * m12
-                k1 = (w22 * f1 - m12 * f2) / w
-                k2 = (w11 * f2 - m12 * f1) / w
-                u1 = v1 + h * k1
-                u2 = v2 + h * k2
-                n11, n12, f1, f2, _, _ = _forces(p, q1 + h * v1, q2 + h * v2, u1, u2, m1, m2)
-                n = n11 * m22 - n12 * n12
-                r1 = (m22 * f1 - n12 * f2) / n - 2.0 * k1
-                r2 = (n11 * f2 - n12 * f1) / n - 2.0 * k2
-                f1 = m11 * r1 + m12 * r2
-                f2 = m12 * r1 + m22 * r2
-                a1 = 1.5 * k1 + 0.5 * (w22 * f1 - m12 * f2) / w
-                a2 = 1.5 * k2 + 0.5 * (w11 * f2 - m12 * f1) / w
-                q1 += 0.5 * h * (v1 + u1)
-                q2 += 0.5 * h * (v2 + u2)
-                v1 += h * a1
-                v2 += h * a2
+            left = pieces
+            while left > 0:
+                n = pieces_now(p, v1, v2, a1, a2, piece, left)
+                q1, q2, v1, v2, a1, a2 = step_on(p, q1, q2, v1, v2, m1, m2, n * piece)
+                left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
     state[2, 0], state[2, 1] = t1, t2
     state[3, 0], state[3, 1], state[4, 0], state[4, 1] = s1, s2, w1, w2
 
 
-_respond: Callable[..., None] = numba.njit(cache=True, nogil=True)(_loop)
+_respond: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)

@@ -4,8 +4,6 @@ import numpy as np
 
 from estimator.arrays import Array
 
-DIFFERENCE = 1e-7  # s
-
 
 def motor_torque(
     command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float
@@ -16,60 +14,72 @@ def motor_torque(
     `command_to_sample` [s] after command k takes effect. The torque follows `delay` [s] later through a
     first-order lag [s]. The means are exact, of a step in which the command changes too.
     """
-    settled = _lagging(command, rate, lag)
+    return _torque(command, rate, command_to_sample, steps, delay, lag)[0]
+
+
+def torque_and_slopes(
+    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float
+) -> tuple[Array, Array]:
+    """`motor_torque`, and its derivatives by delay and by lag (2, joints, samples, steps) [N m/s].
+
+    Where a command changes at the very edge of a step and no lag softens it, the derivative by delay is that of less.
+    """
+    torque, late, change = _torque(command, rate, command_to_sample, steps, delay, lag)
+    return torque, np.stack((late, change))
+
+
+def _torque(
+    command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float
+) -> tuple[Array, Array, Array]:
+    """The mean torque over each step, and its derivatives by delay and lag."""
+    settled, settled_slope = _lagging(command, rate, lag)
+    total = np.zeros((command.shape[0], command.shape[1] + 1))
+    np.cumsum(command, axis=1, out=total[:, 1:])
     edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delay
-    gathered = []
-    present = []
-    for edge in edges.tolist():
+    gathered, present, by_lag = (np.empty((*command.shape, steps + 1)) for _ in range(3))
+    for i, edge in enumerate(edges.tolist()):
         shift = int(np.floor(edge * rate))
         phase = edge - shift / rate
         held = np.roll(command, -shift, axis=1)
         # Integral of the held command since command 0, at this edge after every sample.
-        gathered.append(_before(command, rate, shift) + held * phase)
+        gathered[:, :, i] = _before(total, rate, shift) + held * phase
         fading = np.exp(-phase / lag) if lag > 0.0 else 0.0
-        present.append(held + (np.roll(settled, -shift, axis=1) - held) * fading)
+        left = (np.roll(settled, -shift, axis=1) - held) * fading
+        present[:, :, i] = held + left
+        # Without a lag the torque changes by lag times the command's steps, which has no derivative here.
+        slope = left * (phase / lag**2) + np.roll(settled_slope, -shift, axis=1) * fading if lag > 0.0 else 0.0
+        by_lag[:, :, i] = slope
     # lag y' = u - y, integrated over a step: the mean of y is that of u less what the lag has stored.
     step = 1.0 / (steps * rate)
-    means = [(gathered[i + 1] - gathered[i] - lag * (present[i + 1] - present[i])) / step for i in range(steps)]
-    return np.stack(means, axis=2)
-
-
-def torque_slopes(
-    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float
-) -> Array:
-    """Derivatives of `motor_torque` by delay and by lag (2, joints, samples, steps) [N m/s].
-
-    By central differences: the torque is piecewise linear in the delay and smooth in the lag.
-    """
-
-    def at(delay: float, lag: float) -> Array:
-        return motor_torque(command, rate, command_to_sample, steps, delay=delay, lag=lag)
-
-    late = (at(delay + DIFFERENCE, lag) - at(delay - DIFFERENCE, lag)) / (2.0 * DIFFERENCE)
+    change = np.diff(present, axis=2) / step
+    torque = np.diff(gathered, axis=2) / step - lag * change
     if lag <= 0.0:
-        return np.stack((late, np.zeros_like(late)))
-    change = min(DIFFERENCE, 0.1 * lag)
-    return np.stack((late, (at(delay, lag + change) - at(delay, lag - change)) / (2.0 * change)))
+        return torque, -change, np.zeros_like(change)
+    return torque, -change, -change - lag * np.diff(by_lag, axis=2) / step
 
 
-def _before(command: Array, rate: float, shift: int) -> Array:
-    """Integral of the held command from command 0 to command k + `shift`, for each k (joints, samples)."""
-    samples = command.shape[1]
-    total = np.zeros((command.shape[0], samples + 1))
-    np.cumsum(command, axis=1, out=total[:, 1:])
-    index = np.arange(samples) + shift
-    turns, rest = np.divmod(index, samples)
-    integral: Array = (turns * total[:, -1:] + total[:, rest]) / rate
+def _before(total: Array, rate: float, shift: int) -> Array:
+    """Integral of the held command from command 0 to command k + `shift`, for each k (joints, samples), from the
+    sum `total` (joints, samples + 1) of all commands before each."""
+    samples = total.shape[1] - 1
+    turns, rest = divmod(shift, samples)
+    once = np.concatenate((total[:, rest:-1], total[:, -1:] + total[:, :rest]), axis=1)
+    integral: Array = (turns * total[:, -1:] + once) / rate
     return integral
 
 
-def _lagging(command: Array, rate: float, lag: float) -> Array:
-    """The lagging torque (joints, samples) at the instants of the commands, in its periodic steady state.
+def _lagging(command: Array, rate: float, lag: float) -> tuple[Array, Array]:
+    """The lagging torque (joints, samples) at the instants of the commands, in its periodic steady state, and its
+    derivative by the lag.
 
     It obeys y[k + 1] = a y[k] + (1 - a) u[k], which is one division per Fourier line.
     """
     if lag <= 0.0:
-        return np.roll(command, 1, axis=1)
+        before = np.roll(command, 1, axis=1)
+        return before, np.zeros_like(before)
     a = np.exp(-1.0 / (rate * lag))
     turn = np.exp(2j * np.pi * np.arange(command.shape[1] // 2 + 1) / command.shape[1])
-    return np.fft.irfft(np.fft.rfft(command, axis=1) * (1.0 - a) / (turn - a), command.shape[1], axis=1)
+    filtered = np.fft.rfft(command, axis=1) * ((1.0 - a) / (turn - a))
+    slope = filtered * ((1.0 - turn) / (turn - a) / (1.0 - a) * (a / (rate * lag**2)))
+    both = np.fft.irfft(np.stack((filtered, slope)), command.shape[1], axis=2)
+    return both[0], both[1]

@@ -61,7 +61,7 @@ class Estimate:
     white_std: Array = field(default_factory=lambda: np.zeros(0))
     """What `std` would be if every sample's error were independent and of the known noise (parameters,)."""
     correlation_time: float = 1.0
-    """Samples over which the residual is correlated, and over which `covariance` counts it as one."""
+    """Samples over which the residual is seen to be correlated; 1 is white. `covariance` allows for more."""
 
     @property
     def std(self) -> Array:

@@ -4,7 +4,8 @@ With errors of position that are alike and independent from sample to sample, as
 most likely parameters are those of the smallest weighted sum of squares. The state at the first sample of
 each run is unknown too: simulating until the motion is periodic would take two or more periods in place of one.
 
-How large the errors are is itself estimated, joint by joint, between a coarse fit and the fine one, and samples
+Most of the way is gone in long steps of integration; short ones choose between what these cannot tell apart.
+How large the errors are is itself estimated, joint by joint, before the last digits, and samples
 far outside are weighed down there (Huber): a few wild readings then cost nothing.
 """
 
@@ -15,10 +16,10 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
-from estimator.covariance import Scatter, correlation_time, robust_covariance, structured_share
+from estimator.covariance import LONGEST_LAG, Scatter, correlation_time, robust_covariance, structured_share
 from estimator.errors import ConvergenceError
 from estimator.least_squares import LinearEstimate
-from estimator.levenberg_marquardt import Minimum, Quadratic, minimise
+from estimator.levenberg_marquardt import LEAST_DAMPING, Minimum, Quadratic, minimise
 from estimator.model import Model
 from estimator.normal_equations import normal_equations
 from estimator.period import SettledPeriod
@@ -29,23 +30,31 @@ from estimator.stabilised_run import StabilisedRun
 
 Run = SimulatedRun | StabilisedRun
 
-WIDTH_FLOOR = 3e-4  # rad/s: narrower cannot be told from friction that sticks
+WIDTH_FLOOR = 1e-4  # rad/s: friction that sticks is not told from this, and from 3e-4 by half a standard error
 # From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both.
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
-# An arm that swings past the upright amplifies what is still wrong: its beginning is fitted before the whole.
+# An arm that swings past the upright amplifies what is still wrong: it is first held to the measured motion by springs
+# that would give its joints this frequency, then its free beginning is fitted before the whole.
+PULL = 2.0  # Hz
 HORIZONS = (0.125, 0.25, 0.5)
 LEAST_HORIZON = 10  # samples of all joints for each unknown
-COARSE = 1e-3  # relative gain in the sum of squares at which each try ends
-FINE = 1e-6
+# Relative gains in the sum of squares at which a fit ends: of a start, of the first and the second look at the whole,
+# and of the end, where what is left to gain is a tenth of a standard error's worth over all parameters together.
 HASTY = 2e-2
+COARSE = 3e-3
+NEAR = 3e-4
+FINE = 1e-5
+# Sums of squares in units of the noise: two tries this close are one minimum, and this close only short steps tell.
+SAME, CLOSE = 1.0, 25.0
 HOPELESS = 2.0  # sum of squares per sample in units of the noise from which a hasty fit gives up
-ALIKE = 1.05  # of the best try's sum of squares: up to here another try may still end lower
+ALIKE = 1.01  # of the best try's sum of squares: up to here another try may still end lower
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
 LEAST_LAG = 1e-4  # s, at the start
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
+LEAST_WINDOW = 0.005  # of a run: rounding is correlated, a little, over more lags than its autocorrelation shows
 OUTLIER = 4.0  # standard deviations; rounding never leaves more than 1.7
 
 
@@ -83,6 +92,8 @@ class Problem:
     """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
     share: float = 1.0
     """Of each run, from its beginning, that is looked at."""
+    pull: Array | None = None
+    """Stiffness of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
 
     @property
     def count(self) -> int:
@@ -111,15 +122,14 @@ class Problem:
             n, b = np.zeros((transform.shape[0],) * 2), np.zeros(transform.shape[0])
             cost = 0.0
             for part, position, derivative in run.pieces(
-                physics, self.start(x, index), self.coordinates.names, self.share
+                physics, self.start(x, index), self.coordinates.names, self.pull, self.share
             ):
-                root = weight[:, part]
-                r = (root * (position - run.measured[:, part])).reshape(-1)
-                J = (root[:, :, None] * derivative).reshape(r.size, -1)
-                if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
+                square = np.square(weight[:, part]).reshape(-1)
+                r = (position - run.measured[:, part]).reshape(-1)
+                normal, gradient = normal_equations(derivative.reshape(r.size, -1), r, square)
+                n, b, cost = n + normal, b + gradient, cost + float(np.sum(square * r * r))
+                if not (np.isfinite(cost) and np.all(np.isfinite(n)) and np.all(np.isfinite(b))):
                     return Quadratic(np.inf, total.normal, total.gradient)
-                normal, gradient = normal_equations(J, r)
-                n, b, cost = n + normal, b + gradient, cost + float(np.sum(r * r))
             total = Quadratic(
                 total.cost + cost,
                 total.normal + transform.T @ n @ transform,
@@ -169,6 +179,7 @@ def fit_runs(
     leaves much more than the noise is given up before its last digits.
     """
     problem, states = _problem(periods, model, linear)
+    rough = replace(problem, runs=tuple(run.roughly() for run in problem.runs))
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
     enough = HASTY if hasty else COARSE
@@ -180,7 +191,7 @@ def fit_runs(
     for start in (*given, *own):
         x = np.concatenate((problem.coordinates.coordinates(start), states))
         try:
-            tries.append(_approach(problem, x, samples, enough))
+            tries.append(_approach(rough, x, linear, samples, enough))
         except ConvergenceError as error:
             lost = error
             continue
@@ -188,37 +199,60 @@ def fit_runs(
             break
     if not tries:
         raise lost
-    # What explains the motion may still have its friction's step in the wrong place, by a little of the sum.
-    best = min(tries, key=lambda found: found.at.cost)
-    wide = _with_width(problem, best.x, STARTING_WIDTHS[-1])
-    if not (hasty and best.at.cost > HOPELESS * samples):
-        tries.append(minimise(problem.evaluate, wide, enough))
-    best = min(tries, key=lambda found: found.at.cost)
+    best = _best(tries)
+    spent = sum(found.iterations for found in tries)
+    hopeless = hasty and best.at.cost > HOPELESS * samples
+    if not hopeless:
+        # What explains the motion may still have its friction's shape wrong, by a little of the sum.
+        again = [minimise(rough.evaluate, _reshaped(problem, best.x, width), enough) for width in STARTING_WIDTHS]
+        spent += sum(found.iterations for found in again)
+        tries += again
+        likely = ALIKE * _best(tries).at.cost
+        tries = [minimise(rough.evaluate, each.x, NEAR) for each in tries if each.at.cost < likely]
+    ends = [minimise(problem.evaluate, each.x, enough) for each in _distinct(tries)]
+    best = _best(ends)
     weights, outliers = _weights(periods, problem.positions(best.x))
     problem = replace(problem, weights=weights)
-    hopeless = hasty and best.at.cost > HOPELESS * samples
-    last = [best.x] if hopeless else [found.x for found in tries if found.at.cost < ALIKE * best.at.cost]
-    ends = [minimise(problem.evaluate, x, HASTY if hopeless else FINE) for x in last]
-    minimum = min(ends, key=lambda found: found.at.cost)
-    return _fit(periods, problem, minimum, outliers, sum(found.iterations for found in (*tries, *ends)))
+    last = HASTY if hopeless else FINE if best.at.cost < EXPLAINED * samples else NEAR
+    minimum = minimise(problem.evaluate, best.x, last, LEAST_DAMPING)
+    spent += sum(found.iterations for found in (*tries, *ends, minimum))
+    return _fit(periods, problem, minimum, outliers, spent)
 
 
-def _approach(problem: Problem, x: Array, samples: int, enough: float) -> Minimum:
-    """From stage 1's parameters to the whole of every run, by way of its beginning."""
+def _best(tries: Sequence[Minimum]) -> Minimum:
+    return min(tries, key=lambda found: found.at.cost)
+
+
+def _distinct(tries: Sequence[Minimum]) -> list[Minimum]:
+    """The best, and those that only finer steps can tell from it."""
+    distinct: list[Minimum] = []
+    for each in sorted(tries, key=lambda found: found.at.cost):
+        cost = each.at.cost
+        if not distinct or (cost > distinct[-1].at.cost + SAME and cost < distinct[0].at.cost + CLOSE):
+            distinct.append(each)
+    return distinct
+
+
+def _approach(problem: Problem, x: Array, linear: LinearEstimate, samples: int, enough: float) -> Minimum:
+    """From stage 1's parameters to the whole free motion, by way of pulled motion and of its beginning."""
+    inertia = [abs(linear.value[linear.names.index(f"inertia_{j + 1}")]) for j in range(problem.state_scale.size // 2)]
+    x = minimise(replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2).evaluate, x, HASTY).x
     for share in HORIZONS:
         if share * samples > LEAST_HORIZON * x.size:
             x = minimise(replace(problem, share=share).evaluate, x, HASTY).x
     return minimise(problem.evaluate, x, enough)
 
 
-def _with_width(problem: Problem, x: Array, width: float) -> Array:
-    """The coordinates `x` with all friction's steps of this width [rad/s]."""
+def _reshaped(problem: Problem, x: Array, width: float) -> Array:
+    """The coordinates `x` with the shape of friction as at the start, its steps of this width [rad/s]."""
     names = problem.coordinates.names
-    steps = np.array([name.startswith("coulomb_width") for name in names])
-    value = np.where(steps, width, problem.coordinates.values(x[: len(names)]))
-    moved = x.copy()
-    moved[: len(names)][steps] = problem.coordinates.coordinates(value)[steps]
-    return moved
+    shape = {"coulomb_width": width, "stribeck_velocity": START["stribeck_velocity"]}
+    moved = np.array([name.rstrip("_12") in shape for name in names])
+    start = np.array([shape.get(name.rstrip("_12"), 0.0) for name in names])
+    value = np.where(moved, start, problem.coordinates.values(x[: len(names)]))
+    reshaped = x.copy()
+    reshaped[: len(names)][moved] = problem.coordinates.coordinates(value)[moved]
+    return reshaped
 
 
 def _problem(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate) -> tuple[Problem, Array]:
@@ -273,11 +307,12 @@ def _fit(periods: Sequence[SettledPeriod], problem: Problem, minimum: Minimum, o
         for period, position, weight in zip(periods, positions, problem.weights, strict=True)
     ]
     lags = correlation_time(residuals)
+    window = max(lags, min(LONGEST_LAG, int(LEAST_WINDOW * max(period.samples for period in periods))))
     count = problem.count
     samples = int(sum(period.valid.sum() for period in periods))
     slopes = problem.coordinates.slopes(x[:count])
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
-    robust = robust_covariance(minimum.at, problem.scatter(x, lags), samples, count, structured)
+    robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
     # Weights are of the residual as it turned out; the noise that is known would give larger ones.
     known = min(float(np.median(w[w > 0.0] * p.noise.min())) for w, p in zip(problem.weights, periods, strict=True))
     white = known**2 * robust_covariance(minimum.at, None, samples, count)

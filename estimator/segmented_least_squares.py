@@ -150,11 +150,16 @@ def _residuals(residual: Residual, shared: Array, own: Array, threads: ThreadPoo
 def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPoolExecutor) -> _Blocks:
     def block(segment: int) -> tuple[Array, Array]:
         r, J = derivative(segment, shared, own[segment])
-        return J.T @ J, J.T @ r
+        with np.errstate(over="ignore", invalid="ignore"):
+            return J.T @ J, J.T @ r
 
     products = list(threads.map(block, range(len(own))))
     normal = np.stack([product[0] for product in products])
     gradient = np.stack([product[1] for product in products])
+    if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
+        raise ConvergenceError(
+            "a simulated motion runs away: check the units, signs and directions of torque and angle"
+        )
     n = shared.size
     return _Blocks(normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:], gradient[:, :n], gradient[:, n:])
 

@@ -29,15 +29,21 @@ class StabilisedRun:
         """Of this period, during which `stabiliser` gave part of the torque."""
         return cls(stabiliser, period.filled(), period.rate, period.command_to_sample)
 
+    def roughly(self) -> "StabilisedRun":
+        """Itself: it has one step only."""
+        return self
+
     def position(self, physics: Physics, start: Array) -> Array:
         """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
         return self.stabiliser.positions(physics, start, self.rate, self.command_to_sample)
 
     def pieces(
-        self, physics: Physics, start: Array, names: tuple[str, ...], share: float = 1.0
+        self, physics: Physics, start: Array, names: tuple[str, ...], pull: Array | None = None, share: float = 1.0
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """The whole run, or the first `share` of it, as one piece, as `SimulatedRun.pieces` gives them."""
-        count = round(share * self.measured.shape[1])
+        """The whole run, or the first `share` of it, as one piece, as `SimulatedRun.pieces` gives them.
+
+        Its stabiliser is `pull` enough.
+        """
         position = self.position(physics, start)
         derivatives = []
         for name in names:
@@ -47,6 +53,7 @@ class StabilisedRun:
             nudged = start.copy()
             nudged[index] += LEAST
             derivatives.append((self.position(physics, nudged) - position) / LEAST)
+        count = round(share * self.measured.shape[1])
         yield slice(0, count), position[:, :count], np.stack(derivatives, axis=-1)[:, :count]
 
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from estimator.drive import motor_torque, torque_slopes
+from estimator.drive import motor_torque, torque_and_slopes
+from estimator.normal_equations import normal_equations
 from estimator.physics import Physics
 from estimator.sensitivity import CAUSES, Sensitive
 from estimator.simulation import simulate
@@ -35,8 +36,7 @@ def position(values: dict[str, float]) -> np.ndarray:
 def test_derivatives_are_those_of_the_simulation() -> None:
     values = {**ARM, **START}
     start = np.array(list(START.values())).reshape(2, 2)
-    motor = motor_torque(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=ARM["lag"])
-    slopes = torque_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=ARM["lag"])
+    motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=ARM["lag"])
     motion = Sensitive(Physics.of(ARM), start, CAUSES, 1.0 / (RATE * STEPS))
     parts = [motion.advance(motor[:, part], slopes[:, :, part]) for part in (slice(0, 250), slice(250, SAMPLES))]
     found = np.concatenate([angle for angle, _ in parts], axis=1)
@@ -47,3 +47,37 @@ def test_derivatives_are_those_of_the_simulation() -> None:
         up, down = (position({**values, cause: values[cause] + sign * change}) for sign in (1.0, -1.0))
         difference = (up - down) / (2.0 * change)
         assert np.abs(derivative[:, :, index] - difference).max() < 1e-4 * np.abs(difference).max(), cause
+
+
+def test_pulled_motion_keeps_to_its_target_and_has_its_own_derivatives() -> None:
+    start = np.array(list(START.values())).reshape(2, 2)
+    motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=ARM["lag"])
+    target = np.tile([[-1.5], [0.1]], SAMPLES)
+
+    def pulled(values: dict[str, float], pull: float) -> tuple[np.ndarray, np.ndarray]:
+        motion = Sensitive(Physics.of(values), start, ("inertia_1",), 1.0 / (RATE * STEPS), pull=np.full(2, pull))
+        return motion.advance(motor, slopes, target)
+
+    free, held = (pulled(ARM, pull)[0] for pull in (0.0, 20.0))
+    assert np.allclose(free, position({**ARM, **START}), atol=1e-10)
+    assert np.abs(held - target)[:, 200:].max() < 0.3 * np.abs(free - target)[:, 200:].max()
+    change = 1e-6 * ARM["inertia_1"]
+    up, down = (pulled({**ARM, "inertia_1": ARM["inertia_1"] + sign * change}, 20.0)[0] for sign in (1.0, -1.0))
+    difference = (up - down) / (2.0 * change)
+    assert np.abs(pulled(ARM, 20.0)[1][:, :, 0] - difference).max() < 1e-4 * np.abs(difference).max()
+
+
+def test_rough_steps_stay_within_a_tenth_of_an_encoder_step() -> None:
+    values = {**ARM, **START}
+    motor = motor_torque(torque(), RATE, 3e-4, 1, delay=values["delay"], lag=values["lag"])
+    start = np.array(list(START.values())).reshape(2, 2)
+    rough = simulate(Physics.of(values), start, motor, 1.0 / RATE)[0]
+    assert np.sqrt(np.mean((rough - position(values)) ** 2)) < 0.1 * 2.0 * np.pi / 4096
+
+
+def test_normal_equations_are_those_of_numpy() -> None:
+    random = np.random.default_rng(1)
+    for rows in (1, 4, 7):
+        J, r, weight = random.normal(size=(rows, 3)), random.normal(size=rows), random.uniform(size=rows)
+        product, gradient = normal_equations(J, r, weight)
+        assert np.allclose(product, J.T @ np.diag(weight) @ J) and np.allclose(gradient, J.T @ (weight * r))

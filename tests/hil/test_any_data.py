@@ -97,7 +97,6 @@ def test_a_csv_that_is_wrong_is_named(
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda columns: columns | {"tau1": -columns["tau1"]}, "check the units, signs"),
         (
             lambda columns: columns | {"q1": np.degrees(columns["q1"])},
             "if it did not, its positions are not in the unit",
@@ -110,7 +109,17 @@ def test_a_csv_that_is_wrong_is_named(
 def test_data_that_is_doubtful_comes_with_a_warning(
     spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A pendulum swinging as 0.02 q'' + 0.5 cos q + 0.03 q' = tau; one column is then wrong."""
+    assert estimate_pendulum(spoil) == 0
+    assert said in " ".join(json.loads(capsys.readouterr().out)["warnings"])
+
+
+def test_torque_of_the_wrong_sign_is_an_error_that_says_where_to_look(capsys: pytest.CaptureFixture[str]) -> None:
+    assert estimate_pendulum(lambda columns: columns | {"tau1": -columns["tau1"]}) == 1
+    assert "check the units, signs and directions of torque and angle" in capsys.readouterr().err
+
+
+def estimate_pendulum(spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> int:
+    """A pendulum swinging as 0.02 q'' + 0.5 cos q + 0.03 q' = tau; one column is then wrong. The exit code."""
     time = 0.0025 * np.arange(2000)
     torque = 0.25 * np.sin(2.0 * time) + 0.2 * np.sin(7.1 * time + 1.0)
     angle, velocity = np.empty(2000), 0.0
@@ -125,8 +134,7 @@ def test_data_that_is_doubtful_comes_with_a_warning(
     )
     toml = '[model]\nfriction = "coulomb"\n[columns]\ntime = "t"\nposition = ["q1"]\ntorque = ["tau1"]\n'
     Path("arm.toml").write_text(toml + "position_step = 0.0015\n", encoding="utf-8")
-    assert hil("estimate", "data.csv", "--config", "arm.toml", "--json") == 0
-    assert said in " ".join(json.loads(capsys.readouterr().out)["warnings"])
+    return hil("estimate", "data.csv", "--config", "arm.toml", "--json")
 
 
 def test_a_csv_needs_its_config_and_no_run_beside_it(capsys: pytest.CaptureFixture[str]) -> None:
