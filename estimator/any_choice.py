@@ -51,12 +51,18 @@ class SegmentChoice:
 
 
 def choose_by_shooting(
-    recordings: Sequence[Recording], drive: Drive, start: Array, *, length: float = 1.0, zeros: bool = False
+    recordings: Sequence[Recording],
+    drive: Drive,
+    start: Array,
+    *,
+    length: float = 1.0,
+    zeros: bool = False,
+    torque_scale: bool = False,
 ) -> SegmentChoice:
     """Fit richer and richer friction, and asymmetry on the best, as long as segments left out are predicted better.
 
-    Arguments as of `estimate_by_shooting`. Raises RecordingError for recordings of fewer than two segments each,
-    ConvergenceError when no model can be fitted.
+    Arguments as of `estimate_by_shooting`; `torque_scale` is part of every model, or of none. Raises RecordingError for
+    recordings of fewer than two segments each, ConvergenceError when no model can be fitted.
     """
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(
@@ -68,7 +74,7 @@ def choose_by_shooting(
         return _try(recordings, model, start, length, zeros)
 
     joints = recordings[0].joints
-    trials = [tried(Model(joints, friction, drive)) for friction in FRICTIONS]
+    trials = [tried(Model(joints, friction, drive, torque_scale=torque_scale)) for friction in FRICTIONS]
     best = trials[0]
     for trial in trials[1:]:
         best = trial if trial.score < WORTH * best.score else best

@@ -67,6 +67,8 @@ def arm_toml(arm: ArmAnswers) -> str:
         _line('friction = "stribeck"', '"coulomb" has less, "stribeck_load" more'),
         _line('drive = "lag"', '"delay": a pure delay instead of a current loop'),
     ]
+    if len(arm.joints) == 2:
+        model.append(_line("torque_scale = true", "find how far the second torque constant is off against the first"))
     safety = ["[safety]", _line("watchdog = 0.1", "s of silence after which a servo stops by itself")]
     tables = [head, port, *(_joint(joint) for joint in arm.joints), mechanism, experiment, model, safety]
     return "\n\n".join("\n".join(table) for table in tables) + "\n"

@@ -48,7 +48,7 @@ def all_methods(
     config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
 ) -> Iterator[Peer]:
     """This project's own estimate first, then its peers."""
-    ours = _ours(period, OURS, Model(period.joints, config.model.fixed_friction, config.model.drive))
+    ours = _ours(period, OURS, _model(config, period))
     yield ours
     length = link_length(config)
     yield from compare_peers(period, length, config.arm.gravity)
@@ -69,6 +69,11 @@ def link_length(config: Config) -> float | None:
     if config.is_fake and config.fake is not None and config.fake.arm is not None:
         return config.fake.arm.links[0].length
     return None
+
+
+def _model(config: Config, period: SettledPeriod) -> Model:
+    wanted = config.model
+    return Model(period.joints, wanted.fixed_friction, wanted.drive, torque_scale=wanted.torque_scale)
 
 
 def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> dict[str, Any]:

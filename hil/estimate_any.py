@@ -72,10 +72,13 @@ def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: flo
     start = fit_inverse_dynamics(recordings, START_CUTOFF, START_WIDTH).value
     choice = None
     if wanted.friction == "auto":
-        choice = choose_by_shooting(recordings, wanted.drive, start, length=segment, zeros=zeros)
+        choice = choose_by_shooting(
+            recordings, wanted.drive, start, length=segment, zeros=zeros, torque_scale=wanted.torque_scale
+        )
         estimate = choice.estimate
     else:
-        model = Model(recordings[0].joints, wanted.friction, wanted.drive, asymmetry=wanted.asymmetry)
+        terms = {"asymmetry": wanted.asymmetry, "torque_scale": wanted.torque_scale}
+        model = Model(recordings[0].joints, wanted.friction, wanted.drive, **terms)
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
     result["warnings"] = any_warnings(recordings, estimate)
