@@ -8,6 +8,7 @@ Gravity, offsets, ripple, the joints' zeros and delay may have either sign.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -92,5 +93,6 @@ def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: f
     return np.array([scale[_kind(name)] for name in names])
 
 
+@cache
 def _kind(name: str) -> str:
     return name.rstrip("_12")

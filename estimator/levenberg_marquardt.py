@@ -43,18 +43,20 @@ class Minimum:
 Evaluate = Callable[[Array], Quadratic]
 
 
-def minimise(evaluate: Evaluate, start: Array, enough: float, damping: float = FIRST_DAMPING) -> Minimum:
-    """Minimise a sum of squares from `start`, coordinates of the size of 1.
+def minimise(
+    evaluate: Evaluate, start: Array, enough: float, damping: float = FIRST_DAMPING, at: Quadratic | None = None
+) -> Minimum:
+    """Minimise a sum of squares from `start`, coordinates of the size of 1; `at` is the sum there, if it is known.
 
     Ends when a step lowers the sum, or would, by less than `enough` of it; a sum that is not finite counts as
     too large. Damped steps are short along what is hardly seen and end too early there: near the end, `damping`
     should start at LEAST_DAMPING. Raises ConvergenceError when `start` gives no finite sum, or when the sum still
     falls by more than UNFINISHED of it after ITERATIONS.
     """
-    x, here = start, evaluate(start)
+    x, here = start, evaluate(start) if at is None else at
     if not np.isfinite(here.cost):
         raise ConvergenceError("the starting values give no finite motion: check the torque and the period's units")
-    evaluations = 1
+    evaluations = int(at is None)
     gained = np.inf
     for _ in range(ITERATIONS):
         found, damping, tried = _improve(evaluate, x, here, damping, enough)

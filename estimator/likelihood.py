@@ -208,7 +208,7 @@ def fit_runs(
         spent += sum(found.iterations for found in again)
         tries += again
         likely = ALIKE * _best(tries).at.cost
-        tries = [minimise(rough.evaluate, each.x, NEAR) for each in tries if each.at.cost < likely]
+        tries = [minimise(rough.evaluate, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
     ends = [minimise(problem.evaluate, each.x, enough) for each in _distinct(tries)]
     best = _best(ends)
     weights, outliers = _weights(periods, problem.positions(best.x))
