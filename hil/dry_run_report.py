@@ -105,7 +105,7 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
     for index, joint in enumerate(config.joints):
         for row, (name, unit) in enumerate(quantities_of(config)):
             numbers = (median[row, index], quantile[row, index], prediction.limits[row, index])
-            cells = [f"{value:.3g}" for value in numbers] + [f"{100 * chance[row, index]:.2g} %"]
+            cells = [f"{value:.3g}" for value in numbers] + [_percent(chance[row, index])]
             table.add_row(joint.name if row == 0 else "", name, unit, *cells)
         table.add_section()
     return table
@@ -118,21 +118,27 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     lines = [
         "99 %: all peaks of an arm together stay within these in 99 of 100 arms.",
         settling_text(config, shown),
-        f"Stopped at any moment, the joints swing at most {_radians(stopped)} beyond their limits; with the program "
-        f"killed or the cable pulled, {_radians(planned[Way.SILENT])}.",
-        f"Should something drive them over a limit at these speeds, they go on for at most "
-        f"{_radians(passed[Way.BRAKED])} when braked, {_radians(passed[Way.CUT])} when cut. Keep that much clear.",
+        f"Stopped at any moment, the joints swing at most {_radians(config, stopped)} beyond their limits; with the program "
+        f"killed or the cable pulled, {_radians(config, planned[Way.SILENT])}.",
+        f"Should something drive them over a limit at these speeds, they go on for up to "
+        f"{_radians(config, passed[Way.BRAKED])} when braked; {_radians(config, passed[Way.CUT])} when cut. Keep that much clear.",
         f"Largest safe torque: peak_torque = [{torque}] N m.",
     ]
     allowed = f"safety.limit_chance allows {100 * config.safety.limit_chance:g} %"
     if run.asked is None:
         return [
             *lines,
-            f"Safe at that torque: a guard stop has a chance of {100 * shown.stop_chance:.2g} %; {allowed}.",
+            f"Safe at that torque: a guard stop has a chance of {_percent(shown.stop_chance)}; {allowed}.",
         ]
     word = "SAFE" if run.is_safe(config) else "NOT SAFE as configured"
-    return [*lines, f"{word}: a guard stop has a chance of {100 * shown.stop_chance:.2g} %; {allowed}."]
+    return [*lines, f"{word}: a guard stop has a chance of {_percent(shown.stop_chance)}; {allowed}."]
 
 
-def _radians(beyond: NDArray[np.float64]) -> str:
-    return ", ".join(f"{value:.2f}" for value in beyond) + " rad"
+def _percent(chance: float) -> str:
+    """Below a millionth of a percent the tail of a few hundred arms says nothing any more."""
+    return "0 %" if chance < 1e-8 else f"{100 * chance:.2g} %"
+
+
+def _radians(config: Config, beyond: NDArray[np.float64]) -> str:
+    each = ["a turn or more" if value >= 2 * np.pi else f"{value:.2f} rad" for value in beyond]
+    return ", ".join(f"{joint.name} {far}" for joint, far in zip(config.joints, each, strict=True))
