@@ -118,10 +118,11 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     lines = [
         "99 %: all peaks of an arm together stay within these in 99 of 100 arms.",
         settling_text(config, shown),
-        f"Stopped at any moment, the joints swing at most {_radians(config, stopped)} beyond their limits; with the program "
-        f"killed or the cable pulled, {_radians(config, planned[Way.SILENT])}.",
-        f"Should something drive them over a limit at these speeds, they go on for up to "
-        f"{_radians(config, passed[Way.BRAKED])} when braked; {_radians(config, passed[Way.CUT])} when cut. Keep that much clear.",
+        f"Stopped at any moment, they swing beyond their limits by up to: {_each(config, stopped)}; with the program "
+        f"killed or the cable pulled: {_each(config, planned[Way.SILENT])}.",
+        "Should something drive them over a limit at these speeds, they go on by up to: "
+        f"{_each(config, passed[Way.BRAKED])} when braked; {_each(config, passed[Way.CUT])} when cut. "
+        "Keep that much clear.",
         f"Largest safe torque: peak_torque = [{torque}] N m.",
     ]
     allowed = f"safety.limit_chance allows {100 * config.safety.limit_chance:g} %"
@@ -139,6 +140,6 @@ def _percent(chance: float) -> str:
     return "0 %" if chance < 1e-8 else f"{100 * chance:.2g} %"
 
 
-def _radians(config: Config, beyond: NDArray[np.float64]) -> str:
+def _each(config: Config, beyond: NDArray[np.float64]) -> str:
     each = ["a turn or more" if value >= 2 * np.pi else f"{value:.2f} rad" for value in beyond]
     return ", ".join(f"{joint.name} {far}" for joint, far in zip(config.joints, each, strict=True))
