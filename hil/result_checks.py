@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.any_choice import SegmentChoice
-from estimator.choice import Choice
+from estimator.any_choice import SegmentChoice, SegmentTrial
+from estimator.choice import Choice, Trial
 from estimator.distortion import LineGroup
 from estimator.validation import Validation
 from estimator.verdict import Verdict
@@ -61,16 +61,7 @@ def describe_choice(choice: Choice) -> dict[str, Any]:
         "chosen": choice.chosen.model.description,
         "error_divided_by": choice.gained,
         "standard_errors_times": choice.cost,
-        "tried": [
-            {
-                "model": trial.model.description,
-                "parameters": len(trial.model.names),
-                "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
-                "score": trial.score if np.isfinite(trial.score) else None,
-                "seconds": round(trial.seconds, 3),
-            }
-            for trial in choice.trials
-        ],
+        "tried": [_tried(trial) for trial in choice.trials],
     }
 
 
@@ -79,14 +70,15 @@ def describe_segment_choice(choice: SegmentChoice) -> dict[str, Any]:
     return {
         "chosen": choice.chosen.model.description,
         "error_divided_by": choice.gained,
-        "tried": [
-            {
-                "model": trial.model.description,
-                "parameters": len(trial.model.names),
-                "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
-                "score": trial.score if np.isfinite(trial.score) else None,
-                "seconds": round(trial.seconds, 3),
-            }
-            for trial in choice.trials
-        ],
+        "tried": [_tried(trial) for trial in choice.trials],
+    }
+
+
+def _tried(trial: Trial | SegmentTrial) -> dict[str, Any]:
+    return {
+        "model": trial.model.description,
+        "parameters": len(trial.model.names),
+        "held_out_rms": None if trial.held_out is None else trial.held_out.tolist(),
+        "score": trial.score if np.isfinite(trial.score) else None,
+        "seconds": round(trial.seconds, 3),
     }
