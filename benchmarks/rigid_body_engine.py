@@ -26,9 +26,10 @@ from estimator.period import SettledPeriod
 from fakes.arm import Arm, base_parameters
 
 PEAK = (0.80, 0.42)  # N m
-# s. The engine steps to first order: at 2e-5 s its inertias come out 1.5 standard errors too large and everything
-# 1e-5 s too early, by the same seeds at 5e-6 s a quarter of that.
-TIMESTEP = 5e-6
+# s. The engine steps to first order, and what that does to the motion is no fault of an estimate: at 2e-5 s its
+# inertias come out 1.5 standard errors too large and everything 1e-5 s too early, by the same seeds at 5e-6 s a quarter
+# of that.
+TIMESTEP = 2e-6
 GROUPS = {
     "inertia": ("inertia_1", "coupling", "inertia_2", "armature_2"),
     "gravity": ("gravity_1", "gravity_2"),
