@@ -209,13 +209,14 @@ def fit_runs(
         tries += again
         likely = ALIKE * _best(tries).at.cost
         tries = [minimise(rough.evaluate, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
+        spent += sum(found.iterations for found in tries)
     ends = [minimise(problem.evaluate, each.x, enough) for each in _distinct(tries)]
     best = _best(ends)
     weights, outliers = _weights(periods, problem.positions(best.x))
     problem = replace(problem, weights=weights)
     last = HASTY if hopeless else FINE if best.at.cost < EXPLAINED * samples else NEAR
     minimum = minimise(problem.evaluate, best.x, last, LEAST_DAMPING)
-    spent += sum(found.iterations for found in (*tries, *ends, minimum))
+    spent += sum(found.iterations for found in (*ends, minimum))
     return _fit(periods, problem, minimum, outliers, spent)
 
 
@@ -236,11 +237,14 @@ def _distinct(tries: Sequence[Minimum]) -> list[Minimum]:
 def _approach(problem: Problem, x: Array, linear: LinearEstimate, samples: int, enough: float) -> Minimum:
     """From stage 1's parameters to the whole free motion, by way of pulled motion and of its beginning."""
     inertia = [abs(linear.value[linear.names.index(f"inertia_{j + 1}")]) for j in range(problem.state_scale.size // 2)]
-    x = minimise(replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2).evaluate, x, HASTY).x
-    for share in HORIZONS:
-        if share * samples > LEAST_HORIZON * x.size:
-            x = minimise(replace(problem, share=share).evaluate, x, HASTY).x
-    return minimise(problem.evaluate, x, enough)
+    eased = [replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2)]
+    eased += [replace(problem, share=share) for share in HORIZONS if share * samples > LEAST_HORIZON * x.size]
+    spent = 0
+    for each in eased:
+        found = minimise(each.evaluate, x, HASTY)
+        x, spent = found.x, spent + found.iterations
+    found = minimise(problem.evaluate, x, enough)
+    return replace(found, iterations=spent + found.iterations)
 
 
 def _reshaped(problem: Problem, x: Array, width: float) -> Array:

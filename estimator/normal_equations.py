@@ -22,11 +22,6 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array | None = No
     return product[:, :-1], product[:, -1]
 
 
-def sum_of_squares(residual: Array) -> float:
-    """|r|^2 of r (rows,)."""
-    return float(np.sum(np.square(residual)))
-
-
 def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:
     rows, columns = J.shape
     # Four rows at once: a quarter of the sums to fetch and put back.

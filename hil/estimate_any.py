@@ -26,7 +26,6 @@ from hil.warnings import clipping_warnings
 SCHEMA = 1
 START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
 START_WIDTH = 0.05  # rad/s
-FEWEST_ROWS = 32
 
 
 def estimate_csv(paths: Sequence[Path], config_path: Path) -> dict[str, Any]:
