@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from machine import machine
-from recorded_arm import Recorded, record, servo_arm
+from recorded_arm import Recorded, record, servo_arm, wave
 
 from estimator.identify import identify
 from estimator.model import Model
@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=500)
     options = parser.parse_args()
     arm = servo_arm({"coulomb_width": WIDTH})
-    recordings = [record(arm, seed, (0.80, 0.42)) for seed in range(1, min(WAVES, options.seeds) + 1)]
+    recordings = [record(arm, wave(seed, (0.80, 0.42))) for seed in range(1, min(WAVES, options.seeds) + 1)]
     truth = {**base_parameters(arm), "coulomb_width_1": WIDTH, "coulomb_width_2": WIDTH, "delay": 0.0}
     measured = campaign(recordings, truth, NOISE, options.seeds)
     measured["rounding_only"] = campaign(recordings, truth, 0.0, options.seeds)

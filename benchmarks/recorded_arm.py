@@ -1,12 +1,13 @@
 """A fake arm's settled motion without its bus: positions as they are, to be given errors and rounded afterwards."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from estimator.excitation import design_multisine, zippered_lines
+from estimator.excitation import Multisine, design_multisine, zippered_lines
 from estimator.period import SettledPeriod
 from fakes.arm import Arm
 from fakes.plant import make_plant
@@ -50,24 +51,28 @@ class Recorded:
         return self.period(np.round(self.position / self.step) * self.step)
 
 
-def servo_arm(friction: dict[str, float]) -> Arm:
-    """The arm of configs/fake_two_link.toml with this friction and drive."""
-    drives = [{**SERVO, **drive, **friction} for drive in DRIVES]
-    return Arm.model_validate({"start": (-math.pi / 2, 0.0), "links": LINKS, "drives": drives})
+def servo_arm(friction: dict[str, float], joints: int = 2) -> Arm:
+    """The arm of configs/fake_two_link.toml, or its first link, with this friction and drive."""
+    drives = [{**SERVO, **drive, **friction} for drive in DRIVES[:joints]]
+    return Arm.model_validate({"start": (-math.pi / 2, 0.0)[:joints], "links": LINKS[:joints], "drives": drives})
 
 
-def record(arm: Arm, seed: int, peak: tuple[float, float]) -> Recorded:
-    """Play one multisine: one period to settle, one kept."""
-    wave = design_multisine(RATE, PERIOD, zippered_lines(PERIOD, BAND, 2), peak, seed)
+def wave(seed: int, peak: Sequence[float], period: float = PERIOD) -> Multisine:
+    """A multisine for as many joints as `peak` has [N m]."""
+    return design_multisine(RATE, period, zippered_lines(period, BAND, len(peak)), peak, seed)
+
+
+def record(arm: Arm, multisine: Multisine) -> Recorded:
+    """Play it: one period to settle, one kept."""
     constant = np.array([drive.torque_constant for drive in arm.drives])[:, None]
-    current = np.round(wave.torque / constant / CURRENT_STEP) * CURRENT_STEP
+    current = np.round(multisine.torque / constant / CURRENT_STEP) * CURRENT_STEP
     commands: list[Any] = current.T.tolist()
     plant = make_plant(arm)
-    position = np.empty((2, wave.samples))
-    start = np.empty((2, 2))
+    position = np.empty(current.shape)
+    start = np.empty((2, len(current)))
     for turn in range(2):
         for k, command in enumerate(commands):
-            t = (turn * wave.samples + k) / RATE
+            t = (turn * multisine.samples + k) / RATE
             plant.advance(t + COMMAND_TO_SAMPLE, command)
             position[:, k] = plant.position
             if k == 0:
