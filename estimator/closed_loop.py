@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 from estimator.arrays import Array
+from estimator.bristles import bend, first_bend, has_bristles, without_dry_friction
 from estimator.physics import Physics
 from estimator.simulation import finer_pieces, pieces_now, step_on, steps_per_sample
 
@@ -51,8 +52,8 @@ class Response:
     torque: Array
     """Commanded, feedback included (joints, samples) [N m]."""
     state: Array
-    """After the last sample: angles, velocities, motor torques, then angles and velocities at the last sample
-    (5, joints) [rad, rad/s, N m, rad, rad/s]; what `respond` takes to go on."""
+    """After the last sample: angles, velocities, motor torques, then angles and velocities at the last sample, and the
+    torque of friction's bristles (6, joints) [rad, rad/s, N m, rad, rad/s, N m]; what `respond` takes to go on."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,8 @@ class Stabilised:
 
     def positions(self, physics: Physics, start: Array, rate: float, command_to_sample: float) -> Array:
         """Simulated angles (joints, samples) [rad] from `start` (2, joints) at the first sample."""
-        state = np.concatenate((start, self.former_torque[None], self.former))
+        bent = first_bend(physics, start[1])
+        state = np.concatenate((start, self.former_torque[None], self.former, bent[None]))
         return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
 
     def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
@@ -93,7 +95,7 @@ def _earlier(physics: Physics, command_to_sample: float) -> Physics:
 def resting(pose: Array) -> Array:
     """The state of an arm at rest in `pose` (joints,) [rad], as `respond` takes it."""
     nothing = np.zeros_like(pose)
-    return np.stack((pose, nothing, nothing, pose, nothing))
+    return np.stack((pose, nothing, nothing, pose, nothing, nothing))
 
 
 def respond(physics: Physics, state: Array, command: Array, rate: float, feedback: Feedback) -> Response:
@@ -106,12 +108,14 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     # A pendulum is a two-joint arm whose second joint has no torque and moves nothing.
     both = np.zeros((2, samples))
     both[:joints] = command
-    full = np.zeros((5, 2))
+    full = np.zeros((6, 2))
     full[:, :joints] = state
     position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
     lag = physics.lag + max(physics.delay, 0.0)
+    moving = without_dry_friction(physics.vector)
     _respond(
-        physics.vector, full, both, gains, lag, step, steps, finer_pieces(physics, step), position, velocity, torque
+        *(physics.vector, has_bristles(physics), moving, full, both, gains),
+        *(lag, step, steps, finer_pieces(physics, step), position, velocity, torque),
     )
     return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
 
@@ -119,6 +123,8 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
 # Compiled code takes its arguments by position.
 def _loop(
     p: Any,
+    bristly: bool,
+    m: Any,
     state: Any,
     command: Any,
     gains: Any,
@@ -133,6 +139,7 @@ def _loop(
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
     t1, t2 = state[2, 0], state[2, 1]
     s1, s2, w1, w2 = state[3, 0], state[3, 1], state[4, 0], state[4, 1]
+    b = state[5]
     a1 = a2 = 0.0
     piece = step / pieces
     fallen = 1.0 - math.exp(-step / lag) if lag > 0.0 else 1.0
@@ -158,7 +165,11 @@ def _loop(
             left = pieces
             while left > 0:
                 n = pieces_now(p, v1, v2, a1, a2, piece, left)
-                q1, q2, v1, v2, a1, a2 = step_on(p, q1, q2, v1, v2, m1, m2, n * piece)
+                if bristly:
+                    bend(p, b, m, v1, v2, m1, m2, 0.5 * n * piece)
+                q1, q2, v1, v2, a1, a2 = step_on(m, q1, q2, v1, v2, m1, m2, n * piece)
+                if bristly:
+                    bend(p, b, m, v1, v2, m1, m2, 0.5 * n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
     state[2, 0], state[2, 1] = t1, t2

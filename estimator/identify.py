@@ -140,7 +140,7 @@ def predict(
     steps = steps_per_sample(rate)
     step = 1.0 / (rate * steps)
     motor = motor_torque(torque, rate, command_to_sample, steps, delay=physics.delay, lag=physics.lag)
-    state = np.stack((estimate.start[0] if pose is None else pose, np.zeros(joints)))
+    state = np.stack((estimate.start[0] if pose is None else pose, np.zeros(joints), np.zeros(joints)))
     for period in range(MOST_PERIODS):
         position, end = simulate(physics, state, motor, step)
         change = float(np.abs(end - state).max())

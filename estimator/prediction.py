@@ -80,7 +80,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
         period.torque, period.rate, period.command_to_sample, steps, delay=physics.delay, lag=physics.lag
     )
     filled = period.filled()
-    state = np.stack((filled.mean(axis=1), np.zeros(period.joints)))
+    state = np.stack((filled.mean(axis=1), np.zeros(period.joints), np.zeros(period.joints)))
     for _ in range(MOST_PERIODS):
         position, end = simulate(physics, state, motor, step)
         if float(np.abs(end - state).max()) < PERIODIC:

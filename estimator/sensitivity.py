@@ -41,7 +41,7 @@ WIDE = NOWHERE + AT_ONCE
 STAGE = 7 * WIDE
 SLOPES, MASSES = 2 * WIDE, 4 * WIDE  # from the stage's first row
 # Numbers of each step. By the state, of either stage: f1 and f2 by q1, q2, v1, v2; slope_1 by q1, v1; slope_2 by q2,
-# v2; m11 and m12 by q2. Then those of all parameters, see `_step`.
+# v2; m11 and m12 by q2. Then those of all parameters, see `arm_step`.
 BY_STATE = 14
 NUMBERS = 2 * BY_STATE + 24
 
@@ -103,11 +103,14 @@ class Sensitive:
         ends[:joints] = 0.0 if pulled_to is None else pulled_to
         position = np.empty((2, samples))
         derivative = np.empty((2, samples, self._count))
-        _advance(
+        self._go_on(
             *(self._constants, self._state, both, slopes, ends, self._step, self._pieces),
             *(self._room, self._z, self._turn, position, derivative),
         )
         return position[:joints], derivative[:joints]
+
+    def _go_on(self, *given: Any) -> None:
+        _advance(*given)
 
 
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint and stage are 0 or 1, `now` is 0 or 1 too,
@@ -212,7 +215,7 @@ def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple
     return p[0] + p[2] + 2.0 * across, p[2] + across
 
 
-def _step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any) -> tuple[float, float]:
+def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any) -> tuple[float, float]:
     """One step of the state x (2, joints), its rows and numbers; the accelerations."""
     _, numbers, here, left, slope, _, _, _ = room
     gh, half = GAMMA * h, 0.5 * h * h
@@ -266,7 +269,7 @@ def _step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any) -
     return s1, s2
 
 
-def _follow(rows: Any, numbers: Any, Z: Any, before: int, count: int) -> None:
+def follow(rows: Any, numbers: Any, Z: Any, before: int, count: int) -> None:
     """The state's derivatives Z after the step at `before`."""
     # That this is 0 or 1 tells the compiler that no index is negative, which Python would count from the end.
     before &= 1
@@ -349,10 +352,10 @@ def _loop(
             left = pieces
             while left > 0:
                 n = pieces_now(p, x[1, 0], x[1, 1], a1, a2, piece, left)
-                a1, a2 = _step(p, x, t1, t2, n * piece, now, room)
+                a1, a2 = arm_step(p, x, t1, t2, n * piece, now, room)
                 left -= n
                 now = 1 - now
-                _follow(rows, numbers, Z, now, count)
+                follow(rows, numbers, Z, now, count)
                 if not written:
                     for i in range(causes):
                         derivative[0, k, i] = Z[i]
@@ -363,7 +366,7 @@ def _loop(
 
 # Only the loop is called from Python; wrappers for the others would take a second more to compile. Calls that are not
 # inlined would spend more time counting references to arrays than on arithmetic.
-_inner: Any = numba.njit(  # type: ignore[call-overload]
+fused: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True,
     error_model="numpy",
     fastmath={"contract"},
@@ -371,5 +374,5 @@ _inner: Any = numba.njit(  # type: ignore[call-overload]
     no_cpython_wrapper=True,
     no_cfunc_wrapper=True,
 )
-_drive, _arm, _step, _follow = map(_inner, (_drive, _arm, _step, _follow))
+_drive, _arm, arm_step, follow = map(fused, (_drive, _arm, arm_step, follow))
 _advance: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_loop)

@@ -6,7 +6,8 @@ The equations are those of `estimator.arm_model` with a friction law that is smo
     friction(v) = viscous v + viscous_asymmetry |v| + level(v) tanh(v / width)
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
 
-with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb level itself is the offset.
+with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb level itself is the offset. With
+presliding the term level(v) tanh(v / width) makes way for the bristles of `estimator.bristles`.
 `estimator.sensitivity` differentiates these equations and this scheme.
 
 Each step is the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999): L-stable for the
@@ -24,6 +25,7 @@ import numba
 import numpy as np
 
 from estimator.arrays import Array
+from estimator.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
 from estimator.physics import Physics
 
 LONGEST_STEP = 0.85e-3  # s
@@ -39,18 +41,22 @@ def steps_per_sample(rate: float, longest: float = LONGEST_STEP) -> int:
 def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tuple[Array, Array]:
     """Simulate from one sample to as many as `torque` has.
 
-    `start` (2, joints): angles [rad] and velocities [rad/s] at the first sample; `torque` (joints, samples,
-    steps): mean motor torque over each step after each sample [N m]; `step` [s]: length of one. Returns the
-    angles at the samples (joints, samples) and the state after the last sample's steps, shaped as `start`.
+    `start` (2 or 3, joints): angles [rad], velocities [rad/s] and the torque of friction's bristles [N m] at the first
+    sample, the last as of a sliding joint where it is not given; `torque` (joints, samples, steps): mean motor torque
+    over each step after each sample [N m]; `step` [s]: length of one. Returns the angles at the samples
+    (joints, samples) and the state after the last sample's steps (3, joints).
     """
     joints, samples, _ = torque.shape
     # A pendulum is a two-joint arm whose second joint has no torque and moves nothing.
-    state = np.zeros((2, 2))
-    state[:, :joints] = start
+    state = np.zeros((3, 2))
+    state[2, :joints] = first_bend(physics, start[1])
+    state[: len(start), :joints] = start
     both = np.zeros((2, *torque.shape[1:]))
     both[:joints] = torque
     position = np.empty((2, samples))
-    _simulate(physics.vector, state, both, step, finer_pieces(physics, step), position)
+    pieces = finer_pieces(physics, step)
+    moving = without_dry_friction(physics.vector)
+    _simulate(physics.vector, has_bristles(physics), moving, state, both, step, pieces, position)
     return position[:joints], state[:, :joints]
 
 
@@ -134,28 +140,31 @@ def step_on(
     return q1 + 0.5 * h * (v1 + u1), q2 + 0.5 * h * (v2 + u2), v1 + h * a1, v2 + h * a2, a1, a2
 
 
-def _loop(p: Any, state: Any, torque: Any, step: float, pieces: int, position: Any) -> None:
+def _loop(p: Any, bristly: bool, m: Any, state: Any, torque: Any, step: float, pieces: int, position: Any) -> None:
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
+    b = state[2]
     a1 = a2 = 0.0
     piece = step / pieces
     for k in range(position.shape[1]):
         position[0, k] = q1
         position[1, k] = q2
         for s in range(torque.shape[2]):
+            t1, t2 = torque[0, k, s], torque[1, k, s]
             left = pieces
             while left > 0:
                 n = pieces_now(p, v1, v2, a1, a2, piece, left)
-                q1, q2, v1, v2, a1, a2 = step_on(p, q1, q2, v1, v2, torque[0, k, s], torque[1, k, s], n * piece)
+                if bristly:
+                    bend(p, b, m, v1, v2, t1, t2, 0.5 * n * piece)
+                q1, q2, v1, v2, a1, a2 = step_on(m, q1, q2, v1, v2, t1, t2, n * piece)
+                if bristly:
+                    bend(p, b, m, v1, v2, t1, t2, 0.5 * n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
 
 
 # What is only called from compiled code needs no wrappers, which take a second to compile. It is inlined: a call
 # counts references to its arrays, which takes longer than a step's arithmetic.
-inner: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
-)
 _drive, _forces, pieces_now, step_on = map(inner, (_drive, _forces, pieces_now, step_on))
-_simulate: Callable[[Array, Array, Array, float, int, Array], None] = numba.njit(
+_simulate: Callable[[Array, bool, Array, Array, Array, float, int, Array], None] = numba.njit(
     cache=True, nogil=True, error_model="numpy"
 )(_loop)

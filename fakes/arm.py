@@ -40,6 +40,10 @@ class Drive(BaseModel):
     stribeck_rise: NotNegative = Field(0.0, description="static friction above Coulomb, as a fraction of it")
     stribeck_velocity: Positive = Field(0.1, description="velocity where the rise is down to 1/e [rad/s]")
     load: NotNegative = Field(0.0, description="dry friction added per motor torque [N m per N m]")
+    presliding_stiffness: NotNegative = Field(
+        0.0, description="0 sticks; more is a spring that yields before the joint slides [N m/rad]"
+    )
+    presliding_damping: NotNegative = Field(0.0, description="of that spring's bending [N m s/rad]")
     offset: Finite = Field(0.0, description="constant torque on the side of the load [N m]")
     ripple: NotNegative = Field(0.0, description="torque ripple over the angle, as a fraction of torque")
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
@@ -58,6 +62,16 @@ class Drive(BaseModel):
             raise ValueError(
                 f"coulomb_width is {self.coulomb_width:g} rad/s: give 0 for friction that sticks, "
                 "or at least 0.001 rad/s for a smooth step"
+            )
+        if self.presliding_stiffness and self.coulomb_width:
+            raise ValueError(
+                "presliding_stiffness and coulomb_width both say what friction does near standstill: give one of them"
+            )
+        if self.presliding_stiffness and not self.coulomb:
+            raise ValueError("presliding_stiffness needs a coulomb greater than 0: without it nothing holds the joint")
+        if self.presliding_damping and not self.presliding_stiffness:
+            raise ValueError(
+                "presliding_damping needs a presliding_stiffness greater than 0: there is no spring to damp"
             )
         if self.stops is not None and self.stops[0] >= self.stops[1]:
             raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be the smaller")
@@ -102,8 +116,8 @@ def base_parameters(arm: Arm | None) -> dict[str, float]:
 
     Empty when there is no `Arm`: of another plant nothing is known here.
 
-    What no base parameter stands for is left out: dry friction above Coulomb (Stribeck rise, load), the current's lag,
-    ripple, cogging, backlash, stops. `gravity` values are those of the tilted plane.
+    What no base parameter stands for is left out: dry friction above Coulomb (Stribeck rise, load), presliding, the
+    current's lag, ripple, cogging, backlash, stops. `gravity` values are those of the tilted plane.
     """
     if arm is None:
         return {}

@@ -95,6 +95,7 @@ class _Rotor:
         dry = step * level
         left = impulse - dry if impulse > dry else impulse + dry if impulse < -dry else 0.0
         self._velocity = left / (self._inertia + step * (self.motor.viscous + slope))
+        self.motor.bend(step, 0.5 * (v + self._velocity))
         self.angle += step * self._velocity
 
 

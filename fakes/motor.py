@@ -1,26 +1,37 @@
-"""One joint's drive while a plant steps: current lag, torque, friction, stops. Plain floats, called every step."""
+"""One joint's drive while a plant steps: current lag, torque, friction, stops. Plain floats, called every step.
 
-from math import exp, expm1, sin, tanh
+Dry friction that yields before it slides is that of Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions
+on Automatic Control 40 (1995) 419): bristles that bend with the joint and slip the more the further they are bent,
 
-from fakes.arm import Drive
+    friction = stiffness bend + damping bend'        bend' = velocity (1 - stiffness bend / +-level)
+"""
+
+from math import copysign, exp, expm1, sin, sqrt, tanh
+
+from fakes.arm import Drive, armature
 
 LONGEST_STEP = 0.6e-3  # s: short against the arm's own motion
 SHORTEST_STEP = 1e-9  # s: less than this is rounding
 STEP_PER_WIDTH = 0.02  # s per rad/s: short against the time the arm takes to cross a smooth friction step
+STEP_PER_SWING = 0.2  # of the time in which a rotor on its bristles swings through one radian of phase
 JAM = 1e6  # N m of dry friction: more than anything here can push
 
 
 class Motor:
-    """The laws of one drive. It holds no state of the arm; its current is the only thing that moves in it."""
+    """The laws of one drive. It holds no state of the arm; only its current and its friction's bristles move in it."""
 
     __slots__ = (
+        "_bristle_damping",
         "_drive",
         "_lag",
         "_left",
+        "_level",
         "_mean_left",
         "_shaped",
         "_step",
         "_width",
+        "bristle_stiffness",
+        "bristle_torque",
         "constants",
         "current",
         "jammed",
@@ -33,7 +44,11 @@ class Motor:
         self._lag = drive.current_lag
         self._width = drive.coulomb_width
         self._shaped = bool(drive.ripple or drive.cogging or drive.load or drive.stops)
-        self._step = self._left = self._mean_left = 0.0
+        self._step = self._left = self._mean_left = self._level = 0.0
+        self._bristle_damping = drive.presliding_damping
+        self.bristle_stiffness = drive.presliding_stiffness
+        """0 for dry friction that sticks [N m/rad]."""
+        self.bristle_torque = 0.0  # N m
         self.constants = (
             drive.torque_constant,
             drive.offset,
@@ -47,11 +62,14 @@ class Motor:
         """True: something holds the joint fast."""
         self.current = 0.0  # A
         self.longest_step = min(LONGEST_STEP, STEP_PER_WIDTH * self._width) if self._width else LONGEST_STEP
+        if self.bristle_stiffness and drive.rotor_inertia:
+            swing = sqrt(armature(drive) / self.bristle_stiffness)
+            self.longest_step = min(LONGEST_STEP, STEP_PER_SWING * swing)
 
     @property
     def is_plain(self) -> bool:
         """Whether lag, torque, offset and sticking Stribeck friction are all there is to it."""
-        return not (self._shaped or self._width or self.jammed)
+        return not (self._shaped or self._width or self.bristle_stiffness or self.jammed)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """What the drive does during one step, its angle and velocity given at the step's middle.
@@ -75,9 +93,27 @@ class Motor:
             torque -= level * bend
             slope += level / self._width * (1.0 - bend * bend)
             level = 0.0
+        elif self.bristle_stiffness:
+            self._level = level
+            bent = self._slipped(0.5 * step, velocity)
+            give = 1.0 - copysign(bent, bent * velocity) / level
+            stiff = (0.5 * step * self.bristle_stiffness + self._bristle_damping) * give
+            torque -= bent + self._bristle_damping * give * velocity
+            slope += stiff
+            level = 0.0
         if self.jammed:
             level += JAM
         return torque, level, slope, command + away * left
+
+    def bend(self, step: float, velocity: float) -> None:
+        """Move the bristles through the step last asked for, its mean velocity [rad/s] now known."""
+        if self.bristle_stiffness:
+            self.bristle_torque = self._slipped(step, velocity)
+
+    def _slipped(self, step: float, velocity: float) -> float:
+        """The bristles' torque after `step` [s] at a constant velocity, exactly [N m]."""
+        end = copysign(self._level, velocity)
+        return end + (self.bristle_torque - end) * exp(-self.bristle_stiffness * abs(velocity) * step / self._level)
 
     def lag(self, step: float) -> tuple[float, float]:
         """How much of a current's distance from its command is left at the end of a step, and on its average."""

@@ -72,6 +72,7 @@ class Pendulum:
             # Friction takes as much of the impulse as brings the joint to rest, up to its limit.
             new = copysign(max(abs(impulse) - dry, 0.0), impulse) / (self._inertia + damp)
         self._a = (new - v) / step
+        self._motor.bend(step, 0.5 * (v + new))
         self._v = new
         self._q = q + half * new
         self._motor.current = current

@@ -80,6 +80,7 @@ class TwoLink:
         motor_1, motor_2 = self._motors
         plain = motor_1.is_plain and motor_2.is_plain
         jammed = motor_1.jammed or motor_2.jammed
+        bristly = motor_1.bristle_stiffness or motor_2.bristle_stiffness
         kt_1, offset_1, coulomb_1, rise_1, per_v1 = motor_1.constants
         kt_2, offset_2, coulomb_2, rise_2, per_v2 = motor_2.constants
         amp_1, amp_2 = motor_1.current, motor_2.current
@@ -150,6 +151,9 @@ class TwoLink:
             a2 = (new_2 - v2) / step
             if jammed:  # an impulse within a tiny step says nothing of the next one's middle
                 a1 = a2 = 0.0
+            if bristly:
+                motor_1.bend(step, 0.5 * (v1 + new_1))
+                motor_2.bend(step, 0.5 * (v2 + new_2))
             v1 = new_1
             v2 = new_2
             q1 = middle_q1 + half * new_1

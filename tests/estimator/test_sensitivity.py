@@ -1,10 +1,12 @@
 """Forward sensitivities against differences of the simulation itself, every parameter at once."""
 
 import numpy as np
+import pytest
 
 from estimator.drive import motor_torque, torque_and_slopes
 from estimator.normal_equations import normal_equations
 from estimator.physics import Physics
+from estimator.presliding import PreslidingSensitive, sensitive
 from estimator.sensitivity import CAUSES, Sensitive
 from estimator.simulation import simulate
 
@@ -18,6 +20,7 @@ ARM = {
     **{"gravity_1": 0.55, "gravity_2": 0.22, "lag": 1e-3, "delay": 2e-4},
     **{f"{name}_{joint}": value for name, value in EACH.items() for joint in (1, 2)},
 }
+BRISTLES = {f"presliding_{name}_{joint}": v for name, v in (("stiffness", 12.0), ("damping", 0.1)) for joint in (1, 2)}
 START = {"position_1": -1.57, "position_2": 0.1, "velocity_1": 0.1, "velocity_2": 0.2}
 RATE, STEPS, SAMPLES = 400.0, 3, 600
 
@@ -33,16 +36,21 @@ def position(values: dict[str, float]) -> np.ndarray:
     return simulate(Physics.of(values), start, motor, 1.0 / (RATE * STEPS))[0]
 
 
-def test_derivatives_are_those_of_the_simulation() -> None:
-    values = {**ARM, **START}
+@pytest.mark.parametrize("bristles", [{}, BRISTLES], ids=["dry", "presliding"])
+def test_derivatives_are_those_of_the_simulation(bristles: dict[str, float]) -> None:
+    values = {**ARM, **START, **bristles}
     start = np.array(list(START.values())).reshape(2, 2)
     motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=ARM["lag"])
-    motion = Sensitive(Physics.of(ARM), start, CAUSES, 1.0 / (RATE * STEPS))
+    # With bristles no step over the velocity has a width, without them they have no stiffness.
+    absent = "coulomb_width" if bristles else "presliding"
+    causes = tuple(cause for cause in CAUSES if not cause.startswith(absent))
+    motion = sensitive(Physics.of(values), start, causes, 1.0 / (RATE * STEPS))
+    assert isinstance(motion, PreslidingSensitive) == bool(bristles)
     parts = [motion.advance(motor[:, part], slopes[:, :, part]) for part in (slice(0, 250), slice(250, SAMPLES))]
     found = np.concatenate([angle for angle, _ in parts], axis=1)
     derivative = np.concatenate([each for _, each in parts], axis=1)
     assert np.allclose(found, position(values), atol=1e-10)
-    for index, cause in enumerate(CAUSES):
+    for index, cause in enumerate(causes):
         change = 1e-6 * max(abs(values[cause]), 1e-3)
         up, down = (position({**values, cause: values[cause] + sign * change}) for sign in (1.0, -1.0))
         difference = (up - down) / (2.0 * change)
