@@ -1,10 +1,11 @@
-"""A realistic arm whose friction the tool has to find out: Stribeck, load-dependent, current lag; then with ripple too.
+"""A realistic arm whose friction the tool has to find out: Stribeck, load-dependent, current lag; then with more.
 
     python benchmarks/friction_models.py [--json] [--seeds N]
 
 The arm of configs/fake_two_link.toml with dry friction that grows by 5 % of the motor's torque; `ripple` adds 2 % of
-torque ripple over the angle. The model is chosen by the tool (`friction = "auto"`). The worst of N seeds; those in
-which the guard stops the arm are counted and passed over.
+torque ripple over the angle, `presliding` lets dry friction yield before it slides, by some 3 mrad. The model is chosen
+by the tool (`friction = "auto"`). The worst of N seeds; those in which the guard stops the arm are counted and passed
+over.
 """
 
 import argparse
@@ -22,7 +23,11 @@ from hil.errors import SafetyStop
 
 SOURCE = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 LAG = "current_lag = 1.0e-3"
-ARMS = {"load": "load = 0.05\n", "ripple": "load = 0.05\nripple = 0.02\n"}
+ARMS = {
+    "load": "load = 0.05\n",
+    "ripple": "load = 0.05\nripple = 0.02\n",
+    "presliding": "load = 0.05\npresliding_stiffness = 20.0\npresliding_damping = 0.4\n",
+}
 
 
 def arm_text(name: str) -> str:

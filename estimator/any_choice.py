@@ -8,6 +8,7 @@ kept apart so; what is judged has seen none but its own half.)
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -59,7 +60,8 @@ def choose_by_shooting(
     zeros: bool = False,
     torque_scale: bool = False,
 ) -> SegmentChoice:
-    """Fit richer and richer friction, and asymmetry on the best, as long as segments left out are predicted better.
+    """Fit richer and richer friction, presliding and asymmetry on the best, as long as segments left out are predicted
+    better.
 
     Arguments as of `estimate_by_shooting`; `torque_scale` is part of every model, or of none. Raises RecordingError for
     recordings of fewer than two segments each, ConvergenceError when no model can be fitted.
@@ -78,8 +80,9 @@ def choose_by_shooting(
     best = trials[0]
     for trial in trials[1:]:
         best = trial if trial.score < WORTH * best.score else best
-    trials.append(tried(replace(best.model, asymmetry=True)))
-    best = trials[-1] if trials[-1].score < WORTH * best.score else best
+    for more in (partial(replace, presliding=True), partial(replace, asymmetry=True)):
+        trials.append(tried(more(best.model)))
+        best = trials[-1] if trials[-1].score < WORTH * best.score else best
     if best.held_out is None:
         raise ConvergenceError("no friction model could be fitted: look at the recording and its units")
     estimate = estimate_by_shooting(recordings, best.model, start, length=length, zeros=zeros)

@@ -72,9 +72,10 @@ def choose(
 ) -> Choice:
     """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
 
-    Coulomb, Stribeck and load-dependent friction come first; then ripple over the angle and friction that differs
-    with direction, on top of the best. Ends when the prediction's error is the encoder's own noise. Raises
-    ConvergenceError when no model can be fitted. `torque_scale` is part of every model, or of none.
+    Coulomb, Stribeck and load-dependent friction come first; then friction that yields before it slides; then ripple
+    over the angle and friction that differs with direction, on top of the best. Ends when the prediction's error is
+    the encoder's own noise. Raises ConvergenceError when no model can be fitted. `torque_scale` is part of every
+    model, or of none.
     """
     trials: list[Trial] = []
     best: Trial | None = None
@@ -98,15 +99,16 @@ def _ladder(joints: int, drive: Drive) -> Iterator[Model]:
     yield Model(joints, "coulomb", drive)
     yield Model(joints, "stribeck", drive)
     yield Model(joints, "stribeck_load", drive)
+    yield Model(joints, "stribeck_load", drive, presliding=True)
     yield Model(joints, "stribeck_load", drive, ripple=True)
     yield Model(joints, "coulomb", drive, asymmetry=True)
 
 
 def _on_top(model: Model, best: Model) -> Model:
-    """Direction is added to the best so far; ripple only shows with all of friction in place."""
+    """Direction is added to the best so far; presliding and ripple only show with all of friction in place."""
     if model.asymmetry:
         return replace(best, asymmetry=True)
-    return model
+    return replace(model, presliding=model.presliding or best.presliding)
 
 
 def _try(model: Model, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, *, hasty: bool) -> Trial:

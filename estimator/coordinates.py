@@ -16,6 +16,7 @@ from estimator.arrays import Array
 
 LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
 MOST_COUPLING = 0.95  # of its bound, at the start
+BEND = 0.01  # rad: much of it, for friction that yields before it slides
 EITHER_SIGN = ("gravity", "offset", "delay", "ripple_sin", "ripple_cos", "ripple_cycles", "zero")
 
 
@@ -83,7 +84,8 @@ def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: f
     scale: Mapping[str, float] = {
         **dict.fromkeys(("inertia", "coupling", "armature"), inertia),
         **dict.fromkeys(("gravity", "coulomb", "offset"), torque),
-        **dict.fromkeys(("viscous", "viscous_asymmetry"), torque / velocity),
+        **dict.fromkeys(("viscous", "viscous_asymmetry", "presliding_damping"), torque / velocity),
+        "presliding_stiffness": torque / BEND,
         **dict.fromkeys(("ripple_sin", "ripple_cos", "ripple_cycles", "zero"), 0.02),
         "stribeck_velocity": velocity,
         "coulomb_width": 0.05,

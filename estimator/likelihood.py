@@ -31,8 +31,10 @@ from estimator.stabilised_run import StabilisedRun
 Run = SimulatedRun | StabilisedRun
 
 WIDTH_FLOOR = 1e-4  # rad/s: friction that sticks is not told from this, and from 3e-4 by half a standard error
-# From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both.
+# From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both. With
+# presliding, what matters is how far friction bends before it slides.
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
+STARTING_BENDS = (1e-3, 5e-3)  # rad
 # An arm that swings past the upright amplifies what is still wrong: it is first held to the measured motion by springs
 # that would give its joints this frequency, then its free beginning is fitted before the whole.
 PULL = 2.0  # Hz
@@ -52,6 +54,7 @@ EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is 
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
+RISES = (0.05, 2.0)  # of static over Coulomb friction, less one: what is to be believed halfway
 LEAST_LAG = 1e-4  # s, at the start
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 LEAST_WINDOW = 0.005  # of a run: rounding is correlated, a little, over more lags than its autocorrelation shows
@@ -185,7 +188,8 @@ def fit_runs(
     enough = HASTY if hasty else COARSE
     tries: list[Minimum] = []
     lost = ConvergenceError("no start was given")
-    own = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
+    shapes = _shapes(linear)
+    own = [_start(model, linear, ripple, shape) for shape in shapes]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
     for start in (*given, *own):
@@ -204,7 +208,9 @@ def fit_runs(
     hopeless = hasty and best.at.cost > HOPELESS * samples
     if not hopeless:
         # What explains the motion may still have its friction's shape wrong, by a little of the sum.
-        again = [minimise(rough.evaluate, _reshaped(problem, best.x, width), enough) for width in STARTING_WIDTHS]
+        # How far friction bends before it slides is seen better than how it rises then.
+        shapes += [{}] * model.presliding
+        again = [found for shape in shapes for found in _retry(rough, _reshaped(problem, best.x, shape), enough)]
         spent += sum(found.iterations for found in again)
         tries += again
         likely = ALIKE * _best(tries).at.cost
@@ -218,6 +224,14 @@ def fit_runs(
     minimum = minimise(problem.evaluate, best.x, last, LEAST_DAMPING)
     spent += sum(found.iterations for found in (*ends, minimum))
     return _fit(periods, problem, minimum, outliers, spent)
+
+
+def _retry(problem: Problem, x: Array, enough: float) -> list[Minimum]:
+    """The minimum from `x`; none if that leads nowhere, which is no loss where there is another."""
+    try:
+        return [minimise(problem.evaluate, x, enough)]
+    except ConvergenceError:
+        return []
 
 
 def _best(tries: Sequence[Minimum]) -> Minimum:
@@ -247,13 +261,30 @@ def _approach(problem: Problem, x: Array, linear: LinearEstimate, samples: int, 
     return replace(found, iterations=spent + found.iterations)
 
 
-def _reshaped(problem: Problem, x: Array, width: float) -> Array:
-    """The coordinates `x` with the shape of friction as at the start, its steps of this width [rad/s]."""
+def _shapes(linear: LinearEstimate) -> list[dict[str, float]]:
+    """Friction near standstill to start from, of every joint: sharp and soft."""
+    viscous, coulomb = (
+        float(np.mean([abs(linear.value[i]) for i, name in enumerate(linear.names) if name.startswith(kind)]))
+        for kind in ("viscous", "coulomb")
+    )
+    return [
+        {"coulomb_width": width, "presliding_stiffness": coulomb / bend, "presliding_damping": viscous}
+        for width, bend in zip(STARTING_WIDTHS, STARTING_BENDS, strict=True)
+    ]
+
+
+def _reshaped(problem: Problem, x: Array, shape: Mapping[str, float]) -> Array:
+    """The coordinates `x` with friction near standstill as at the start, of this shape."""
     names = problem.coordinates.names
-    shape = {"coulomb_width": width, "stribeck_velocity": START["stribeck_velocity"]}
+    shape = {**shape, "stribeck_velocity": START["stribeck_velocity"]}
     moved = np.array([name.rstrip("_12") in shape for name in names])
     start = np.array([shape.get(name.rstrip("_12"), 0.0) for name in names])
     value = np.where(moved, start, problem.coordinates.values(x[: len(names)]))
+    # A rise that has vanished, or grown as it shrank to nothing in velocity, has no slope left that brings it back.
+    low, high = RISES
+    lost = np.array([name.startswith("stribeck_rise") for name in names]) & ((value < low) | (value > high))
+    value = np.where(lost, START["stribeck_rise"], value)
+    moved |= lost
     reshaped = x.copy()
     reshaped[: len(names)][moved] = problem.coordinates.coordinates(value)[moved]
     return reshaped
@@ -275,10 +306,10 @@ def _simulated(period: SettledPeriod) -> Run:
     return SimulatedRun.of(period) if period.stabiliser is None else StabilisedRun.of(period, period.stabiliser)
 
 
-def _start(model: Model, linear: LinearEstimate, ripple: dict[str, float], width: float) -> Array:
+def _start(model: Model, linear: LinearEstimate, ripple: dict[str, float], shape: Mapping[str, float]) -> Array:
     """Parameters to start from [SI] (parameters,): stage 1's, and what it does not see."""
     known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | ripple
-    known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), width)
+    known |= {f"{name}_{joint + 1}": value for name, value in shape.items() for joint in range(model.joints)}
     if model.drive == "delay":
         known["delay"] = linear.delay
     known |= {"lag": max(linear.delay, LEAST_LAG)}

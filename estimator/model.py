@@ -14,6 +14,7 @@ FRICTION_TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("coulomb_width", "stribeck_rise", "stribeck_velocity"),
     "stribeck_load": ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
 }
+PRESLIDING = ("presliding_stiffness", "presliding_damping")
 DRIVE_TERMS: dict[str, tuple[str, ...]] = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 RIPPLE = ("ripple_sin", "ripple_cos", "ripple_cycles")
 UNITS = {
@@ -21,6 +22,8 @@ UNITS = {
     "stribeck_rise": "1",
     "stribeck_velocity": "rad/s",
     "load": "1",
+    "presliding_stiffness": "N m/rad",
+    "presliding_damping": "N m s/rad",
     "viscous_asymmetry": "N m s/rad",
     "ripple_sin": "1",
     "ripple_cos": "1",
@@ -37,7 +40,8 @@ class Model:
     """The arm's equations with these terms.
 
     Friction: `coulomb` is viscous v + coulomb tanh(v / coulomb_width); `stribeck` multiplies coulomb by 1 +
-    stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level.
+    stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level. `presliding`
+    puts bristles that bend before they slip (`estimator.bristles`) in the place of any of these' coulomb_width.
     Drive: `delay` is a pure delay of the torque on top of what `SettledPeriod` knows, `lag` a first-order
     lag, `delay_lag` both. `asymmetry` adds viscous_asymmetry |v|: friction that differs with direction (of the
     Coulomb level, that is the offset). `ripple` multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles
@@ -52,6 +56,7 @@ class Model:
     joints: int
     friction: Friction = "coulomb"
     drive: Drive = "delay"
+    presliding: bool = False
     asymmetry: bool = False
     ripple: bool = False
     zeros: bool = False
@@ -75,6 +80,8 @@ class Model:
     def names(self) -> tuple[str, ...]:
         """The base parameters, then the friction terms joint by joint, then the drive's."""
         more = FRICTION_TERMS[self.friction]
+        if self.presliding:
+            more = (*more[1:], *PRESLIDING)
         more += ("viscous_asymmetry",) * self.asymmetry + RIPPLE * self.ripple + ("zero",) * self.zeros
         terms = (f"{term}_{joint + 1}" for term in more for joint in range(self.joints))
         return (*self.base_names, *terms, *(("torque_scale_2",) * self.torque_scale), *DRIVE_TERMS[self.drive])
@@ -83,6 +90,7 @@ class Model:
     def description(self) -> str:
         """In words, for a person."""
         words = {
+            "presliding": self.presliding,
             "asymmetry": self.asymmetry,
             "ripple": self.ripple,
             "zeros": self.zeros,

@@ -24,7 +24,10 @@ PHASE_TRIALS = 60
 DIFFERENCE = 1e-3  # relative, of a parameter; for the state [rad, rad/s]
 SCALING_ROUNDS = 12
 LEAST_SHARE = 1e-3
-NUISANCES = ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "torque_scale")
+NUISANCES = (
+    *("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "torque_scale"),
+    *("presliding_stiffness", "presliding_damping"),
+)
 THREADS = 2
 LEAST_WIDTH = 0.02  # rad/s
 

@@ -48,7 +48,7 @@ class Physics:
         return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0))
 
     def crossing_time(self) -> float:
-        """The shortest time in which friction turned round moves a joint: across its step's width, on its bristles [s]."""
+        """The shortest time in which friction turned round moves a joint, over its step or on its bristles [s]."""
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
         shared = constant["inertia_2"] ** 2 / (constant["inertia_2"] + constant["armature_2"])
         inertia = (
@@ -67,4 +67,4 @@ class Physics:
             for joint in (1, 2)
             if constant[f"presliding_stiffness_{joint}"] > 0.0
         ]
-        return min(times)
+        return float(min(times))

@@ -22,14 +22,15 @@ from estimator.coordinates import Coordinates, scales_of
 from estimator.errors import ConvergenceError
 from estimator.model import Model
 from estimator.physics import Physics
+from estimator.presliding import sensitive
 from estimator.recording import Recording
 from estimator.segmented_least_squares import Segmented, minimise_segmented
 from estimator.segments import Grid, Segment, cut, grid_torque, grid_torque_slopes
-from estimator.sensitivity import Sensitive
 from estimator.simulation import simulate
 
 WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a second of motion
 STARTING_WIDTH = 0.05  # rad/s
+STARTING_BEND = 0.01  # rad, of friction that yields before it slides
 RISES_FADE = (0.2, 2.0)  # rad/s
 START = {"stribeck_rise": 0.2, "load": 0.02, "delay": 0.0, "lag": 1e-3}
 SHORT = 0.25  # of the segments' length, to begin with
@@ -124,7 +125,7 @@ class Shooting:
         joints = self._model.joints
         zeros = tuple(f"zero_{joint + 1}" for joint in range(joints) if self.zeros)
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
-        motion = Sensitive(
+        motion = sensitive(
             physics,
             own.reshape(2, -1) * self.state_scale,
             (*coordinates.names, *zeros, *state),
@@ -276,6 +277,9 @@ def _starts(problem: Shooting, coordinates: Coordinates, model: Model, base: Arr
     """Shared coordinates to start from: `base`, and what it does not say of friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), STARTING_WIDTH)
+    for joint in range(1, model.joints + 1):
+        known[f"presliding_stiffness_{joint}"] = abs(known[f"coulomb_{joint}"]) / STARTING_BEND
+        known[f"presliding_damping_{joint}"] = abs(known[f"viscous_{joint}"])
     rising = "stribeck_velocity_1" in model.names
     for velocity in RISES_FADE if rising else RISES_FADE[:1]:
         unknown = START | {"stribeck_velocity": velocity}

@@ -9,7 +9,7 @@ from estimator.arrays import Array
 from estimator.drive import motor_torque, torque_and_slopes
 from estimator.period import SettledPeriod
 from estimator.physics import Physics
-from estimator.sensitivity import Sensitive
+from estimator.presliding import sensitive
 from estimator.simulation import MOST_PIECES, simulate, steps_per_sample
 
 ROUGH_STEP, ROUGH_PIECES = 2.6e-3, 16  # s
@@ -56,7 +56,7 @@ class SimulatedRun:
         samples."""
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
-        motion = Sensitive(physics, start, (*names, *state), 1.0 / (self.rate * self.steps), self.most_pieces, pull)
+        motion = sensitive(physics, start, (*names, *state), 1.0 / (self.rate * self.steps), self.most_pieces, pull)
         times = {"delay": physics.delay, "lag": physics.lag}
         torque, slopes = torque_and_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
         samples = round(share * samples)

@@ -95,7 +95,10 @@ class Motor:
             level = 0.0
         elif self.bristle_stiffness:
             self._level = level
-            bent = self._slipped(0.5 * step, velocity)
+            end = copysign(level, velocity)
+            turns = self.bristle_stiffness * abs(velocity) * step / level
+            # Its mean over a step at a constant velocity, exactly.
+            bent = end + (self.bristle_torque - end) * (-expm1(-turns) / turns if turns else 1.0)
             give = 1.0 - copysign(bent, bent * velocity) / level
             stiff = (0.5 * step * self.bristle_stiffness + self._bristle_damping) * give
             torque -= bent + self._bristle_damping * give * velocity

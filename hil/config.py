@@ -185,9 +185,10 @@ class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
     friction: Literal["auto", "coulomb", "stribeck", "stribeck_load"] = Field(
-        "stribeck", description='"auto" tries them, and asymmetry and ripple, and keeps what predicts best'
+        "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
     )
     drive: Literal["delay", "lag", "delay_lag"] = "lag"
+    presliding: bool = Field(False, description="dry friction that yields like a spring before it slides")
     asymmetry: bool = Field(False, description="viscous friction that differs with direction")
     ripple: bool = Field(False, description="torque ripple over the joint's angle")
     zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
@@ -202,8 +203,10 @@ class ModelConfig(_Table):
 
     @model_validator(mode="after")
     def _auto_has_no_terms(self) -> Self:
-        if self.friction == "auto" and (self.asymmetry or self.ripple or self.zeros):
-            raise ValueError('friction = "auto" chooses asymmetry and ripple itself and leaves zeros out: give neither')
+        if self.friction == "auto" and (self.presliding or self.asymmetry or self.ripple or self.zeros):
+            raise ValueError(
+                'friction = "auto" chooses presliding, asymmetry and ripple itself and leaves zeros out: give none'
+            )
         return self
 
 

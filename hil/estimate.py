@@ -69,6 +69,7 @@ def _estimate(
         choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale)
         return choice.estimate, choice
     terms = {
+        "presliding": wanted.presliding,
         "asymmetry": wanted.asymmetry,
         "ripple": wanted.ripple,
         "zeros": wanted.zeros,

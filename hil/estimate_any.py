@@ -76,7 +76,11 @@ def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: flo
         )
         estimate = choice.estimate
     else:
-        terms = {"asymmetry": wanted.asymmetry, "torque_scale": wanted.torque_scale}
+        terms = {
+            "presliding": wanted.presliding,
+            "asymmetry": wanted.asymmetry,
+            "torque_scale": wanted.torque_scale,
+        }
         model = Model(recordings[0].joints, wanted.friction, wanted.drive, **terms)
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))

@@ -20,6 +20,7 @@ _PER_JOINT = ("viscous", "coulomb", "offset")
 _OPTIONAL_PER_JOINT = (
     *("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry"),
     *("ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale"),
+    *("presliding_stiffness", "presliding_damping"),
 )
 _DRIVE = ("lag", "delay")
 

@@ -9,6 +9,8 @@ MEANING = {
     "stribeck_rise": "friction at low speed above Coulomb, as a fraction of it",
     "stribeck_velocity": "velocity where that rise has fallen off",
     "load": "friction per motor torque",
+    "presliding_stiffness": "of the spring as which dry friction yields before it slides",
+    "presliding_damping": "of that spring",
     "viscous_asymmetry": "viscous friction that is more one way than the other",
     "ripple_sin": "torque ripple over the angle, sine part",
     "ripple_cos": "torque ripple over the angle, cosine part",
@@ -24,6 +26,8 @@ UNITS = {
     "stribeck_rise": "",
     "stribeck_velocity": "rad/s",
     "load": "",
+    "presliding_stiffness": "N m/rad",
+    "presliding_damping": "N m s/rad",
     "viscous_asymmetry": "N m s/rad",
     "ripple_sin": "",
     "ripple_cos": "",
@@ -34,12 +38,12 @@ UNITS = {
 }
 
 
-def left_out(model: ArmModel, terms: tuple[str, ...]) -> list[str]:
-    """One sentence per parameter of the model whose kind is among `terms`."""
+def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
+    """One sentence per parameter of the model that has a meaning here, unless the format has `carried` its kind."""
     said = []
     for name, value in model.values.items():
         kind = name.rstrip("0123456789").rstrip("_")
-        if kind in terms:
+        if kind in MEANING and kind not in carried:
             amount = f"{value:.6g} {UNITS[kind]}".rstrip()
             said.append(f"{name} = {amount} ({MEANING[kind]})")
     return said

@@ -9,14 +9,14 @@ from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text
 from hil.export.xml_text import axis, comment, describe, numbers, to_text
 
-_MISSING = ("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "delay")
+_CARRIED = ("armature", "offset", "lag")
 
 
 def export_mjcf(source: Source, path: Path) -> list[str]:
     """Write `path`; what MJCF has no place for. Raises ExportError when no physical masses exist."""
     model = source.model
     links = distribute(model, source.link_length)
-    left = left_out(model, _MISSING)
+    left = left_out(model, _CARRIED)
     root = ET.Element("mujoco", model="arm")
     describe(root, model, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")

@@ -10,14 +10,13 @@ from hil.export.source import Source, write_text
 from hil.export.xml_text import axis, describe, numbers, to_text
 
 STANDARD_GRAVITY = 9.81
-_MISSING = ("armature", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "lag", "delay")
 
 
 def export_urdf(source: Source, path: Path) -> list[str]:
     """Write `path`; what URDF has no place for. Raises ExportError when no physical masses exist."""
     model = source.model
     links = distribute(model, source.link_length)
-    left = [*left_out(model, _MISSING), *torque_constants(model)]
+    left = [*left_out(model), *torque_constants(model)]
     if model.gravity not in (0.0, STANDARD_GRAVITY):
         left.append(f"gravity = {model.gravity:g} m/s^2, with which the masses were computed: set it in the engine")
     root = ET.Element("robot", name="arm")

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.recorded_arm import servo_arm
 from estimator.choice import choose
 from estimator.covariance import correlation_time, structured_share
 from estimator.excitation import Multisine
@@ -17,6 +18,7 @@ from estimator.ripple import find_ripple
 from estimator.validation import validate
 from estimator.verdict import judge
 from fakes.arm import Arm, base_parameters
+from tests.estimator.conftest import STICKING
 
 Recorder = Callable[[Arm, Multisine], SettledPeriod]
 Wave = Callable[..., Multisine]
@@ -44,6 +46,24 @@ def test_friction_is_chosen_by_what_it_predicts(
     assert choice.estimate.residual_steps.max() <= 0.30
     assert choice.chosen.held_out is not None and choice.chosen.held_out.max() < 0.001
     assert choice.gained > 3.0 and choice.cost > 1.0
+
+
+def test_friction_that_yields_before_it_slides_is_found_out(recorded: Recorder, wave: Wave) -> None:
+    bristles = {"presliding_stiffness": 15.0, "presliding_damping": 0.5}
+    arm = servo_arm({**STICKING, **bristles})
+    periods = [recorded(arm, wave(seed, (0.8, 0.42))) for seed in (1, 2)]
+    choice = choose(periods[:1], periods[1], "lag")
+    found = choice.estimate
+    assert found.model.presliding
+    assert worst(found.parameters, arm) < 0.005
+    assert found.residual_steps.max() <= 0.30
+    assert choice.chosen.held_out is not None and choice.chosen.held_out.max() < 0.001
+    std = dict(zip(found.names, found.std, strict=True))
+    for name, true in bristles.items():
+        for joint in ("1", "2"):
+            assert abs(found.parameters[f"{name}_{joint}"] - true) < max(0.02 * true, 3.0 * std[f"{name}_{joint}"])
+    plain = choice.trials[2]
+    assert plain.model.friction == "stribeck_load" and plain.score > 3.0 * choice.chosen.score
 
 
 def test_a_wild_reading_costs_nothing(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:

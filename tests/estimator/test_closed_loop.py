@@ -16,6 +16,9 @@ ARM = {
     **{"offset_1": 0.004, "offset_2": -0.003},
 }
 SHAPE = {"coulomb_width_1": 0.05, "coulomb_width_2": 0.05, "lag": 1e-3}
+BRISTLES = {"lag": 1e-3} | {
+    f"presliding_{name}_{joint}": value for name, value in (("stiffness", 12.0), ("damping", 0.3)) for joint in (1, 2)
+}
 POSE = np.array([-np.pi / 2, 0.0])
 RATE = 200.0
 
@@ -24,8 +27,9 @@ def wave(peak: float, period: float = 4.0):  # type: ignore[no-untyped-def]
     return design_multisine(RATE, period, zippered_lines(period, (0.5, 5.0), 2), [peak, 0.6 * peak], 1)
 
 
-def test_without_feedback_it_is_the_open_loop() -> None:
-    physics, multisine = Physics.of({**ARM, **SHAPE}), wave(0.5)
+@pytest.mark.parametrize("friction", [SHAPE, BRISTLES], ids=["dry", "presliding"])
+def test_without_feedback_it_is_the_open_loop(friction: dict[str, float]) -> None:
+    physics, multisine = Physics.of({**ARM, **friction}), wave(0.5)
     steps = steps_per_sample(RATE)
     torque = motor_torque(multisine.torque, RATE, 0.0, steps, delay=0.0, lag=1e-3)
     start = np.stack((POSE, np.zeros(2)))
@@ -36,9 +40,10 @@ def test_without_feedback_it_is_the_open_loop() -> None:
     assert np.abs(found.position - expected).max() < 2e-4, "rad; the two begin with slightly different lag states"
 
 
-def test_two_halves_are_one_whole_and_one_joint_works() -> None:
+@pytest.mark.parametrize("friction", [SHAPE, BRISTLES], ids=["dry", "presliding"])
+def test_two_halves_are_one_whole_and_one_joint_works(friction: dict[str, float]) -> None:
     feedback = Feedback(np.array([1.0, 0.5]), np.array([0.05, 0.02]), POSE, np.array([2.0, 1.0]))
-    physics, command = Physics.of({**ARM, **SHAPE}), wave(0.8).torque
+    physics, command = Physics.of({**ARM, **friction}), wave(0.8).torque
     whole = respond(physics, resting(POSE), command, RATE, feedback)
     first = respond(physics, resting(POSE), command[:, :300], RATE, feedback)
     second = respond(physics, first.state, command[:, 300:], RATE, feedback)

@@ -93,7 +93,7 @@ def test_friction_is_chosen_by_segments_left_out(pendulum: Arm) -> None:
     choice = choose_by_shooting([recorded], "delay", start(recorded))
     assert choice.chosen.model.friction == "stribeck" and choice.gained > 1.5
     assert choice.estimate.parameters["stribeck_rise_1"] == pytest.approx(0.6, rel=0.1)
-    assert len(choice.trials) == 4
+    assert len(choice.trials) == 5
     with pytest.raises(RecordingError, match="two segments"):
         choose_by_shooting([recorded], "delay", start(recorded), length=6.0)
 

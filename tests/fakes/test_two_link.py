@@ -126,10 +126,42 @@ def test_friction_brings_a_swinging_arm_to_an_exact_rest() -> None:
     assert plant.velocity == (0.0, 0.0)
 
 
+def test_friction_yields_before_it_slides_and_lets_go_again() -> None:
+    """Pushed slowly by less than its level, it bends by -level / stiffness log(1 - torque / level)."""
+    soft = arm(1, coulomb=0.05, presliding_stiffness=10.0, presliding_damping=0.3, viscous=0.02)
+    plant = make_plant(soft)
+    gravity = base_parameters(soft)["gravity_1"]
+    for k in range(4400):
+        plant.advance((k + 1) / 400, (min(k / 4000, 1.0) * 0.03 / 1.8,))
+    moved = plant.position[0] - soft.start[0]
+    held = 0.03 - gravity * math.sin(moved)
+    assert moved == pytest.approx(-0.05 / 10.0 * math.log(1.0 - held / 0.05), rel=0.01)
+    assert abs(plant.velocity[0]) < 1e-5
+    plant.advance(15.0, (0.0,))
+    # Bent back by log(1 + torque / level): what is left is friction's hysteresis.
+    left = moved - 0.05 / 10.0 * math.log(1.0 + held / 0.05)
+    assert plant.position[0] - soft.start[0] == pytest.approx(left, rel=0.1)
+
+
 @pytest.mark.parametrize("joints", [1, 2])
-@pytest.mark.parametrize("width", [0.0, 0.05])
-def test_motion_does_not_depend_on_how_advance_is_cut(joints: int, width: float) -> None:
-    drives = arm(joints, **FRICTION, coulomb_width=width, current_lag=1e-3, load=0.05, ripple=0.02)
+def test_friction_that_has_yielded_is_dry_friction(joints: int) -> None:
+    """Far from standstill both kinds of dry friction brake alike."""
+    start, speed = (0.3, 0.4)[:joints], (3.0, -4.0)[:joints]
+    ends = []
+    for near in ({}, {"presliding_stiffness": 100.0, "presliding_damping": 0.1}):
+        sliding = arm(joints, start, coulomb=0.05, viscous=0.02, **near)
+        plant = Pendulum(sliding, speed) if joints == 1 else TwoLink(sliding, speed)
+        plant.advance(0.05, (0.0,) * joints)
+        ends.append(tuple(plant.velocity))
+    assert ends[1] == pytest.approx(ends[0], rel=0.02)
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+@pytest.mark.parametrize(
+    "near", [{}, {"coulomb_width": 0.05}, {"presliding_stiffness": 15.0, "presliding_damping": 0.3}]
+)
+def test_motion_does_not_depend_on_how_advance_is_cut(joints: int, near: dict[str, float]) -> None:
+    drives = arm(joints, **FRICTION, **near, current_lag=1e-3, load=0.05, ripple=0.02)
     cuts = ((2.5e-3,), (0.18e-3, 0.34e-3, 2.5e-3), (0.01e-3, 1.1e-3, 1.3e-3, 2.5e-3))
     tracks = []
     for cut in cuts:
@@ -172,6 +204,9 @@ def test_current_follows_a_first_order_lag() -> None:
         ({"weight": 3.0}, "weight"),
         ({"drives": ({**DRIVE, "viscous": -0.1}, DRIVE)}, "viscous"),
         ({"drives": ({**DRIVE, "coulomb_width": 1e-5}, DRIVE)}, "coulomb_width"),
+        ({"drives": ({**DRIVE, "presliding_stiffness": 9.0}, DRIVE)}, "needs a coulomb"),
+        ({"drives": ({**DRIVE, "presliding_damping": 0.1}, DRIVE)}, "needs a presliding_stiffness"),
+        ({"drives": ({**DRIVE, "presliding_stiffness": 9.0, "coulomb": 0.1, "coulomb_width": 0.1}, DRIVE)}, "give one"),
     ],
 )
 def test_a_wrong_arm_is_refused_by_name(change: dict[str, Any], named: str) -> None:

@@ -20,6 +20,8 @@ _MEANING = {
     "stribeck_rise": "more dry friction at low speed",
     "stribeck_velocity": "speed where that has fallen off",
     "load": "friction per torque",
+    "presliding_stiffness": "how dry friction yields before it slides",
+    "presliding_damping": "of that yielding",
     "viscous_asymmetry": "more friction one way",
     "ripple_sin": "torque ripple over the angle",
     "ripple_cos": "torque ripple over the angle",

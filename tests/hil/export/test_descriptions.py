@@ -140,10 +140,13 @@ def test_a_horizontal_arm_asks_for_its_link_length(identified: Path) -> None:
 
 @pytest.mark.parametrize("name", ["urdf", "mjcf"])
 def test_what_has_no_place_is_said_and_written_down(identified: Path, name: str) -> None:
-    model = with_values(load_model(identified), stribeck_rise_1=0.4, stribeck_velocity_1=0.15, load_2=0.05, delay=1e-3)
+    more = {"stribeck_rise_1": 0.4, "stribeck_velocity_1": 0.15, "load_2": 0.05, "delay": 1e-3, "ripple_sin_1": 0.02}
+    more |= {"presliding_stiffness_1": 15.0, "viscous_asymmetry_2": 0.001, "zero_1": 0.01}
+    model = with_values(load_model(identified), **more)
     path, left = write(model, identified, name)
     said = "\n".join(left)
-    for term in ("stribeck_rise_1 = 0.4", "load_2 = 0.05", "delay = 0.001 s", "coulomb_width_1"):
+    terms = ("stribeck_rise_1 = 0.4", "load_2 = 0.05", "delay = 0.001 s", "coulomb_width_1", "ripple_sin_1 = 0.02")
+    for term in (*terms, "presliding_stiffness_1 = 15 N m/rad", "viscous_asymmetry_2 = 0.001", "zero_1 = 0.01 rad"):
         assert term in said
     if name == "urdf":
         assert "armature_2" in said and "offset_1" in said and "torque per goal of elbow = 1.8 N m/A" in said

@@ -1,0 +1,80 @@
+"""What friction that yields before it slides costs a model that has none, and what a model that has it makes of it.
+
+    python benchmarks/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5]
+
+The realistic fake arm without its bus, its dry friction a spring of this stiffness [N m/rad] before it slides, damped
+to 0.7 of critical; Stribeck friction is in both models. The worst of N seeds; `gained`: held-out error of the
+model without presliding over that of the one with it, the least of them.
+"""
+
+import argparse
+import json
+import math
+
+import numpy as np
+from machine import machine
+from recorded_arm import record, servo_arm, wave
+
+from estimator.choice import relative_error
+from estimator.errors import ConvergenceError, PeriodicityError
+from estimator.identify import identify, predict
+from estimator.model import Model
+from estimator.period import SettledPeriod
+from fakes.arm import Arm, base_parameters
+
+FRICTION = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}
+PEAK = (0.6, 0.35)  # N m
+INERTIA = 0.012  # kg m^2, about what either joint feels
+GROUPS = {"inertia": ("inertia", "coupling", "armature"), "gravity": ("gravity",), "friction": ("viscous", "coulomb")}
+
+
+def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding: bool) -> dict[str, float]:
+    """All infinite where the fit, or the prediction, finds no end."""
+    keys = (*(f"{group}_error" for group in GROUPS), "held_out_rms", "residual_ticks")
+    try:
+        found = identify(period, Model(2, "stribeck", "lag", presliding=presliding))
+        predicted = predict(found, held_out.torque, held_out.rate, held_out.command_to_sample)
+    except (ConvergenceError, PeriodicityError):
+        return dict.fromkeys(keys, math.inf)
+    truth = base_parameters(arm)
+    errors = {name: abs(found.parameters[name] / true - 1.0) for name, true in truth.items()}
+    worst = [max(error for name, error in errors.items() if name.split("_")[0] in kinds) for kinds in GROUPS.values()]
+    held = float(relative_error(held_out, predicted).max())
+    return dict(zip(keys, (*worst, held, float(found.residual_steps.max())), strict=True))
+
+
+def measure(stiffness: float, seeds: int) -> dict[str, dict[str, float]]:
+    damping = 1.4 * math.sqrt(stiffness * INERTIA)
+    arm = servo_arm({**FRICTION, "presliding_stiffness": stiffness, "presliding_damping": damping})
+    runs: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
+    for seed in range(seeds):
+        period, held_out = (record(arm, wave(2 * seed + each, PEAK)).rounded() for each in (1, 2))
+        for name, entries in runs.items():
+            entries.append(figures(arm, period, held_out, name == "with"))
+    worst = {name: {key: max(run[key] for run in each) for key in each[0]} for name, each in runs.items()}
+    pairs = zip(runs["without"], runs["with"], strict=True)
+    worst["with"]["gained"] = float(np.min([a["held_out_rms"] / b["held_out_rms"] for a, b in pairs]))
+    return worst
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--stiffness", type=float, nargs="+", default=[1000.0, 200.0, 50.0, 15.0, 5.0])
+    options = parser.parse_args()
+    found = {f"{stiffness:g}": measure(stiffness, options.seeds) for stiffness in options.stiffness}
+    if options.json:
+        print(json.dumps(found))
+        return
+    print(f"{machine()}; worst of {options.seeds} seeds")
+    for stiffness, entry in found.items():
+        for name, each in entry.items():
+            shown = (
+                f"{k} {v:.2f}" if k in ("gained", "residual_ticks") else f"{k} {100 * v:.3f} %" for k, v in each.items()
+            )
+            print(f"{stiffness:>5s} N m/rad {name:7s} {', '.join(shown)}")
+
+
+if __name__ == "__main__":
+    main()
