@@ -74,8 +74,7 @@ class Stabilised:
 
     def positions(self, physics: Physics, start: Array, rate: float, command_to_sample: float) -> Array:
         """Simulated angles (joints, samples) [rad] from `start` (2, joints) at the first sample."""
-        bent = first_bend(physics, start[1])
-        state = np.concatenate((start, self.former_torque[None], self.former, bent[None]))
+        state = np.concatenate((start, self.former_torque[None], self.former))
         return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
 
     def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
@@ -99,7 +98,10 @@ def resting(pose: Array) -> Array:
 
 
 def respond(physics: Physics, state: Array, command: Array, rate: float, feedback: Feedback) -> Response:
-    """Simulate one sample for each of `command` (joints, samples) [N m], at `rate` [1/s], from `state`."""
+    """Simulate one sample for each of `command` (joints, samples) [N m], at `rate` [1/s], from `state`.
+
+    Without its last row friction's bristles are bent as those of a sliding joint.
+    """
     joints, samples = command.shape
     steps = steps_per_sample(rate)
     step = 1.0 / (rate * steps)
@@ -109,7 +111,8 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     both = np.zeros((2, samples))
     both[:joints] = command
     full = np.zeros((6, 2))
-    full[:, :joints] = state
+    full[5, :joints] = first_bend(physics, state[1])
+    full[: len(state), :joints] = state
     position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
     lag = physics.lag + max(physics.delay, 0.0)
     moving = without_dry_friction(physics.vector)

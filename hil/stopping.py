@@ -68,7 +68,7 @@ class Stopping:
 
 @dataclass(frozen=True)
 class _Start:
-    """state: as `respond` takes it (6, joints). goal: torque that the former goals command (joints,) [N m].
+    """state: as `respond` takes it (5 or 6, joints). goal: torque that the former goals command (joints,) [N m].
 
     jammed: a joint that something holds fast.
     """

@@ -57,6 +57,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
             r"safety\.watchdog.*steps of 0\.02 s, so a multiple",
         ),
         ("url =", "url ", r"not valid TOML"),
+        ('friction = "stribeck"', 'friction = "auto"\npresliding = true', r"chooses presliding.*: give none"),
         ("[model]", "[model]\ntorque_scale = 1", r"model\.torque_scale = 1: must be true or false"),
     ],
 )
