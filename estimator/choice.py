@@ -6,8 +6,9 @@ rest, gets better only by what is true in it. Without such a motion the Bayesian
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -68,21 +69,27 @@ class Choice:
 
 
 def choose(
-    periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drive: Drive, *, torque_scale: bool = False
+    periods: Sequence[SettledPeriod],
+    held_out: SettledPeriod | None,
+    drive: Drive,
+    *,
+    torque_scale: bool = False,
+    starts: Sequence[Mapping[str, float]] = (),
 ) -> Choice:
     """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
 
     Coulomb, Stribeck and load-dependent friction come first; then friction that yields before it slides; then ripple
     over the angle and friction that differs with direction, on top of the best. Ends when the prediction's error is
     the encoder's own noise. Raises ConvergenceError when no model can be fitted. `torque_scale` is part of every
-    model, or of none.
+    model, or of none; `starts` as of `estimator.identify.identify`.
     """
     trials: list[Trial] = []
     best: Trial | None = None
+    tried = partial(_try, periods, held_out, starts)
     joints = periods[0].joints
     for step in _ladder(joints, drive):
         model = replace(step, torque_scale=torque_scale)
-        trial = _try(model if best is None else _on_top(model, best.model), periods, held_out, hasty=True)
+        trial = tried(model if best is None else _on_top(model, best.model), hasty=True)
         trials.append(trial)
         if best is None or trial.score < WORTH * best.score:
             best = trial
@@ -91,7 +98,7 @@ def choose(
     if best is None or best.estimate is None:
         raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
     if best.score >= EXPLAINED:
-        best = _try(best.model, periods, held_out, hasty=False)
+        best = tried(best.model, hasty=False)
     return Choice(tuple(trials), best)
 
 
@@ -111,11 +118,18 @@ def _on_top(model: Model, best: Model) -> Model:
     return replace(model, presliding=model.presliding or best.presliding)
 
 
-def _try(model: Model, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, *, hasty: bool) -> Trial:
+def _try(
+    periods: Sequence[SettledPeriod],
+    held_out: SettledPeriod | None,
+    starts: Sequence[Mapping[str, float]],
+    model: Model,
+    *,
+    hasty: bool,
+) -> Trial:
     started = time.perf_counter()
     relative = None
     try:
-        estimate = identify(periods, model, hasty=hasty)
+        estimate = identify(periods, model, hasty=hasty, starts=starts)
         if held_out is None:
             score = _criterion(estimate, periods)
         else:

@@ -66,7 +66,7 @@ def _estimate(
     """The estimate of the model that the configuration asks for, or of the one chosen, with how it was."""
     wanted = config.model
     if wanted.friction == "auto":
-        choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale)
+        choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts)
         return choice.estimate, choice
     terms = {
         "presliding": wanted.presliding,

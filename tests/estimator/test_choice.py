@@ -35,6 +35,11 @@ def test_the_plain_model_is_kept_where_nothing_more_is_true(
     choice = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay")
     assert choice.estimate.model == Model(2, "coulomb", "delay")
     assert choice.gained == 1.0 and choice.cost == pytest.approx(1.0)
+    # A start that leads nowhere is counted, so it was taken, and costs the result nothing.
+    astray = {name: 0.1 * value for name, value in base_parameters(ideal_arm).items()}
+    again = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay", starts=[astray])
+    assert again.estimate.iterations != choice.estimate.iterations
+    assert again.estimate.value == pytest.approx(choice.estimate.value, rel=1e-3)
 
 
 def test_friction_is_chosen_by_what_it_predicts(
