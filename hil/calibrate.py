@@ -1,18 +1,19 @@
 """`hil calibrate`: each joint's torque constant from two runs, one of them with a known mass bolted on."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from estimator.calibration import Calibration, KnownMass, calibrate
 from estimator.identify import identify
-from estimator.model import Model
 from hil.config import Config
 from hil.errors import ConfigError
 from hil.plan import IDENTIFY
 from hil.recording import load_samples
 from hil.run_folder import RunFolder
 from hil.settled import settled_period
+from hil.wanted_model import wanted_model
 
 SCHEMA = 1
 
@@ -27,7 +28,9 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
         settled_period(each, run.load_facts(), load_samples(run.samples_path, len(each.joints)), IDENTIFY)
         for each, run in ((config, without), (other, with_mass))
     ]
-    first = identify(periods[0], Model(len(config.joints), config.model.fixed_friction, config.model.drive))
+    # The ratio of the torque constants is what the mass tells, and each of them.
+    model = replace(wanted_model(config.model, len(config.joints)), torque_scale=False)
+    first = identify(periods[0], model)
     found = calibrate(periods[0], periods[1], first, known, config.arm.gravity)
     return _described(config, found)
 

@@ -19,6 +19,7 @@ from hil.recording import load_samples
 from hil.run_folder import RunFolder, write_json
 from hil.settled import settled_period
 from hil.truth import true_parameters
+from hil.wanted_model import wanted_model
 
 SCHEMA = 1
 OURS = "hil"
@@ -48,7 +49,7 @@ def all_methods(
     config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
 ) -> Iterator[Peer]:
     """This project's own estimate first, then its peers."""
-    ours = _ours(period, OURS, _model(config, period))
+    ours = _ours(period, OURS, wanted_model(config.model, period.joints))
     yield ours
     length = link_length(config)
     yield from compare_peers(period, length, config.arm.gravity)
@@ -69,11 +70,6 @@ def link_length(config: Config) -> float | None:
     if config.is_fake and config.fake is not None and config.fake.arm is not None:
         return config.fake.arm.links[0].length
     return None
-
-
-def _model(config: Config, period: SettledPeriod) -> Model:
-    wanted = config.model
-    return Model(period.joints, wanted.fixed_friction, wanted.drive, torque_scale=wanted.torque_scale)
 
 
 def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> dict[str, Any]:
@@ -113,7 +109,7 @@ def _ours(period: SettledPeriod, name: str, model: Model) -> Peer:
     estimate = identify(period, model)
     seconds = time.perf_counter() - began
     std = dict(zip(estimate.names, estimate.std.tolist(), strict=True))
-    settings = f"{model.friction} friction, {model.drive} drive"
+    settings = model.description
     return Peer(name, estimate.parameters, std, seconds, settings, 1)
 
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from estimator.choice import Choice, choose
 from estimator.identify import Estimate, identify, predict
-from estimator.model import Model
 from estimator.period import SettledPeriod
 from estimator.physics import Physics
 from estimator.validation import validate
@@ -24,6 +23,7 @@ from hil.run_folder import RunFolder
 from hil.settled import settled_period
 from hil.stabiliser import stabiliser_share
 from hil.timing import timing
+from hil.wanted_model import wanted_model
 from hil.warnings import warnings_of
 
 
@@ -68,14 +68,7 @@ def _estimate(
     if wanted.friction == "auto":
         choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts)
         return choice.estimate, choice
-    terms = {
-        "presliding": wanted.presliding,
-        "asymmetry": wanted.asymmetry,
-        "ripple": wanted.ripple,
-        "zeros": wanted.zeros,
-        "torque_scale": wanted.torque_scale,
-    }
-    return identify(period, Model(len(config.joints), wanted.friction, wanted.drive, **terms), starts=starts), None
+    return identify(period, wanted_model(wanted, len(config.joints)), starts=starts), None
 
 
 def _predict(config: Config, estimate: Estimate, other: SettledPeriod) -> NDArray[np.float64]:

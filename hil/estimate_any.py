@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,6 @@ import numpy as np
 
 from estimator.any_choice import choose_by_shooting
 from estimator.idim import fit_inverse_dynamics
-from estimator.model import Model
 from estimator.recording import Recording
 from estimator.shooting import ShootingEstimate, estimate_by_shooting
 from hil.any_warnings import any_warnings
@@ -21,6 +21,7 @@ from hil.physical import physical_entries
 from hil.recording import load_samples
 from hil.result_checks import describe_segment_choice
 from hil.run_folder import RunFolder
+from hil.wanted_model import wanted_model
 from hil.warnings import clipping_warnings
 
 SCHEMA = 1
@@ -76,12 +77,8 @@ def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: flo
         )
         estimate = choice.estimate
     else:
-        terms = {
-            "presliding": wanted.presliding,
-            "asymmetry": wanted.asymmetry,
-            "torque_scale": wanted.torque_scale,
-        }
-        model = Model(recordings[0].joints, wanted.friction, wanted.drive, **terms)
+        # The encoders' zeros are each recording's own here.
+        model = replace(wanted_model(wanted, recordings[0].joints), zeros=False)
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
     result["warnings"] = any_warnings(recordings, estimate)
