@@ -64,7 +64,7 @@ def arm_toml(arm: ArmAnswers) -> str:
     ]
     model = [
         "[model]",
-        _line('friction = "stribeck"', '"coulomb" has less, "stribeck_load" more'),
+        _line('friction = "stribeck"', '"coulomb" has less, "stribeck_load" more; "auto" tries them all'),
         _line('drive = "lag"', '"delay": a pure delay instead of a current loop'),
     ]
     if len(arm.joints) == 2:

@@ -36,7 +36,7 @@ def _draw_chart(axes: Any, chart: Chart) -> None:
     axes.set_yscale("log" if chart.log_y else "linear")
     axes.grid(color="#e3e6ea")
     if any(series.name for series in chart.series):
-        axes.legend(fontsize=8, loc="upper right")
+        axes.legend(fontsize=8, loc="best")
 
 
 def _draw_series(axes: Any, series: Series) -> None:
