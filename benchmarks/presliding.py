@@ -1,17 +1,20 @@
 """What friction that yields before it slides costs a model that has none, and what a model that has it makes of it.
 
-    python benchmarks/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5]
+    python benchmarks/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5] [--law slip]
 
 The realistic fake arm without its bus, its dry friction a spring of this stiffness [N m/rad] before it slides, damped
-to 0.7 of critical; Stribeck friction is in both models. The worst of N seeds; `gained`: held-out error of the
+to 0.7 of critical; Stribeck friction is in both models. `--law slip` moves the arm by a law that the estimator does not
+have, benchmarks/elastic_slip.py. The worst of N seeds; `gained`: held-out error of the
 model without presliding over that of the one with it, the least of them.
 """
 
 import argparse
 import json
 import math
+from unittest.mock import patch
 
 import numpy as np
+from elastic_slip import SlippingMotor
 from machine import machine
 from recorded_arm import record, servo_arm, wave
 
@@ -21,10 +24,12 @@ from estimator.identify import identify, predict
 from estimator.model import Model
 from estimator.period import SettledPeriod
 from fakes.arm import Arm, base_parameters
+from fakes.motor import Motor
 
 FRICTION = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}
 PEAK = (0.6, 0.35)  # N m
 INERTIA = 0.012  # kg m^2, about what either joint feels
+LAWS: dict[str, type[Motor]] = {"bristles": Motor, "slip": SlippingMotor}
 GROUPS = {"inertia": ("inertia", "coupling", "armature"), "gravity": ("gravity",), "friction": ("viscous", "coulomb")}
 
 
@@ -43,12 +48,13 @@ def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding
     return dict(zip(keys, (*worst, held, float(found.residual_steps.max())), strict=True))
 
 
-def measure(stiffness: float, seeds: int) -> dict[str, dict[str, float]]:
+def measure(stiffness: float, seeds: int, law: type[Motor]) -> dict[str, dict[str, float]]:
     damping = 1.4 * math.sqrt(stiffness * INERTIA)
     arm = servo_arm({**FRICTION, "presliding_stiffness": stiffness, "presliding_damping": damping})
     runs: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
     for seed in range(seeds):
-        period, held_out = (record(arm, wave(2 * seed + each, PEAK)).rounded() for each in (1, 2))
+        with patch("fakes.two_link.Motor", law):
+            period, held_out = (record(arm, wave(2 * seed + each, PEAK)).rounded() for each in (1, 2))
         for name, entries in runs.items():
             entries.append(figures(arm, period, held_out, name == "with"))
     worst = {name: {key: max(run[key] for run in each) for key in each[0]} for name, each in runs.items()}
@@ -62,12 +68,14 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--stiffness", type=float, nargs="+", default=[1000.0, 200.0, 50.0, 15.0, 5.0])
+    parser.add_argument("--law", choices=LAWS, default="bristles")
     options = parser.parse_args()
-    found = {f"{stiffness:g}": measure(stiffness, options.seeds) for stiffness in options.stiffness}
+    law = LAWS[options.law]
+    found = {f"{stiffness:g}": measure(stiffness, options.seeds, law) for stiffness in options.stiffness}
     if options.json:
         print(json.dumps(found))
         return
-    print(f"{machine()}; worst of {options.seeds} seeds")
+    print(f"{machine()}; the arm has {options.law}, worst of {options.seeds} seeds")
     for stiffness, entry in found.items():
         for name, each in entry.items():
             shown = (
