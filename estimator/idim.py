@@ -62,18 +62,25 @@ def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, flo
     return position, recording.mean_torque(edges, delay), dt
 
 
-def filtered_rows(recording: Recording, cutoff: float, coulomb_width: float, delay: float = 0.0) -> Rows:
-    """Rows of the regression at this `cutoff` [Hz]; raises RecordingError when it leaves nothing."""
+def filtered_rows(
+    recording: Recording,
+    cutoff: float,
+    coulomb_width: float,
+    delay: float = 0.0,
+    position_cutoff: float | None = None,
+) -> Rows:
+    """Rows of the regression; arguments as of `fit_inverse_dynamics`. Raises RecordingError when nothing is left."""
     position, torque, dt = uniform(recording, delay)
     trim = int(np.ceil(TRIM / (cutoff * dt)))
     keep = max(1, int(1.0 / (PER_CYCLE * cutoff * dt)))
-    if cutoff >= 0.45 / dt or position.shape[1] < 3 * trim:
+    highest = max(cutoff, position_cutoff or cutoff)
+    if highest >= 0.45 / dt or position.shape[1] < 3 * trim:
         raise RecordingError(
-            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {cutoff:g} Hz: "
+            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {highest:g} Hz: "
             "record longer or faster"
         )
     filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
-    smooth = sosfiltfilt(filter_, position, axis=1)
+    smooth = sosfiltfilt(butter(ORDER, position_cutoff or cutoff, fs=1.0 / dt, output="sos"), position, axis=1)
     velocity = np.gradient(smooth, dt, axis=1)
     acceleration = np.gradient(velocity, dt, axis=1)
     Y = sosfiltfilt(filter_, regressor(smooth, velocity, acceleration, coulomb_width), axis=1)
@@ -82,14 +89,19 @@ def filtered_rows(recording: Recording, cutoff: float, coulomb_width: float, del
 
 
 def fit_inverse_dynamics(
-    recordings: Sequence[Recording], cutoff: float, coulomb_width: float, delay: float = 0.0
+    recordings: Sequence[Recording],
+    cutoff: float,
+    coulomb_width: float,
+    delay: float = 0.0,
+    position_cutoff: float | None = None,
 ) -> InverseDynamics:
     """IDIM-LS over all `recordings`, each joint weighted by what a first solution left of its torque.
 
-    `cutoff` [Hz], `coulomb_width` [rad/s] of the Coulomb step, `delay` [s] of the torque. Raises
+    `cutoff` [Hz] of regressors and torques, `position_cutoff` [Hz] of the positions that the regressors are made of
+    (the same if none is given), `coulomb_width` [rad/s] of the Coulomb step, `delay` [s] of the torque. Raises
     RecordingError, UnidentifiableError.
     """
-    rows = [filtered_rows(recording, cutoff, coulomb_width, delay) for recording in recordings]
+    rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff) for recording in recordings]
     Y = np.concatenate([row.regressor for row in rows], axis=1)
     tau = np.concatenate([row.torque for row in rows], axis=1)
     weight = np.ones(len(Y))

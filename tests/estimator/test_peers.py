@@ -27,6 +27,16 @@ def test_filtered_inverse_dynamics_is_within_percents(ideal_arm: Arm, ideal_peri
     assert found.relative_residual.max() < 0.1
 
 
+def test_rows_and_positions_may_be_filtered_apart(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
+    recording = joined(ideal_period, 1)
+    alike, same, apart = (
+        fit_inverse_dynamics([recording], 4.0, 0.05, position_cutoff=cutoff) for cutoff in (None, 4, 20)
+    )
+    assert np.array_equal(alike.value, same.value)
+    kinds = ("inertia", "coupling", "gravity")
+    assert worst(apart.names, apart.value, ideal_arm, *kinds) < 0.5 * worst(alike.names, alike.value, ideal_arm, *kinds)
+
+
 def test_recursive_least_squares_gets_near_it(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
     found = fit_recursively([joined(ideal_period, 1)], 15.0, 0.05)
     assert worst(found.names, found.value, ideal_arm, "inertia", "coupling", "armature", "gravity") < 0.03
