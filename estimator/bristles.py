@@ -9,7 +9,10 @@ its b being the bristles' torque here. Viscous friction comes on top, as ever.
 A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506): the bristles bend for half of it
 at the velocity where it starts, exactly; the arm moves with their torque, which then is one more offset, and their
 damping, one more viscous friction; and they bend for the other half at the velocity where it ends. The arm's own step
-is that of every other friction law.
+is that of every other friction law. The level is taken at the velocity in the middle of the step, in the first half as
+the last step's acceleration foresees it: bristles that slip are the level and nothing else, and would be half a step
+late.
+Against a hundred steps per sample, three at 400 Hz are within 0.03 encoder steps RMS for 5 to 1000 N m/rad.
 """
 
 import math
@@ -50,16 +53,17 @@ def first_bend(physics: Physics, velocity: Array) -> Array:
 
 
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
-def bend(p: Any, b: Any, m: Any, v1: float, v2: float, t1: float, t2: float, time: float) -> None:
-    """Bend the bristles b (2,) [N m] for `time` [s] at these velocities under the motor torques t1 and t2 [N m].
+def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1: float, t2: float, time: float) -> None:
+    """Bend the bristles b (2,) [N m] for `time` [s] at the velocities v1 and v2 under the motor torques t1 and t2.
 
-    Puts into the constants `m` what the arm then feels of them.
+    u1 and u2 are the velocities in the middle of the arm's step, where the level is taken: it is the whole of friction
+    once the bristles slip. Puts into the constants `m` what the arm then feels of them.
     """
     for joint in range(2):
         stiffness = p[STIFFNESS + joint]
         if stiffness > 0.0:
-            v, t = (v1, t1) if joint == 0 else (v2, t2)
-            rise = p[RISE + joint] * math.exp(-((v / p[FADING + joint]) ** 2))
+            v, u, t = (v1, u1, t1) if joint == 0 else (v2, u2, t2)
+            rise = p[RISE + joint] * math.exp(-((u / p[FADING + joint]) ** 2))
             level = p[COULOMB + joint] * (1.0 + rise) + p[LOAD + joint] * abs(p[SCALE + joint] * t)
             end = math.copysign(level, v)
             b[joint] = end + (b[joint] - end) * math.exp(-stiffness * abs(v) * time / level)

@@ -168,11 +168,12 @@ def _loop(
             left = pieces
             while left > 0:
                 n = pieces_now(p, v1, v2, a1, a2, piece, left)
+                half = 0.5 * n * piece
                 if bristly:
-                    bend(p, b, m, v1, v2, m1, m2, 0.5 * n * piece)
+                    bend(p, b, m, v1, v2, v1 + half * a1, v2 + half * a2, m1, m2, half)
                 q1, q2, v1, v2, a1, a2 = step_on(m, q1, q2, v1, v2, m1, m2, n * piece)
                 if bristly:
-                    bend(p, b, m, v1, v2, m1, m2, 0.5 * n * piece)
+                    bend(p, b, m, v1, v2, v1 - half * a1, v2 - half * a2, m1, m2, half)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
     state[2, 0], state[2, 1] = t1, t2

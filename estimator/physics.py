@@ -19,7 +19,7 @@ PER_JOINT = (
 CONSTANTS = (*RIGID, *(f"{name}_{joint}" for name in PER_JOINT for joint in (1, 2)))
 # What stands for a term the model lacks; a pendulum's second joint is a wheel that nothing turns.
 ONE_WHERE_ABSENT = ("armature", "coulomb_width", "stribeck_velocity", "torque_scale")
-SLIDING = 0.02  # rad/s: faster than this a joint slides, and its friction's bristles are bent that way
+SLIDING = 0.05  # rad/s: faster than this a joint slides, and its friction's bristles are bent that way
 ABSENT = {name: 1.0 if name.rstrip("_12") in ONE_WHERE_ABSENT else 0.0 for name in CONSTANTS}
 
 
@@ -55,16 +55,13 @@ class Physics:
             constant["inertia_1"] + constant["inertia_2"] - shared,
             constant["inertia_2"] + constant["armature_2"],
         )
-        times = [
-            constant[f"coulomb_width_{joint}"]
-            * inertia[joint - 1]
-            / (2.0 * constant[f"coulomb_{joint}"] * (1.0 + constant[f"stribeck_rise_{joint}"]) + 1e-12)
-            for joint in (1, 2)
-        ]
-        # Bristles turned round swing like a spring.
-        times += [
-            math.sqrt(inertia[joint - 1] / constant[f"presliding_stiffness_{joint}"])
-            for joint in (1, 2)
-            if constant[f"presliding_stiffness_{joint}"] > 0.0
-        ]
+        times = []
+        for joint in (1, 2):
+            stiffness = constant[f"presliding_stiffness_{joint}"]
+            if stiffness > 0.0:
+                # Bristles turned round swing like a spring; an eighth of a radian of that is followed well.
+                times.append(0.125 * math.sqrt(inertia[joint - 1] / stiffness))
+            else:
+                turned = 2.0 * constant[f"coulomb_{joint}"] * (1.0 + constant[f"stribeck_rise_{joint}"])
+                times.append(constant[f"coulomb_width_{joint}"] * inertia[joint - 1] / (turned + 1e-12))
         return float(min(times))

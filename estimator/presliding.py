@@ -78,13 +78,13 @@ class PreslidingSensitive(Sensitive):
                 within[[COULOMB + joint, LOAD + joint]] = NOWHERE
         self._room = (*room, within)
         self._moving = without_dry_friction(physics.vector)
-        self._began = np.zeros(2)
+        self._began, self._faster = np.zeros((2, 2))
         self._bent = np.zeros(2)
         self._bent[: self._joints] = first_bend(physics, start[1])
-        self._bristles = (at, _first_slopes(physics.vector, self._state[1], at).reshape(-1), *np.zeros((2, 2 * WIDE)))
+        self._bristles = (at, _first_slopes(physics.vector, self._state[1], at).reshape(-1), *np.zeros((3, 2 * WIDE)))
 
     def _go_on(self, *given: Any) -> None:
-        _advance(self._moving, self._bent, (*self._bristles, self._began), *given)
+        _advance(self._moving, self._bent, (*self._bristles, self._began, self._faster), *given)
 
 
 def _first_slopes(p: Array, velocity: Array, at: npt.NDArray[np.int64]) -> Array:
@@ -109,12 +109,25 @@ def _first_slopes(p: Array, velocity: Array, at: npt.NDArray[np.int64]) -> Array
 #   D              derivatives of the bristles' torque (joints, WIDE), flat as the rest
 #   level_by       those of the level at a given velocity
 #   give_by        those of what the bristles add to viscous friction
+#   faster_by      those of the last step's accelerations
 #   began          velocities with which the arm's step began (joints,)
+#   faster         accelerations of the last step (joints,)
 def _bend(
-    p: Any, m: Any, b: Any, bristles: Any, x: Any, t1: float, t2: float, time: float, dt: Any, Z: Any, count: int
+    p: Any,
+    m: Any,
+    b: Any,
+    bristles: Any,
+    x: Any,
+    t1: float,
+    t2: float,
+    time: float,
+    ahead: float,
+    dt: Any,
+    Z: Any,
+    count: int,
 ) -> None:
-    """`estimator.bristles.bend` and its derivatives."""
-    at, D, level_by, give_by, began = bristles
+    """`estimator.bristles.bend` and its derivatives; the middle of the step is `ahead` [s] of now."""
+    at, D, level_by, give_by, faster_by, began, faster = bristles
     for joint in range(2):
         stiffness = p[STIFFNESS + joint]
         if stiffness > 0.0:
@@ -123,19 +136,20 @@ def _bend(
             scale, damping = p[SCALE + joint], p[DAMPING + joint]
             t = scale * commanded
             loaded = load if t > 0.0 else -load
-            bump = math.exp(-((v / fading) ** 2))
+            u = v + ahead * faster[joint]
+            bump = math.exp(-((u / fading) ** 2))
             level = coulomb * (1.0 + rise * bump) + load * abs(t)
-            level_v = -2.0 * coulomb * rise * bump * v / fading**2
+            level_u = -2.0 * coulomb * rise * bump * u / fading**2
             way = math.copysign(1.0, v)
             turns = stiffness * abs(v) * time / level
             left = math.exp(-turns)
             away = b[joint] - way * level
             by_level = way * (1.0 - left) + away * left * turns / level
-            by_v = by_level * level_v - away * left * way * stiffness * time / level
+            by_v = -away * left * way * stiffness * time / level
             r = joint * WIDE
             level_by[r + at[COULOMB + joint]] = 1.0 + rise * bump
             level_by[r + at[RISE + joint]] = coulomb * bump
-            level_by[r + at[FADING + joint]] = 2.0 * coulomb * rise * bump * v * v / fading**3
+            level_by[r + at[FADING + joint]] = 2.0 * coulomb * rise * bump * u * u / fading**3
             level_by[r + at[LOAD + joint]] = abs(t)
             level_by[r + at[SCALE + joint]] = loaded * commanded
             for cause in range(2):
@@ -143,11 +157,10 @@ def _bend(
             b[joint] = way * level + away * left
             bent = way * b[joint] / level
             z = (2 + joint) * WIDE
+            D[r + at[STIFFNESS + joint]] -= away * abs(v) * time / level
             for i in range(count):
-                D[r + i] = left * D[r + i] + by_level * level_by[r + i] + by_v * Z[z + i]
-            D[r + at[STIFFNESS + joint]] -= away * left * abs(v) * time / level
-            for i in range(count):
-                level_i = level_by[r + i] + level_v * Z[z + i]
+                level_i = level_by[r + i] + level_u * (Z[z + i] + ahead * faster_by[r + i])
+                D[r + i] = left * D[r + i] + by_level * level_i + by_v * Z[z + i]
                 give_by[r + i] = -damping / level * (way * D[r + i] - bent * level_i)
             give_by[r + at[DAMPING + joint]] += 1.0 - bent
             m[OFFSET + joint] = p[OFFSET + joint] + b[joint]
@@ -165,7 +178,7 @@ def _clear(rows: Any, now: int) -> None:
 
 def _press(rows: Any, here: Any, bristles: Any, now: int, count: int) -> None:
     """Add to the rows of the step at `now` what the bristles' torque and damping change in it."""
-    _, D, _, give_by, began = bristles
+    _, D, _, give_by, _, began, _ = bristles
     for stage in range(2):
         for joint in range(2):
             v = began[joint] if stage == 0 else here[1, joint]
@@ -173,6 +186,15 @@ def _press(rows: Any, here: Any, bristles: Any, now: int, count: int) -> None:
             for i in range(count):
                 rows[f + i] -= D[r + i] + v * give_by[r + i]
                 rows[f + SLOPES + i] += give_by[r + i]
+
+
+def _accelerate(bristles: Any, Z: Any, kept: float, share: float, count: int) -> None:
+    """Derivatives of the accelerations: those that were, `kept` times, and those of the velocities, `share` times."""
+    faster_by = bristles[4]
+    for joint in range(2):
+        r, z = joint * WIDE, (2 + joint) * WIDE
+        for i in range(count):
+            faster_by[r + i] = kept * faster_by[r + i] + share * Z[z + i]
 
 
 def _loop(
@@ -196,7 +218,7 @@ def _loop(
     causes = derivative.shape[2]
     count = (causes + AT_ONCE - 1) // AT_ONCE * AT_ONCE
     now = turn[0]
-    a1 = a2 = 0.0
+    faster = bristles[6]
     piece = step / pieces
     for k in range(position.shape[1]):
         position[0, k], position[1, k] = x[0, 0], x[0, 1]
@@ -210,17 +232,19 @@ def _loop(
                 dt[cause, 0], dt[cause, 1] = slopes[cause, 0, k, s], slopes[cause, 1, k, s]
             left = pieces
             while left > 0:
-                n = pieces_now(p, x[1, 0], x[1, 1], a1, a2, piece, left)
+                n = pieces_now(p, x[1, 0], x[1, 1], faster[0], faster[1], piece, left)
                 h = n * piece
-                _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, dt, Z, count)
+                _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, 0.5 * h, dt, Z, count)
                 _clear(rows, now)
-                a1, a2 = arm_step(m, x, t1, t2, h, now, room)
+                _accelerate(bristles, Z, 0.0, -1.0 / h, count)
+                faster[0], faster[1] = arm_step(m, x, t1, t2, h, now, room)
                 _press(rows, here, bristles, now, count)
                 # At once: the bristles' other half needs what this step does to the velocities.
                 follow(rows, numbers, Z, now, count)
-                _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, dt, Z, count)
+                _accelerate(bristles, Z, 1.0, 1.0 / h, count)
+                _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, -0.5 * h, dt, Z, count)
                 left -= n
 
 
-_bend, _clear, _press = map(fused, (_bend, _clear, _press))
+_bend, _clear, _press, _accelerate = map(fused, (_bend, _clear, _press, _accelerate))
 _advance: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_loop)
