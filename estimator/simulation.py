@@ -28,6 +28,7 @@ from estimator.physics import Physics
 
 LONGEST_STEP = 0.85e-3  # s
 MOST_PIECES = 64
+FADED = 40.0  # e to minus this is lost beside 1, and takes a library longer than any other power
 GAMMA = 1.0 - math.sqrt(0.5)
 
 
@@ -71,8 +72,15 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, flo
     t *= p[c + 24]
     if p[c + 20] != 0.0:
         t *= 1.0 + p[c + 16] * math.sin(p[c + 20] * q) + p[c + 18] * math.cos(p[c + 20] * q)
-    level = p[c + 2] * (1.0 + p[c + 8] * math.exp(-((v / p[c + 10]) ** 2))) + p[c + 12] * abs(t)
-    bend = math.tanh(v / p[c + 6])
+    past = (v / p[c + 10]) ** 2
+    bump = math.exp(-past) if past < FADED else 0.0
+    level = p[c + 2] * (1.0 + p[c + 8] * bump) + p[c + 12] * abs(t)
+    # tanh(v / width) by one exponential: the library's takes twice as long.
+    bend = math.copysign(1.0, v)
+    past = 2.0 * abs(v) / p[c + 6]
+    if past < FADED:
+        short = math.exp(-past)
+        bend *= (1.0 - short) / (1.0 + short)
     left = t - p[c + 4] - p[c] * v - (p[c + 14] * v + level) * bend
     return left, p[c] + level / p[c + 6] * (1.0 - bend * bend)
 
