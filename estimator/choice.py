@@ -56,15 +56,17 @@ class Choice:
 
     @property
     def cost(self) -> float:
-        """How much larger the base parameters' standard errors are than the plainest model's would be with the
-        chosen one's residual: what the terms that were added cost (geometric mean)."""
-        plain = self.trials[0].estimate
-        if plain is None:
-            return np.inf
-        base = len(plain.model.base_names)
-        sizes = [each.white_std[:base] for each in (self.estimate, plain)]
-        seen = np.isfinite(sizes[0]) & np.isfinite(sizes[1])
-        return float(np.exp(np.mean(np.log(sizes[0][seen] / sizes[1][seen]))))
+        """How much larger the base parameters' standard errors are than they would be if the terms that the plainest
+        model lacks were known: what adding them cost (geometric mean)."""
+        estimate = self.estimate
+        std = estimate.std
+        seen = np.isfinite(std)
+        added = seen & [name not in self.trials[0].model.names for name in estimate.names]
+        base = seen & [name in estimate.model.base_names for name in estimate.names]
+        correlation = np.where(np.outer(seen, seen), estimate.covariance, 0.0) / np.outer(std, std)
+        across = correlation[np.ix_(added, base)]
+        told = np.sum(across * np.linalg.solve(correlation[np.ix_(added, added)], across), axis=0)
+        return float(np.exp(-0.5 * np.mean(np.log1p(-told))))
 
 
 def choose(

@@ -19,7 +19,7 @@ from estimator.coordinates import Coordinates, scales_of
 from estimator.covariance import LONGEST_LAG, Scatter, correlation_time, robust_covariance, structured_share
 from estimator.errors import ConvergenceError
 from estimator.least_squares import LinearEstimate
-from estimator.levenberg_marquardt import LEAST_DAMPING, Minimum, Quadratic, minimise
+from estimator.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, Minimum, Quadratic, alike, minimise
 from estimator.model import Model
 from estimator.normal_equations import normal_equations
 from estimator.period import SettledPeriod
@@ -34,8 +34,10 @@ WIDTH_FLOOR = 1e-4  # rad/s: friction that sticks is not told from this, and fro
 # From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both.
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
 # An arm that swings past the upright amplifies what is still wrong: it is first held to the measured motion by springs
-# that would give its joints this frequency, then its free beginning is fitted before the whole.
+# that would give its joints this frequency. If what is found then is lost when the springs are gone, and leaves so many
+# times more of the motion, the arm's free beginning is fitted before the whole.
 PULL = 2.0  # Hz
+LOST = 1.5
 HORIZONS = (0.125, 0.25, 0.5)
 LEAST_HORIZON = 10  # samples of all joints for each unknown
 # Relative gains in the sum of squares at which a fit ends: of a start, of the first and the second look at the whole,
@@ -49,6 +51,8 @@ SAME, CLOSE = 1.0, 25.0
 HOPELESS = 2.0  # sum of squares per sample in units of the noise from which a hasty fit gives up
 ALIKE = 1.01  # of the best try's sum of squares: up to here another try may still end lower
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
+# Far from the end the sum is anything but quadratic in friction's width; in the short steps near the end it is nearly.
+CAUTIOUS, BOLD = 0.5, 0.95
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
@@ -94,6 +98,10 @@ class Problem:
     """Of each run, from its beginning, that is looked at."""
     pull: Array | None = None
     """Stiffness of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
+    narrowing: float = BOLD
+    """Share that friction's step may lose of its width at a time."""
+    held: bool = False
+    """Whether the parameters stay as they are."""
 
     @property
     def count(self) -> int:
@@ -137,6 +145,18 @@ class Problem:
             )
         return total
 
+    def minimise(self, x: Array, enough: float, damping: float = FIRST_DAMPING, at: Quadratic | None = None) -> Minimum:
+        """Minimise the sum of squares from `x`, until it falls by less than `enough` of it; see `minimise`."""
+        return minimise(self.evaluate, x, enough, damping, at, move=self.coordinates.moved, limits=self._limits)
+
+    def _limits(self, x: Array) -> tuple[Array, Array]:
+        """The least and the most that each coordinate may change in a step."""
+        least, most = alike(x)
+        self.coordinates.limit(x[: self.count], least, most, self.narrowing)
+        if self.held:
+            least[: self.count] = most[: self.count] = 0.0
+        return least, most
+
     def positions(self, x: Array) -> tuple[Array, ...]:
         """Simulated positions of each run (joints, samples) [rad]."""
         physics = self.physics(x)
@@ -179,7 +199,7 @@ def fit_runs(
     leaves much more than the noise is given up before its last digits.
     """
     problem, states = _problem(periods, model, linear)
-    rough = replace(problem, runs=tuple(run.roughly() for run in problem.runs))
+    rough = replace(problem, runs=tuple(run.roughly() for run in problem.runs), narrowing=CAUTIOUS)
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
     enough = HASTY if hasty else COARSE
@@ -204,18 +224,18 @@ def fit_runs(
     hopeless = hasty and best.at.cost > HOPELESS * samples
     if not hopeless:
         # What explains the motion may still have its friction's shape wrong, by a little of the sum.
-        again = [minimise(rough.evaluate, _reshaped(problem, best.x, width), enough) for width in STARTING_WIDTHS]
+        again = [rough.minimise(_reshaped(problem, best.x, width), enough) for width in STARTING_WIDTHS]
         spent += sum(found.iterations for found in again)
         tries += again
         likely = ALIKE * _best(tries).at.cost
-        tries = [minimise(rough.evaluate, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
+        tries = [rough.minimise(each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
         spent += sum(found.iterations for found in tries)
-    ends = [minimise(problem.evaluate, each.x, enough) for each in _distinct(tries)]
+    ends = [problem.minimise(each.x, HASTY if hasty else NEAR, LEAST_DAMPING) for each in _distinct(tries)]
     best = _best(ends)
     weights, outliers = _weights(periods, problem.positions(best.x))
     problem = replace(problem, weights=weights)
     last = HASTY if hopeless else FINE if best.at.cost < EXPLAINED * samples else NEAR
-    minimum = minimise(problem.evaluate, best.x, last, LEAST_DAMPING)
+    minimum = problem.minimise(best.x, last, LEAST_DAMPING)
     spent += sum(found.iterations for found in (*ends, minimum))
     return _fit(periods, problem, minimum, outliers, spent)
 
@@ -235,15 +255,24 @@ def _distinct(tries: Sequence[Minimum]) -> list[Minimum]:
 
 
 def _approach(problem: Problem, x: Array, linear: LinearEstimate, samples: int, enough: float) -> Minimum:
-    """From stage 1's parameters to the whole free motion, by way of pulled motion and of its beginning."""
+    """From stage 1's parameters to the whole free motion, by way of pulled motion."""
     inertia = [abs(linear.value[linear.names.index(f"inertia_{j + 1}")]) for j in range(problem.state_scale.size // 2)]
-    eased = [replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2)]
-    eased += [replace(problem, share=share) for share in HORIZONS if share * samples > LEAST_HORIZON * x.size]
-    spent = 0
-    for each in eased:
-        found = minimise(each.evaluate, x, HASTY)
-        x, spent = found.x, spent + found.iterations
-    found = minimise(problem.evaluate, x, enough)
+    pulled = replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2).minimise(x, HASTY)
+    try:
+        # Springs leave little trace of the state at the first sample.
+        start = replace(problem, held=True).minimise(pulled.x, HASTY)
+        found = problem.minimise(start.x, enough, at=start.at)
+        spent = pulled.iterations + start.iterations + found.iterations
+        if found.at.cost < LOST * pulled.at.cost:
+            return replace(found, iterations=spent)
+    except ConvergenceError:
+        spent = pulled.iterations
+    x = pulled.x
+    for share in HORIZONS:
+        if share * samples > LEAST_HORIZON * x.size:
+            start = replace(problem, share=share).minimise(x, HASTY)
+            x, spent = start.x, spent + start.iterations
+    found = problem.minimise(x, enough)
     return replace(found, iterations=spent + found.iterations)
 
 
