@@ -9,8 +9,10 @@ How large the errors are is itself estimated, joint by joint, before the last di
 far outside are weighed down there (Huber): a few wild readings then cost nothing.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -52,10 +54,11 @@ HOPELESS = 2.0  # sum of squares per sample in units of the noise from which a h
 ALIKE = 1.01  # of the best try's sum of squares: up to here another try may still end lower
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
 # Far from the end the sum is anything but quadratic in friction's width; in the short steps near the end it is nearly.
-CAUTIOUS, BOLD = 0.5, 0.95
+CAUTIOUS, BOLD = 0.5, 0.8
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
+SHAPE = ("coulomb_width", "stribeck_rise", "stribeck_velocity")  # of friction near standstill
 LEAST_LAG = 1e-4  # s, at the start
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 LEAST_WINDOW = 0.005  # of a run: rounding is correlated, a little, over more lags than its autocorrelation shows
@@ -157,6 +160,14 @@ class Problem:
             least[: self.count] = most[: self.count] = 0.0
         return least, most
 
+    def cost(self, positions: Sequence[Array]) -> float:
+        """The weighted sum of squares of simulated positions, run by run (joints, samples) [rad]."""
+        squares = [
+            np.square(weight * (position - run.measured))
+            for run, weight, position in zip(self.runs, self.weights, positions, strict=True)
+        ]
+        return float(sum(square.sum() for square in squares))
+
     def positions(self, x: Array) -> tuple[Array, ...]:
         """Simulated positions of each run (joints, samples) [rad]."""
         physics = self.physics(x)
@@ -203,15 +214,18 @@ def fit_runs(
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
     enough = HASTY if hasty else COARSE
-    tries: list[Minimum] = []
-    lost = ConvergenceError("no start was given")
     own = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
+    tries: list[Minimum] = []
+    pulled: list[Minimum] = []
+    lost = ConvergenceError("no start was given")
     for start in (*given, *own):
         x = np.concatenate((problem.coordinates.coordinates(start), states))
         try:
-            tries.append(_approach(rough, x, linear, samples, enough))
+            near = _pulled(rough, x, linear)
+            tries.append(_released(rough, near, samples, enough))
+            pulled.append(near)
         except ConvergenceError as error:
             lost = error
             continue
@@ -223,21 +237,33 @@ def fit_runs(
     spent = sum(found.iterations for found in tries)
     hopeless = hasty and best.at.cost > HOPELESS * samples
     if not hopeless:
-        # What explains the motion may still have its friction's shape wrong, by a little of the sum.
-        again = [rough.minimise(_reshaped(problem, best.x, width), enough) for width in STARTING_WIDTHS]
-        spent += sum(found.iterations for found in again)
-        tries += again
-        likely = ALIKE * _best(tries).at.cost
-        tries = [rough.minimise(each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
+        # What explains the motion may still have its friction's shape wrong, by a little of the sum: pulled motion
+        # shows the shape well, and a narrow shape is not the way to a wide one.
+        shapes = pulled[int(np.argmin([found.at.cost for found in tries]))].x, problem.coordinates.coordinates(own[1])
+        likely = ALIKE * best.at.cost
+        again = [_reshaped(problem, best.x, shape) for shape in shapes]
+        tries = _at_once(
+            [partial(rough.minimise, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
+            + [partial(_polished, rough, x, enough, likely) for x in again]
+        )
         spent += sum(found.iterations for found in tries)
-    ends = [problem.minimise(each.x, HASTY if hasty else NEAR, LEAST_DAMPING) for each in _distinct(tries)]
-    best = _best(ends)
-    weights, outliers = _weights(periods, problem.positions(best.x))
+        best = _best(tries)
+    positions = problem.positions(best.x)
+    explained = problem.cost(positions) < EXPLAINED * samples
+    weights, outliers = _weights(periods, positions)
     problem = replace(problem, weights=weights)
-    last = HASTY if hopeless else FINE if best.at.cost < EXPLAINED * samples else NEAR
-    minimum = problem.minimise(best.x, last, LEAST_DAMPING)
+    ends = _at_once([partial(problem.minimise, each.x, HASTY if hasty else NEAR) for each in _distinct(tries)])
+    best = _best(ends)
+    last = HASTY if hopeless else FINE if explained else NEAR
+    minimum = problem.minimise(best.x, last, LEAST_DAMPING, best.at)
     spent += sum(found.iterations for found in (*ends, minimum))
     return _fit(periods, problem, minimum, outliers, spent)
+
+
+def _at_once(fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
+    """Fits that do not need each other, in threads: what is compiled leaves the interpreter to the others."""
+    with ThreadPoolExecutor(len(fits)) as threads:
+        return [running.result() for running in [threads.submit(fit) for fit in fits]]
 
 
 def _best(tries: Sequence[Minimum]) -> Minimum:
@@ -254,10 +280,13 @@ def _distinct(tries: Sequence[Minimum]) -> list[Minimum]:
     return distinct
 
 
-def _approach(problem: Problem, x: Array, linear: LinearEstimate, samples: int, enough: float) -> Minimum:
+def _pulled(problem: Problem, x: Array, linear: LinearEstimate) -> Minimum:
     """From stage 1's parameters to the whole free motion, by way of pulled motion."""
     inertia = [abs(linear.value[linear.names.index(f"inertia_{j + 1}")]) for j in range(problem.state_scale.size // 2)]
-    pulled = replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2).minimise(x, HASTY)
+    return replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2).minimise(x, HASTY)
+
+
+def _released(problem: Problem, pulled: Minimum, samples: int, enough: float) -> Minimum:
     try:
         # Springs leave little trace of the state at the first sample.
         start = replace(problem, held=True).minimise(pulled.x, HASTY)
@@ -276,15 +305,20 @@ def _approach(problem: Problem, x: Array, linear: LinearEstimate, samples: int, 
     return replace(found, iterations=spent + found.iterations)
 
 
-def _reshaped(problem: Problem, x: Array, width: float) -> Array:
-    """The coordinates `x` with the shape of friction as at the start, its steps of this width [rad/s]."""
-    names = problem.coordinates.names
-    shape = {"coulomb_width": width, "stribeck_velocity": START["stribeck_velocity"]}
-    moved = np.array([name.rstrip("_12") in shape for name in names])
-    start = np.array([shape.get(name.rstrip("_12"), 0.0) for name in names])
-    value = np.where(moved, start, problem.coordinates.values(x[: len(names)]))
+def _polished(problem: Problem, x: Array, enough: float, likely: float) -> Minimum:
+    """From `x` to where the fit ends, and on to what short steps can tell if its sum of squares is below `likely`."""
+    found = problem.minimise(x, enough)
+    if found.at.cost >= likely:
+        return found
+    near = problem.minimise(found.x, NEAR, at=found.at)
+    return replace(near, iterations=found.iterations + near.iterations)
+
+
+def _reshaped(problem: Problem, x: Array, other: Array) -> Array:
+    """The coordinates `x` with the shape of friction near standstill of the coordinates `other`."""
+    shape = [name.rstrip("_12") in SHAPE for name in problem.coordinates.names]
     reshaped = x.copy()
-    reshaped[: len(names)][moved] = problem.coordinates.coordinates(value)[moved]
+    reshaped[: len(shape)][shape] = other[: len(shape)][shape]
     return reshaped
 
 

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from estimator.arrays import Array
 from estimator.physics import CONSTANTS, Physics
-from estimator.simulation import FADED, GAMMA, MOST_PIECES, finer_pieces, pieces_now
+from estimator.simulation import GAMMA, MOST_PIECES, bend_at, bump_at, finer_pieces, pieces_now
 
 # What can be differentiated by: the constants, the drive's times, the state at the first sample.
 CAUSES = (*CONSTANTS, "delay", "lag", "position_1", "position_2", "velocity_1", "velocity_2")
@@ -137,26 +137,20 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     motor = t * shape
     loaded = load if motor > 0.0 else -load
     sharp, slow = 1.0 / width, 1.0 / fading
-    ratio = v * slow
-    bump = math.exp(-ratio * ratio) if ratio * ratio < FADED else 0.0
+    bump = bump_at(v * slow)
     level = coulomb * (1.0 + rise * bump) + load * abs(motor)
-    level_v = -2.0 * coulomb * rise * bump * ratio * slow
-    bend, bent = math.copysign(1.0, v), 0.0
-    past = 2.0 * abs(v) * sharp
-    if past < FADED:
-        short = math.exp(-past)
-        bend *= (1.0 - short) / (1.0 + short)
-        bent = (1.0 - bend * bend) * sharp
-    bent_v = -2.0 * bend * bent * sharp
-    bend_w = -v * sharp * bent
-    level_f = -level_v * ratio
+    dry = asymmetry * v + level
+    level_v = -2.0 * coulomb * rise * bump * v * slow * slow
+    level_f = -level_v * v * slow
+    bend, bent = bend_at(v, sharp)
+    bent_v, bend_w = -2.0 * bend * bent * sharp, -v * sharp * bent
     passed = 1.0 - loaded * bend
     f = (2 * now + stage) * STAGE + joint * WIDE
     s = f + SLOPES
     rows[f + at[c]], rows[s + at[c]] = -v, 1.0
     rows[f + at[c + 2]], rows[s + at[c + 2]] = -(1.0 + rise * bump) * bend, (1.0 + rise * bump) * bent
     rows[f + at[c + 4]] = -1.0
-    rows[f + at[c + 6]] = -(level + asymmetry * v) * bend_w
+    rows[f + at[c + 6]] = -dry * bend_w
     rows[s + at[c + 6]] = -level * (bent + 2.0 * bend * bend_w) * sharp
     rows[f + at[c + 8]], rows[s + at[c + 8]] = -coulomb * bump * bend, coulomb * bump * bent
     rows[f + at[c + 10]], rows[s + at[c + 10]] = -level_f * bend, level_f * bent
@@ -174,11 +168,10 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     for cause in range(2):
         rows[f + at[DELAY + cause]] = scale * shape * passed * dt[cause, joint]
         rows[s + at[DELAY + cause]] = scale * shape * loaded * bent * dt[cause, joint]
-    left[stage, joint] = motor - offset - viscous * v - (asymmetry * v + level) * bend
-    slope[stage, joint] = viscous + level * bent
+    left[stage, joint], slope[stage, joint] = motor - offset - viscous * v - dry * bend, viscous + level * bent
     n = now * NUMBERS + stage * BY_STATE
     numbers[n + 5 * joint] = cycles * turn * passed
-    numbers[n + 5 * joint + 2] = -viscous - (asymmetry * v + level) * bent - (asymmetry + level_v) * bend
+    numbers[n + 5 * joint + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
     numbers[n + 8 + 2 * joint], numbers[n + 9 + 2 * joint] = (
         cycles * turn * loaded * bent,
         level_v * bent + level * bent_v,

@@ -65,6 +65,22 @@ def finer_pieces(physics: Physics, step: float, most: int = MOST_PIECES) -> int:
     return int(2 ** math.ceil(math.log2(max(needed, 1.0))))
 
 
+def bump_at(ratio: float) -> float:
+    """exp(-ratio^2)."""
+    past = ratio * ratio
+    return math.exp(-past) if past < FADED else 0.0
+
+
+def bend_at(v: float, sharp: float) -> tuple[float, float]:
+    """tanh(v sharp) and its slope over v, by one exponential: the library's tanh takes twice as long."""
+    past = 2.0 * abs(v) * sharp
+    if not past < FADED:
+        return math.copysign(1.0, v), 0.0
+    short = math.exp(-past)
+    bend = math.copysign((1.0 - short) / (1.0 + short), v)
+    return bend, (1.0 - bend * bend) * sharp
+
+
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
 def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, float]:
     """Torque that a drive leaves its joint after friction, and the slope of that friction."""
@@ -72,17 +88,10 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, flo
     t *= p[c + 24]
     if p[c + 20] != 0.0:
         t *= 1.0 + p[c + 16] * math.sin(p[c + 20] * q) + p[c + 18] * math.cos(p[c + 20] * q)
-    past = (v / p[c + 10]) ** 2
-    bump = math.exp(-past) if past < FADED else 0.0
-    level = p[c + 2] * (1.0 + p[c + 8] * bump) + p[c + 12] * abs(t)
-    # tanh(v / width) by one exponential: the library's takes twice as long.
-    bend = math.copysign(1.0, v)
-    past = 2.0 * abs(v) / p[c + 6]
-    if past < FADED:
-        short = math.exp(-past)
-        bend *= (1.0 - short) / (1.0 + short)
+    level = p[c + 2] * (1.0 + p[c + 8] * bump_at(v / p[c + 10])) + p[c + 12] * abs(t)
+    bend, bent = bend_at(v, 1.0 / p[c + 6])
     left = t - p[c + 4] - p[c] * v - (p[c + 14] * v + level) * bend
-    return left, p[c] + level / p[c + 6] * (1.0 - bend * bend)
+    return left, p[c] + level * bent
 
 
 def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:
@@ -163,7 +172,9 @@ def _loop(p: Any, state: Any, torque: Any, step: float, pieces: int, position: A
 inner: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True, error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
 )
-_drive, _forces, pieces_now, step_on = map(inner, (_drive, _forces, pieces_now, step_on))
+bump_at, bend_at, _drive, _forces, pieces_now, step_on = map(
+    inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on)
+)
 _simulate: Callable[[Array, Array, Array, float, int, Array], None] = numba.njit(
     cache=True, nogil=True, error_model="numpy"
 )(_loop)
