@@ -133,8 +133,7 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     if cycles != 0.0:
         sine, cosine = math.sin(cycles * q), math.cos(cycles * q)
         shape = 1.0 + ripple_sin * sine + ripple_cos * cosine
-    turn = t * (ripple_sin * cosine - ripple_cos * sine)
-    motor = t * shape
+    motor, turn = t * shape, t * (ripple_sin * cosine - ripple_cos * sine)
     loaded = load if motor > 0.0 else -load
     sharp, slow = 1.0 / width, 1.0 / fading
     bump = bump_at(v * slow)
