@@ -213,42 +213,26 @@ def fit_runs(
     rough = replace(problem, runs=tuple(run.roughly() for run in problem.runs), narrowing=CAUTIOUS)
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
-    enough = HASTY if hasty else COARSE
     own = [_start(model, linear, ripple, width) for width in STARTING_WIDTHS]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
-    tries: list[Minimum] = []
-    pulled: list[Minimum] = []
-    lost = ConvergenceError("no start was given")
-    for start in (*given, *own):
-        x = np.concatenate((problem.coordinates.coordinates(start), states))
-        try:
-            near = _pulled(rough, x, linear)
-            tries.append(_released(rough, near, samples, enough))
-            pulled.append(near)
-        except ConvergenceError as error:
-            lost = error
-            continue
-        if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
-            break
-    if not tries:
-        raise lost
-    best = _best(tries)
+    coordinates = [problem.coordinates.coordinates(value) for value in (*given, *own)]
+    ways = _ways(rough, [np.concatenate((x, states)) for x in coordinates], _springs(linear), samples, hasty)
+    way = min(ways, key=lambda each: each.free.at.cost)
+    tries = [each.free for each in ways]
     spent = sum(found.iterations for found in tries)
-    hopeless = hasty and best.at.cost > HOPELESS * samples
+    hopeless = hasty and way.free.at.cost > HOPELESS * samples
     if not hopeless:
         # What explains the motion may still have its friction's shape wrong, by a little of the sum: pulled motion
-        # shows the shape well, and a narrow shape is not the way to a wide one.
-        shapes = pulled[int(np.argmin([found.at.cost for found in tries]))].x, problem.coordinates.coordinates(own[1])
-        likely = ALIKE * best.at.cost
-        again = [_reshaped(problem, best.x, shape) for shape in shapes]
+        # shows the shape well, and from a narrow shape there is no way to a wide one.
+        likely = ALIKE * way.free.at.cost
+        again = [_reshaped(problem, way.free.x, shape) for shape in (way.pulled, coordinates[-1])]
         tries = _at_once(
             [partial(rough.minimise, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
-            + [partial(_polished, rough, x, enough, likely) for x in again]
+            + [partial(_polished, rough, x, HASTY if hasty else COARSE, likely) for x in again]
         )
         spent += sum(found.iterations for found in tries)
-        best = _best(tries)
-    positions = problem.positions(best.x)
+    positions = problem.positions(_best(tries).x)
     explained = problem.cost(positions) < EXPLAINED * samples
     weights, outliers = _weights(periods, positions)
     problem = replace(problem, weights=weights)
@@ -258,6 +242,63 @@ def fit_runs(
     minimum = problem.minimise(best.x, last, LEAST_DAMPING, best.at)
     spent += sum(found.iterations for found in (*ends, minimum))
     return _fit(periods, problem, minimum, outliers, spent)
+
+
+@dataclass(frozen=True)
+class Way:
+    """How one start went, in long steps of integration."""
+
+    pulled: Array
+    """Coordinates of what fits the motion of the pulled arm."""
+    free: Minimum
+    """What fits the free motion, with all simulations on the way there."""
+
+
+def _ways(problem: Problem, starts: Sequence[Array], springs: Array, samples: int, hasty: bool) -> list[Way]:
+    """From one start after the other until the motion is explained. Raises ConvergenceError if none leads anywhere."""
+    ways: list[Way] = []
+    lost = ConvergenceError("no start was given")
+    for x in starts:
+        try:
+            ways.append(_way(problem, x, springs, samples, HASTY if hasty else COARSE))
+        except ConvergenceError as error:
+            lost = error
+            continue
+        if ways[-1].free.at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
+            break
+    if not ways:
+        raise lost
+    return ways
+
+
+def _springs(linear: LinearEstimate) -> Array:
+    """Stiffness (joints,) [N m/rad] of springs that give each joint the frequency PULL."""
+    inertia = [abs(linear.value[i]) for i, name in enumerate(linear.names) if name.startswith("inertia")]
+    stiffness: Array = np.array(inertia) * (2.0 * np.pi * PULL) ** 2
+    return stiffness
+
+
+def _way(problem: Problem, x: Array, springs: Array, samples: int, enough: float) -> Way:
+    """From stage 1's parameters to the whole free motion, by way of pulled motion."""
+    pulled = replace(problem, pull=springs).minimise(x, HASTY)
+    spent = pulled.iterations
+    ends: list[Minimum] = []
+    try:
+        # Springs leave little trace of the state at the first sample.
+        start = replace(problem, held=True).minimise(pulled.x, HASTY)
+        ends.append(problem.minimise(start.x, enough, at=start.at))
+        spent += start.iterations + ends[0].iterations
+    except ConvergenceError:
+        pass
+    if not ends or ends[0].at.cost > LOST * pulled.at.cost:
+        x = pulled.x
+        for share in HORIZONS:
+            if share * samples > LEAST_HORIZON * x.size:
+                start = replace(problem, share=share).minimise(x, HASTY)
+                x, spent = start.x, spent + start.iterations
+        ends.append(problem.minimise(x, enough))
+        spent += ends[-1].iterations
+    return Way(pulled.x, replace(_best(ends), iterations=spent))
 
 
 def _at_once(fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
@@ -280,33 +321,8 @@ def _distinct(tries: Sequence[Minimum]) -> list[Minimum]:
     return distinct
 
 
-def _pulled(problem: Problem, x: Array, linear: LinearEstimate) -> Minimum:
-    """From stage 1's parameters to the whole free motion, by way of pulled motion."""
-    inertia = [abs(linear.value[linear.names.index(f"inertia_{j + 1}")]) for j in range(problem.state_scale.size // 2)]
-    return replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2).minimise(x, HASTY)
-
-
-def _released(problem: Problem, pulled: Minimum, samples: int, enough: float) -> Minimum:
-    try:
-        # Springs leave little trace of the state at the first sample.
-        start = replace(problem, held=True).minimise(pulled.x, HASTY)
-        found = problem.minimise(start.x, enough, at=start.at)
-        spent = pulled.iterations + start.iterations + found.iterations
-        if found.at.cost < LOST * pulled.at.cost:
-            return replace(found, iterations=spent)
-    except ConvergenceError:
-        spent = pulled.iterations
-    x = pulled.x
-    for share in HORIZONS:
-        if share * samples > LEAST_HORIZON * x.size:
-            start = replace(problem, share=share).minimise(x, HASTY)
-            x, spent = start.x, spent + start.iterations
-    found = problem.minimise(x, enough)
-    return replace(found, iterations=spent + found.iterations)
-
-
 def _polished(problem: Problem, x: Array, enough: float, likely: float) -> Minimum:
-    """From `x` to where the fit ends, and on to what short steps can tell if its sum of squares is below `likely`."""
+    """From `x` until little is left to gain, and on if the sum of squares is below `likely`."""
     found = problem.minimise(x, enough)
     if found.at.cost >= likely:
         return found
