@@ -1,8 +1,9 @@
 """Which friction model: fitted one after the other, from plain to rich, and judged by a motion none of them saw.
 
 A richer model always leaves less of the motion it was fitted to. What it predicts of another motion, freely, from
-rest, gets better only by what is true in it. Without such a motion the Bayesian information criterion judges
-(Schwarz, Annals of Statistics 6 (1978) 461), samples counted as far as the residual is not correlated.
+rest, gets better only by what is true in it, or by chance: so it must also leave less of its own motion than terms
+without meaning would. Without another motion the Bayesian information criterion judges (Schwarz, Annals of Statistics 6
+(1978) 461), samples counted as far as the residual is not correlated.
 """
 
 import time
@@ -85,7 +86,7 @@ def choose(
         model = replace(step, torque_scale=torque_scale)
         trial = _try(model if best is None else _on_top(model, best.model), periods, held_out, hasty=True)
         trials.append(trial)
-        if best is None or trial.score < WORTH * best.score:
+        if best is None or (trial.score < WORTH * best.score and _beyond_chance(trial.estimate, best.estimate)):
             best = trial
         if best.score < EXPLAINED:
             break
@@ -109,6 +110,19 @@ def _on_top(model: Model, best: Model) -> Model:
     if model.asymmetry:
         return replace(best, asymmetry=True)
     return model
+
+
+def _beyond_chance(richer: Estimate | None, plainer: Estimate | None) -> bool:
+    """Whether more terms explain the motion that they were fitted to better than terms without meaning do.
+
+    A flat minimum leaves much to chance in what it predicts of another motion. By Akaike's criterion (IEEE Trans.
+    Automatic Control 19 (1974) 716): twice the gain in log-likelihood above twice the number of terms.
+    """
+    if richer is None or plainer is None:
+        return richer is not None
+    samples = np.sum(np.isfinite(richer.residual), axis=1)
+    gain = 2.0 * float(np.sum(samples * np.log(plainer.residual_steps / richer.residual_steps)))
+    return gain > 2.0 * (len(richer.names) - len(plainer.names))
 
 
 def _try(model: Model, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, *, hasty: bool) -> Trial:

@@ -40,26 +40,41 @@ def _torque(
     command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float
 ) -> tuple[Array, Array, Array]:
     """The mean torque over each step, and its derivatives by delay and lag."""
+    joints, samples = command.shape
+    total = np.zeros((joints, samples + 1))
+    np.cumsum(command, axis=1, out=total[:, 1:])
     edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delay
     shifts = np.floor(edges * rate)
-    torque, late, change = (np.empty((*command.shape, steps)) for _ in range(3))
+    phases = edges - shifts / rate
+    fading = np.exp(-phases / lag) if lag > 0.0 else np.zeros(steps + 1)
+    torque, late, change = (np.empty((joints, samples, steps)) for _ in range(3))
+    lagging = np.empty((2, samples))
     _average(
-        *(np.ascontiguousarray(command), rate, lag, shifts.astype(np.int64), edges - shifts / rate),
-        *(torque, late, change),
+        *(np.ascontiguousarray(command), total, rate, lag, shifts.astype(np.int64), phases, fading),
+        *(lagging, torque, late, change),
     )
     return torque, late, change
 
 
 # Compiled code takes its arguments by position. Edge i of each sample's steps is `phases[i]` [s] after the command
-# `shifts[i]` commands later.
-def _loop(command: Any, rate: float, lag: float, shifts: Any, phases: Any, torque: Any, late: Any, change: Any) -> None:
+# `shifts[i]` commands later, by when `fading[i]` of what the lag held back then is left.
+def _average_loop(
+    command: Any,
+    total: Any,
+    rate: float,
+    lag: float,
+    shifts: Any,
+    phases: Any,
+    fading: Any,
+    lagging: Any,
+    torque: Any,
+    late: Any,
+    change: Any,
+) -> None:
     joints, samples, steps = torque.shape
     per_time = steps * rate
-    fading = np.exp(-phases / lag) if lag > 0.0 else np.zeros(steps + 1)
     for j in range(joints):
-        lagging, slope = _lagging(command[j], rate, lag)
-        total = np.zeros(samples + 1)
-        total[1:] = np.cumsum(command[j])
+        _follow(command, j, rate, lag, lagging)
         for k in range(samples):
             gathered_before = present_before = by_lag_before = 0.0
             for i in range(steps + 1):
@@ -68,11 +83,11 @@ def _loop(command: Any, rate: float, lag: float, shifts: Any, phases: Any, torqu
                     turns, at = turns + 1, at - samples
                 held = command[j, at]
                 # Integral of the held command since command 0.
-                gathered = (turns * total[samples] + total[at]) / rate + held * phases[i]
-                left = (lagging[at] - held) * fading[i]
+                gathered = (turns * total[j, samples] + total[j, at]) / rate + held * phases[i]
+                left = (lagging[0, at] - held) * fading[i]
                 present = held + left
                 # Without a lag the torque changes by lag times the command's steps, which has no derivative here.
-                by_lag = left * phases[i] / lag**2 + slope[at] * fading[i] if lag > 0.0 else 0.0
+                by_lag = left * phases[i] / (lag * lag) + lagging[1, at] * fading[i] if lag > 0.0 else 0.0
                 if i > 0:
                     # lag y' = u - y, integrated over a step: the mean of y is that of u less what the lag has stored.
                     stored = (present - present_before) * per_time
@@ -82,31 +97,26 @@ def _loop(command: Any, rate: float, lag: float, shifts: Any, phases: Any, torqu
                 gathered_before, present_before, by_lag_before = gathered, present, by_lag
 
 
-def _lagging_loop(u: Any, rate: float, lag: float) -> tuple[Any, Any]:
-    """The lagging torque y (samples,) at the instants of the commands u (samples,), in its periodic steady state, and
-    its derivative by the lag.
+def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None:
+    """The lagging torque at the instants of joint j's commands, in its periodic steady state, and its derivative by the
+    lag, into `lagging` (2, samples).
 
-    It obeys y[k + 1] = a y[k] + (1 - a) u[k]. What it comes to from rest tells the steady state, being linear.
+    It obeys y[k + 1] = a y[k] + (1 - a) u[k]. What it comes to from rest in one period tells the steady state.
     """
-    samples = len(u)
-    y, slope = np.zeros(samples), np.zeros(samples)
-    if lag <= 0.0:
-        y[0], y[1:] = u[-1], u[:-1]
-        return y, slope
-    a = math.exp(-1.0 / (rate * lag))
-    now = by_a = 0.0
-    for k in range(samples):
-        now, by_a = a * now + (1.0 - a) * u[k], a * by_a + now - u[k]
-    left = a**samples
-    now /= 1.0 - left
-    by_a = (by_a + samples * a ** (samples - 1) * now) / (1.0 - left)
-    for k in range(samples):
-        y[k], slope[k] = now, by_a * a / (rate * lag**2)
-        now, by_a = a * now + (1.0 - a) * u[k], a * by_a + now - u[k]
-    return y, slope
+    samples = command.shape[1]
+    a = math.exp(-1.0 / (rate * lag)) if lag > 0.0 else 0.0
+    a_by_lag = a / (rate * lag * lag) if lag > 0.0 else 0.0
+    y = by_a = 0.0
+    for turn in range(2):
+        for k in range(samples):
+            u = command[j, k]
+            lagging[0, k], lagging[1, k] = y, by_a * a_by_lag
+            y, by_a = a * y + (1.0 - a) * u, a * by_a + y - u
+        if turn == 0:
+            left = a**samples
+            y /= 1.0 - left
+            by_a = (by_a + samples * a ** (samples - 1) * y) / (1.0 - left)
 
 
-_lagging: Any = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(  # type: ignore[call-overload]
-    _lagging_loop
-)
-_average: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)
+_follow = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(_follow)  # type: ignore[call-overload]
+_average: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_average_loop)

@@ -233,15 +233,15 @@ def fit_runs(
         )
         spent += sum(found.iterations for found in tries)
     positions = problem.positions(_best(tries).x)
-    explained = problem.cost(positions) < EXPLAINED * samples
     weights, outliers = _weights(periods, positions)
-    problem = replace(problem, weights=weights)
-    ends = _at_once([partial(problem.minimise, each.x, HASTY if hasty else NEAR) for each in _distinct(tries)])
+    weighed = replace(problem, weights=weights)
+    ends = _at_once([partial(weighed.minimise, each.x, HASTY if hasty else NEAR) for each in _distinct(tries)])
     best = _best(ends)
-    last = HASTY if hopeless else FINE if explained else NEAR
-    minimum = problem.minimise(best.x, last, LEAST_DAMPING, best.at)
+    left = problem.cost(positions) * best.at.cost / weighed.cost(positions)
+    last = HASTY if hopeless else FINE if left < EXPLAINED * samples else NEAR
+    minimum = weighed.minimise(best.x, last, LEAST_DAMPING, best.at)
     spent += sum(found.iterations for found in (*ends, minimum))
-    return _fit(periods, problem, minimum, outliers, spent)
+    return _fit(periods, weighed, minimum, outliers, spent)
 
 
 @dataclass(frozen=True)
