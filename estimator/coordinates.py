@@ -8,7 +8,7 @@ Gravity, offsets, ripple, the joints' zeros and delay may have either sign.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -68,8 +68,7 @@ class Coordinates:
 
         One that shrinks to nothing in a single step leaves no trace in the motion that would bring it back.
         """
-        shapes = [i for i, name in enumerate(self.names) if _kind(name) in SHAPES]
-        least[shapes], most[shapes] = -RESHAPING, RESHAPING
+        least[self._shapes], most[self._shapes] = -RESHAPING, RESHAPING
         widths = np.flatnonzero(self._floors)
         share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
         least[widths], most[widths] = np.maximum(-1.0, -narrowing * share), WIDENING * share
@@ -84,15 +83,19 @@ class Coordinates:
             slope[share, second] += 0.5 * value[share]
         return slope
 
-    @property
+    @cached_property
     def _either_sign(self) -> Array:
         return np.array([_kind(name) in EITHER_SIGN for name in self.names])
 
-    @property
+    @cached_property
     def _floors(self) -> Array:
         return np.array([self.width_floor if _kind(name) == "coulomb_width" else 0.0 for name in self.names])
 
-    @property
+    @cached_property
+    def _shapes(self) -> list[int]:
+        return [i for i, name in enumerate(self.names) if _kind(name) in SHAPES]
+
+    @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
         """Indices of what is bounded by the geometric mean of two others, and of the two."""
         bounds = {"coupling": ("inertia_1", "inertia_2")}

@@ -126,13 +126,14 @@ def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Ar
     """
     scale = np.sqrt(np.diag(normal))
     scale = np.maximum(scale, 1e-12 * scale.max())
-    damped = normal + damping * np.diag(scale**2)
+    matrix = normal / np.outer(scale, scale)
+    matrix[np.diag_indices_from(matrix)] += damping
+    slope = gradient / scale
     step = np.zeros_like(gradient)
     free = np.ones(gradient.size, dtype=np.bool_)
     while free.any():
-        slope = (gradient[free] + damped[np.ix_(free, ~free)] @ step[~free]) / scale[free]
-        matrix = damped[np.ix_(free, free)] / np.outer(scale[free], scale[free])
-        step[free] = -np.linalg.solve(matrix, slope) / scale[free]
+        held = np.where(free, 0.0, step * scale)
+        step[free] = -np.linalg.solve(matrix[free][:, free], (slope + matrix @ held)[free]) / scale[free]
         too_long = free & ((step < least) | (step > most))
         if not too_long.any():
             break
