@@ -42,8 +42,10 @@ PULL = 2.0  # Hz
 LOST = 1.5
 HORIZONS = (0.125, 0.25, 0.5)
 LEAST_HORIZON = 10  # samples of all joints for each unknown
-# Relative gains in the sum of squares at which a fit ends: of a start, of the first and the second look at the whole,
-# and of the end, where what is left to gain is a tenth of a standard error's worth over all parameters together.
+# Relative gains in the sum of squares at which a fit ends: of the first state alone, of a start, of the first and the
+# second look at the whole, and of the end, where what is left to gain is a tenth of a standard error's worth over all
+# parameters together.
+ROUGHLY = 0.1
 HASTY = 2e-2
 COARSE = 3e-3
 NEAR = 3e-4
@@ -285,7 +287,7 @@ def _way(problem: Problem, x: Array, springs: Array, samples: int, enough: float
     ends: list[Minimum] = []
     try:
         # Springs leave little trace of the state at the first sample.
-        start = replace(problem, held=True).minimise(pulled.x, HASTY)
+        start = replace(problem, held=True).minimise(pulled.x, ROUGHLY)
         ends.append(problem.minimise(start.x, enough, at=start.at))
         spent += start.iterations + ends[0].iterations
     except ConvergenceError:
