@@ -12,7 +12,7 @@ building mujoco.sysid's model and residual is not counted either. On the demo `h
 current lag of its configuration, which cost time; mujoco.sysid has the Coulomb friction that it can have, and
 `hil_coulomb` the same, which no more fits that arm than its own does. On the textbook arm all three have Coulomb
 friction and so has the arm: there times compare the same work. mujoco.sysid spreads its rollouts over all cores, this
-project's estimate uses one, so that a busy machine says little about their ratio.
+project's estimate two or three of its fits, so that a busy machine says little about their ratio.
 """
 
 import argparse

@@ -1,8 +1,9 @@
 """Which friction model: fitted one after the other, from plain to rich, and judged by a motion none of them saw.
 
 A richer model always leaves less of the motion it was fitted to. What it predicts of another motion, freely, from
-rest, gets better only by what is true in it. Without such a motion the Bayesian information criterion judges
-(Schwarz, Annals of Statistics 6 (1978) 461), samples counted as far as the residual is not correlated.
+rest, gets better only by what is true in it, or by chance: so it must also leave less of its own motion than terms
+without meaning would. Without another motion the Bayesian information criterion judges (Schwarz, Annals of Statistics 6
+(1978) 461), samples counted as far as the residual is not correlated.
 """
 
 import time
@@ -57,15 +58,17 @@ class Choice:
 
     @property
     def cost(self) -> float:
-        """How much larger the base parameters' standard errors are than the plainest model's would be with the
-        chosen one's residual: what the terms that were added cost (geometric mean)."""
-        plain = self.trials[0].estimate
-        if plain is None:
-            return np.inf
-        base = len(plain.model.base_names)
-        sizes = [each.white_std[:base] for each in (self.estimate, plain)]
-        seen = np.isfinite(sizes[0]) & np.isfinite(sizes[1])
-        return float(np.exp(np.mean(np.log(sizes[0][seen] / sizes[1][seen]))))
+        """How much larger the base parameters' standard errors are than they would be if the terms that the plainest
+        model lacks were known: what adding them cost (geometric mean)."""
+        estimate = self.estimate
+        std = estimate.std
+        seen = np.isfinite(std)
+        added = seen & [name not in self.trials[0].model.names for name in estimate.names]
+        base = seen & [name in estimate.model.base_names for name in estimate.names]
+        correlation = np.where(np.outer(seen, seen), estimate.covariance, 0.0) / np.outer(std, std)
+        across = correlation[np.ix_(added, base)]
+        told = np.sum(across * np.linalg.solve(correlation[np.ix_(added, added)], across), axis=0)
+        return float(np.exp(-0.5 * np.mean(np.log1p(-told))))
 
 
 def choose(
@@ -91,7 +94,7 @@ def choose(
         model = replace(step, torque_scale=torque_scale)
         trial = tried(model if best is None else _on_top(model, best.model), hasty=True)
         trials.append(trial)
-        if best is None or trial.score < WORTH * best.score:
+        if best is None or (trial.score < WORTH * best.score and _beyond_chance(trial.estimate, best.estimate)):
             best = trial
         if best.score < EXPLAINED:
             break
@@ -116,6 +119,19 @@ def _on_top(model: Model, best: Model) -> Model:
     if model.asymmetry:
         return replace(best, asymmetry=True)
     return replace(model, presliding=model.presliding or best.presliding)
+
+
+def _beyond_chance(richer: Estimate | None, plainer: Estimate | None) -> bool:
+    """Whether more terms explain the motion that they were fitted to better than terms without meaning do.
+
+    A flat minimum leaves much to chance in what it predicts of another motion. By Akaike's criterion (IEEE Trans.
+    Automatic Control 19 (1974) 716): twice the gain in log-likelihood above twice the number of terms.
+    """
+    if richer is None or plainer is None:
+        return richer is not None
+    samples = np.sum(np.isfinite(richer.residual), axis=1)
+    gain = 2.0 * float(np.sum(samples * np.log(plainer.residual_steps / richer.residual_steps)))
+    return gain > 2.0 * (len(richer.names) - len(plainer.names))
 
 
 def _try(

@@ -8,7 +8,7 @@ Gravity, offsets, ripple, the joints' zeros and delay may have either sign.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -17,6 +17,10 @@ from estimator.arrays import Array
 LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
 MOST_COUPLING = 0.95  # of its bound, at the start
 BEND = 0.01  # rad: much of it, for friction that yields before it slides
+NEAREST = 1e-3  # of a width's floor: what always stays above it, or no step would lead back
+WIDENING = 2.0  # of a width, in one step
+SHAPES = ("stribeck_rise", "stribeck_velocity")
+RESHAPING = 1.0  # of the logarithms of these, in one step
 EITHER_SIGN = ("gravity", "offset", "delay", "ripple_sin", "ripple_cos", "ripple_cycles", "zero")
 
 
@@ -48,6 +52,28 @@ class Coordinates:
             x[share] = np.arctanh(np.clip(part, -MOST_COUPLING, MOST_COUPLING))
         return x
 
+    def moved(self, x: Array, step: Array) -> Array:
+        """Where `step` (coordinates,) leads from `x`; both may have coordinates of something else at their end.
+
+        The motion follows a width and not its logarithm: the width changes as a linear model foresees. By the
+        exponential of the step it would never arrive at its floor, and all that makes up for it would go too far.
+        """
+        y = x + step
+        widths = np.flatnonzero(self._floors)
+        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), NEAREST * self.width_floor))
+        return y
+
+    def limit(self, x: Array, least: Array, most: Array, narrowing: float) -> None:
+        """Lower in place what coordinates may change by in one step from `x` (coordinates,), if it is the shape of
+        friction near standstill: a width by no more than its share `narrowing` and by WIDENING, others by RESHAPING.
+
+        One that shrinks to nothing in a single step leaves no trace in the motion that would bring it back.
+        """
+        least[self._shapes], most[self._shapes] = -RESHAPING, RESHAPING
+        widths = np.flatnonzero(self._floors)
+        share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
+        least[widths], most[widths] = np.maximum(-1.0, -narrowing * share), WIDENING * share
+
     def slopes(self, x: Array) -> Array:
         """Derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
         value = self.values(x)
@@ -58,15 +84,19 @@ class Coordinates:
             slope[share, second] += 0.5 * value[share]
         return slope
 
-    @property
+    @cached_property
     def _either_sign(self) -> Array:
         return np.array([_kind(name) in EITHER_SIGN for name in self.names])
 
-    @property
+    @cached_property
     def _floors(self) -> Array:
         return np.array([self.width_floor if _kind(name) == "coulomb_width" else 0.0 for name in self.names])
 
-    @property
+    @cached_property
+    def _shapes(self) -> list[int]:
+        return [i for i, name in enumerate(self.names) if _kind(name) in SHAPES]
+
+    @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
         """Indices of what is bounded by the geometric mean of two others, and of the two."""
         bounds = {"coupling": ("inertia_1", "inertia_2")}

@@ -1,5 +1,13 @@
-"""From commanded torque to what the motors give: held, late, averaged over each integration step."""
+"""From commanded torque to what the motors give: held, late, averaged over each integration step.
 
+Compiled, since the likelihood asks for it with every simulation, beside which numpy takes a third of the time.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba
 import numpy as np
 
 from estimator.arrays import Array
@@ -32,54 +40,83 @@ def _torque(
     command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float
 ) -> tuple[Array, Array, Array]:
     """The mean torque over each step, and its derivatives by delay and lag."""
-    settled, settled_slope = _lagging(command, rate, lag)
-    total = np.zeros((command.shape[0], command.shape[1] + 1))
+    joints, samples = command.shape
+    total = np.zeros((joints, samples + 1))
     np.cumsum(command, axis=1, out=total[:, 1:])
     edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delay
-    gathered, present, by_lag = (np.empty((*command.shape, steps + 1)) for _ in range(3))
-    for i, edge in enumerate(edges.tolist()):
-        shift = int(np.floor(edge * rate))
-        phase = edge - shift / rate
-        held = np.roll(command, -shift, axis=1)
-        # Integral of the held command since command 0, at this edge after every sample.
-        gathered[:, :, i] = _before(total, rate, shift) + held * phase
-        fading = np.exp(-phase / lag) if lag > 0.0 else 0.0
-        left = (np.roll(settled, -shift, axis=1) - held) * fading
-        present[:, :, i] = held + left
-        # Without a lag the torque changes by lag times the command's steps, which has no derivative here.
-        slope = left * (phase / lag**2) + np.roll(settled_slope, -shift, axis=1) * fading if lag > 0.0 else 0.0
-        by_lag[:, :, i] = slope
-    # lag y' = u - y, integrated over a step: the mean of y is that of u less what the lag has stored.
-    step = 1.0 / (steps * rate)
-    change = np.diff(present, axis=2) / step
-    torque = np.diff(gathered, axis=2) / step - lag * change
-    if lag <= 0.0:
-        return torque, -change, np.zeros_like(change)
-    return torque, -change, -change - lag * np.diff(by_lag, axis=2) / step
+    shifts = np.floor(edges * rate)
+    phases = edges - shifts / rate
+    fading = np.exp(-phases / lag) if lag > 0.0 else np.zeros(steps + 1)
+    torque, late, change = (np.empty((joints, samples, steps)) for _ in range(3))
+    lagging = np.empty((2, samples))
+    _average(
+        *(np.ascontiguousarray(command), total, rate, lag, shifts.astype(np.int64), phases, fading),
+        *(lagging, torque, late, change),
+    )
+    return torque, late, change
 
 
-def _before(total: Array, rate: float, shift: int) -> Array:
-    """Integral of the held command from command 0 to command k + `shift`, for each k (joints, samples), from the
-    sum `total` (joints, samples + 1) of all commands before each."""
-    samples = total.shape[1] - 1
-    turns, rest = divmod(shift, samples)
-    once = np.concatenate((total[:, rest:-1], total[:, -1:] + total[:, :rest]), axis=1)
-    integral: Array = (turns * total[:, -1:] + once) / rate
-    return integral
+# Compiled code takes its arguments by position. Edge i of each sample's steps is `phases[i]` [s] after the command
+# `shifts[i]` commands later, by when `fading[i]` of what the lag held back then is left.
+def _average_loop(
+    command: Any,
+    total: Any,
+    rate: float,
+    lag: float,
+    shifts: Any,
+    phases: Any,
+    fading: Any,
+    lagging: Any,
+    torque: Any,
+    late: Any,
+    change: Any,
+) -> None:
+    joints, samples, steps = torque.shape
+    per_time = steps * rate
+    for j in range(joints):
+        _follow(command, j, rate, lag, lagging)
+        for k in range(samples):
+            gathered_before = present_before = by_lag_before = 0.0
+            for i in range(steps + 1):
+                turns, at = shifts[i] // samples, shifts[i] % samples + k
+                if at >= samples:
+                    turns, at = turns + 1, at - samples
+                held = command[j, at]
+                # Integral of the held command since command 0.
+                gathered = (turns * total[j, samples] + total[j, at]) / rate + held * phases[i]
+                left = (lagging[0, at] - held) * fading[i]
+                present = held + left
+                # Without a lag the torque changes by lag times the command's steps, which has no derivative here.
+                by_lag = left * phases[i] / (lag * lag) + lagging[1, at] * fading[i] if lag > 0.0 else 0.0
+                if i > 0:
+                    # lag y' = u - y, integrated over a step: the mean of y is that of u less what the lag has stored.
+                    stored = (present - present_before) * per_time
+                    torque[j, k, i - 1] = (gathered - gathered_before) * per_time - lag * stored
+                    late[j, k, i - 1] = -stored
+                    change[j, k, i - 1] = -stored - lag * (by_lag - by_lag_before) * per_time if lag > 0.0 else 0.0
+                gathered_before, present_before, by_lag_before = gathered, present, by_lag
 
 
-def _lagging(command: Array, rate: float, lag: float) -> tuple[Array, Array]:
-    """The lagging torque (joints, samples) at the instants of the commands, in its periodic steady state, and its
-    derivative by the lag.
+def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None:
+    """The lagging torque at the instants of joint j's commands, in its periodic steady state, and its derivative by the
+    lag, into `lagging` (2, samples).
 
-    It obeys y[k + 1] = a y[k] + (1 - a) u[k], which is one division per Fourier line.
+    It obeys y[k + 1] = a y[k] + (1 - a) u[k]. What it comes to from rest in one period tells the steady state.
     """
-    if lag <= 0.0:
-        before = np.roll(command, 1, axis=1)
-        return before, np.zeros_like(before)
-    a = np.exp(-1.0 / (rate * lag))
-    turn = np.exp(2j * np.pi * np.arange(command.shape[1] // 2 + 1) / command.shape[1])
-    filtered = np.fft.rfft(command, axis=1) * ((1.0 - a) / (turn - a))
-    slope = filtered * ((1.0 - turn) / (turn - a) / (1.0 - a) * (a / (rate * lag**2)))
-    both = np.fft.irfft(np.stack((filtered, slope)), command.shape[1], axis=2)
-    return both[0], both[1]
+    samples = command.shape[1]
+    a = math.exp(-1.0 / (rate * lag)) if lag > 0.0 else 0.0
+    a_by_lag = a / (rate * lag * lag) if lag > 0.0 else 0.0
+    y = by_a = 0.0
+    for turn in range(2):
+        for k in range(samples):
+            u = command[j, k]
+            lagging[0, k], lagging[1, k] = y, by_a * a_by_lag
+            y, by_a = a * y + (1.0 - a) * u, a * by_a + y - u
+        if turn == 0:
+            left = a**samples
+            y /= 1.0 - left
+            by_a = (by_a + samples * a ** (samples - 1) * y) / (1.0 - left)
+
+
+_follow = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(_follow)  # type: ignore[call-overload]
+_average: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_average_loop)

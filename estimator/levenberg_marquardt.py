@@ -41,12 +41,29 @@ class Minimum:
 
 
 Evaluate = Callable[[Array], Quadratic]
+Move = Callable[[Array, Array], Array]
+Limits = Callable[[Array], tuple[Array, Array]]
+
+
+def alike(x: Array) -> tuple[Array, Array]:
+    """No coordinate changes by more than LONGEST in one step."""
+    return np.full(x.size, -LONGEST), np.full(x.size, LONGEST)
 
 
 def minimise(
-    evaluate: Evaluate, start: Array, enough: float, damping: float = FIRST_DAMPING, at: Quadratic | None = None
+    evaluate: Evaluate,
+    start: Array,
+    enough: float,
+    damping: float = FIRST_DAMPING,
+    at: Quadratic | None = None,
+    *,
+    move: Move = np.add,
+    limits: Limits = alike,
 ) -> Minimum:
     """Minimise a sum of squares from `start`, coordinates of the size of 1; `at` is the sum there, if it is known.
+
+    `move` takes coordinates and a step to where the step leads; `limits` gives the least and the most that each
+    coordinate may change in a step from there.
 
     Ends when a step lowers the sum, or would, by less than `enough` of it; a sum that is not finite counts as
     too large. Damped steps are short along what is hardly seen and end too early there: near the end, `damping`
@@ -59,7 +76,7 @@ def minimise(
     evaluations = int(at is None)
     gained = np.inf
     for _ in range(ITERATIONS):
-        found, damping, tried = _improve(evaluate, x, here, damping, enough)
+        found, damping, tried = _improve(evaluate, x, here, damping, enough, move, limits(x))
         evaluations += tried
         if found is None:
             return Minimum(x, here, evaluations)
@@ -76,42 +93,50 @@ def minimise(
 
 
 def _improve(
-    evaluate: Evaluate, x: Array, at: Quadratic, damping: float, enough: float
+    evaluate: Evaluate,
+    x: Array,
+    at: Quadratic,
+    damping: float,
+    enough: float,
+    move: Move,
+    limits: tuple[Array, Array],
 ) -> tuple[tuple[Array, Quadratic] | None, float, int]:
     """A better point, or None when there is none in sight; the next step's damping; and the points tried."""
     tried = 0
     while damping < MOST_DAMPING:
-        step = _step(at.normal, at.gradient, damping)
+        step = _step(at.normal, at.gradient, damping, *limits)
         foreseen = -float(step @ (2.0 * at.gradient + at.normal @ step))
         if foreseen < enough * at.cost:
             break
-        there = evaluate(x + step)
+        moved = move(x, step)
+        there = evaluate(moved)
         tried += 1
         gained = at.cost - there.cost
         if gained > 0.0:
-            return (x + step, there), max(LEAST_DAMPING, damping * (0.1 if gained > 0.5 * foreseen else 1.0)), tried
+            return (moved, there), max(LEAST_DAMPING, damping * (0.1 if gained > 0.5 * foreseen else 1.0)), tried
         damping = max(10.0 * damping, FIRST_DAMPING)
     return None, damping, tried
 
 
-def _step(normal: Array, gradient: Array, damping: float) -> Array:
-    """The damped step, no coordinate moving by more than LONGEST.
+def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
+    """The damped step, every coordinate moving by no less than `least` and no more than `most`.
 
     A coordinate that would is held there and the others solved again: scaling the whole step would let one
     that is all but flat, such as the logarithm of something that is zero, stop the rest.
     """
     scale = np.sqrt(np.diag(normal))
     scale = np.maximum(scale, 1e-12 * scale.max())
-    damped = normal + damping * np.diag(scale**2)
+    matrix = normal / np.outer(scale, scale)
+    matrix[np.diag_indices_from(matrix)] += damping
+    slope = gradient / scale
     step = np.zeros_like(gradient)
     free = np.ones(gradient.size, dtype=np.bool_)
     while free.any():
-        slope = (gradient[free] + damped[np.ix_(free, ~free)] @ step[~free]) / scale[free]
-        matrix = damped[np.ix_(free, free)] / np.outer(scale[free], scale[free])
-        step[free] = -np.linalg.solve(matrix, slope) / scale[free]
-        too_long = free & (np.abs(step) > LONGEST)
+        held = np.where(free, 0.0, step * scale)
+        step[free] = -np.linalg.solve(matrix[free][:, free], (slope + matrix @ held)[free]) / scale[free]
+        too_long = free & ((step < least) | (step > most))
         if not too_long.any():
             break
-        step[too_long] = np.clip(step[too_long], -LONGEST, LONGEST)
+        step[too_long] = np.clip(step, least, most)[too_long]
         free &= ~too_long
     return step

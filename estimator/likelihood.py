@@ -9,8 +9,10 @@ How large the errors are is itself estimated, joint by joint, before the last di
 far outside are weighed down there (Huber): a few wild readings then cost nothing.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from estimator.coordinates import Coordinates, scales_of
 from estimator.covariance import LONGEST_LAG, Scatter, correlation_time, robust_covariance, structured_share
 from estimator.errors import ConvergenceError
 from estimator.least_squares import LinearEstimate
-from estimator.levenberg_marquardt import LEAST_DAMPING, Minimum, Quadratic, minimise
+from estimator.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, Minimum, Quadratic, alike, minimise
 from estimator.model import Model
 from estimator.normal_equations import normal_equations
 from estimator.period import SettledPeriod
@@ -36,12 +38,16 @@ WIDTH_FLOOR = 1e-4  # rad/s: friction that sticks is not told from this, and fro
 STARTING_WIDTHS = (0.005, 0.05)  # rad/s
 STARTING_BENDS = (1e-3, 5e-3)  # rad
 # An arm that swings past the upright amplifies what is still wrong: it is first held to the measured motion by springs
-# that would give its joints this frequency, then its free beginning is fitted before the whole.
+# that would give its joints this frequency. If what is found then is lost when the springs are gone, and leaves so many
+# times more of the motion, the arm's free beginning is fitted before the whole.
 PULL = 2.0  # Hz
+LOST = 1.5
 HORIZONS = (0.125, 0.25, 0.5)
 LEAST_HORIZON = 10  # samples of all joints for each unknown
-# Relative gains in the sum of squares at which a fit ends: of a start, of the first and the second look at the whole,
-# and of the end, where what is left to gain is a tenth of a standard error's worth over all parameters together.
+# Relative gains in the sum of squares at which a fit ends: of the first state alone, of a start, of the first and the
+# second look at the whole, and of the end, where what is left to gain is a tenth of a standard error's worth over all
+# parameters together.
+ROUGHLY = 0.1
 HASTY = 2e-2
 COARSE = 3e-3
 NEAR = 3e-4
@@ -51,10 +57,13 @@ SAME, CLOSE = 1.0, 25.0
 HOPELESS = 2.0  # sum of squares per sample in units of the noise from which a hasty fit gives up
 ALIKE = 1.01  # of the best try's sum of squares: up to here another try may still end lower
 EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is left for another try to find
+# Far from the end the sum is anything but quadratic in friction's width; in the short steps near the end it is nearly.
+CAUTIOUS, BOLD = 0.5, 0.8
 ANGLE_SCALE = 0.1  # rad
 # Where the terms start that the regression does not see.
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
-RISES = (0.05, 2.0)  # of static over Coulomb friction, less one: what is to be believed halfway
+RISE = ("stribeck_rise", "stribeck_velocity")
+SHAPE = ("coulomb_width", "presliding_stiffness", "presliding_damping", *RISE)  # of friction near standstill
 LEAST_LAG = 1e-4  # s, at the start
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 LEAST_WINDOW = 0.005  # of a run: rounding is correlated, a little, over more lags than its autocorrelation shows
@@ -97,6 +106,10 @@ class Problem:
     """Of each run, from its beginning, that is looked at."""
     pull: Array | None = None
     """Stiffness of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
+    narrowing: float = BOLD
+    """Share that friction's step may lose of its width at a time."""
+    held: bool = False
+    """Whether the parameters stay as they are."""
 
     @property
     def count(self) -> int:
@@ -140,6 +153,26 @@ class Problem:
             )
         return total
 
+    def minimise(self, x: Array, enough: float, damping: float = FIRST_DAMPING, at: Quadratic | None = None) -> Minimum:
+        """Minimise the sum of squares from `x`, until it falls by less than `enough` of it; see `minimise`."""
+        return minimise(self.evaluate, x, enough, damping, at, move=self.coordinates.moved, limits=self._limits)
+
+    def _limits(self, x: Array) -> tuple[Array, Array]:
+        """The least and the most that each coordinate may change in a step."""
+        least, most = alike(x)
+        self.coordinates.limit(x[: self.count], least, most, self.narrowing)
+        if self.held:
+            least[: self.count] = most[: self.count] = 0.0
+        return least, most
+
+    def cost(self, positions: Sequence[Array]) -> float:
+        """The weighted sum of squares of simulated positions, run by run (joints, samples) [rad]."""
+        squares = [
+            np.square(weight * (position - run.measured))
+            for run, weight, position in zip(self.runs, self.weights, positions, strict=True)
+        ]
+        return float(sum(square.sum() for square in squares))
+
     def positions(self, x: Array) -> tuple[Array, ...]:
         """Simulated positions of each run (joints, samples) [rad]."""
         physics = self.physics(x)
@@ -182,48 +215,116 @@ def fit_runs(
     leaves much more than the noise is given up before its last digits.
     """
     problem, states = _problem(periods, model, linear)
-    rough = replace(problem, runs=tuple(run.roughly() for run in problem.runs))
+    rough = replace(problem, runs=tuple(run.roughly() for run in problem.runs), narrowing=CAUTIOUS)
     samples = int(sum(period.valid.sum() for period in periods))
     ripple = find_ripple(periods, linear) if model.ripple else {}
-    enough = HASTY if hasty else COARSE
-    tries: list[Minimum] = []
-    lost = ConvergenceError("no start was given")
-    shapes = _shapes(linear)
-    own = [_start(model, linear, ripple, shape) for shape in shapes]
+    own = [_start(model, linear, ripple, shape) for shape in _shapes(linear)]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
-    for start in (*given, *own):
-        x = np.concatenate((problem.coordinates.coordinates(start), states))
+    coordinates = [problem.coordinates.coordinates(value) for value in (*given, *own)]
+    ways = _ways(rough, [np.concatenate((x, states)) for x in coordinates], _springs(linear), samples, hasty)
+    way = min(ways, key=lambda each: each.free.at.cost)
+    tries = [each.free for each in ways]
+    spent = sum(found.iterations for found in tries)
+    hopeless = hasty and way.free.at.cost > HOPELESS * samples
+    if not hopeless:
+        # What explains the motion may still have its friction's shape wrong, by a little of the sum: pulled motion
+        # shows the shape well, and from a narrow shape there is no way to a wide one.
+        likely = ALIKE * way.free.at.cost
+        again = [_reshaped(problem, way.free.x, other) for other in (way.pulled, coordinates[-1])]
+        if model.presliding:
+            # How far friction bends before it slides is seen better than how it rises then.
+            again.append(_reshaped(problem, way.free.x, coordinates[-1], RISE))
+        tries = _at_once(
+            [partial(rough.minimise, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
+            + [partial(_polished, rough, x, HASTY if hasty else COARSE, likely) for x in again]
+        )
+        spent += sum(found.iterations for found in tries)
+    positions = problem.positions(_best(tries).x)
+    weights, outliers = _weights(periods, positions)
+    weighed = replace(problem, weights=weights)
+    ends = _at_once([partial(weighed.minimise, each.x, HASTY if hasty else NEAR) for each in _distinct(tries)])
+    best = _best(ends)
+    left = problem.cost(positions) * best.at.cost / weighed.cost(positions)
+    last = HASTY if hopeless else FINE if left < EXPLAINED * samples else NEAR
+    minimum = weighed.minimise(best.x, last, LEAST_DAMPING, best.at)
+    spent += sum(found.iterations for found in (*ends, minimum))
+    return _fit(periods, weighed, minimum, outliers, spent)
+
+
+@dataclass(frozen=True)
+class Way:
+    """How one start went, in long steps of integration."""
+
+    pulled: Array
+    """Coordinates of what fits the motion of the pulled arm."""
+    free: Minimum
+    """What fits the free motion, with all simulations on the way there."""
+
+
+def _ways(problem: Problem, starts: Sequence[Array], springs: Array, samples: int, hasty: bool) -> list[Way]:
+    """From one start after the other until the motion is explained. Raises ConvergenceError if none leads anywhere."""
+    ways: list[Way] = []
+    lost = ConvergenceError("no start was given")
+    for x in starts:
         try:
-            tries.append(_approach(rough, x, linear, samples, enough))
+            ways.append(_way(problem, x, springs, samples, HASTY if hasty else COARSE))
         except ConvergenceError as error:
             lost = error
             continue
-        if tries[-1].at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
+        if ways[-1].free.at.cost < (HOPELESS if hasty else 1.0) * EXPLAINED * samples:
             break
-    if not tries:
+    if not ways:
         raise lost
-    best = _best(tries)
-    spent = sum(found.iterations for found in tries)
-    hopeless = hasty and best.at.cost > HOPELESS * samples
-    if not hopeless:
-        # What explains the motion may still have its friction's shape wrong, by a little of the sum.
-        # How far friction bends before it slides is seen better than how it rises then.
-        shapes += [{}] * model.presliding
-        again = [found for shape in shapes for found in _retry(rough, _reshaped(problem, best.x, shape), enough)]
-        spent += sum(found.iterations for found in again)
-        tries += again
-        likely = ALIKE * _best(tries).at.cost
-        tries = [minimise(rough.evaluate, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
-        spent += sum(found.iterations for found in tries)
-    ends = [minimise(problem.evaluate, each.x, enough) for each in _distinct(tries)]
-    best = _best(ends)
-    weights, outliers = _weights(periods, problem.positions(best.x))
-    problem = replace(problem, weights=weights)
-    last = HASTY if hopeless else FINE if best.at.cost < EXPLAINED * samples else NEAR
-    minimum = minimise(problem.evaluate, best.x, last, LEAST_DAMPING)
-    spent += sum(found.iterations for found in (*ends, minimum))
-    return _fit(periods, problem, minimum, outliers, spent)
+    return ways
+
+
+def _springs(linear: LinearEstimate) -> Array:
+    """Stiffness (joints,) [N m/rad] of springs that give each joint the frequency PULL."""
+    inertia = [abs(linear.value[i]) for i, name in enumerate(linear.names) if name.startswith("inertia")]
+    stiffness: Array = np.array(inertia) * (2.0 * np.pi * PULL) ** 2
+    return stiffness
+
+
+def _way(problem: Problem, x: Array, springs: Array, samples: int, enough: float) -> Way:
+    """From stage 1's parameters to the whole free motion, by way of pulled motion."""
+    pulled = replace(problem, pull=springs).minimise(x, HASTY)
+    spent = pulled.iterations
+    ends: list[Minimum] = []
+    try:
+        # Springs leave little trace of the state at the first sample.
+        start = replace(problem, held=True).minimise(pulled.x, ROUGHLY)
+        ends.append(problem.minimise(start.x, enough, at=start.at))
+        spent += start.iterations + ends[0].iterations
+    except ConvergenceError:
+        pass
+    if not ends or ends[0].at.cost > LOST * pulled.at.cost:
+        x = pulled.x
+        for share in HORIZONS:
+            if share * samples > LEAST_HORIZON * x.size:
+                start = replace(problem, share=share).minimise(x, HASTY)
+                x, spent = start.x, spent + start.iterations
+        ends.append(problem.minimise(x, enough))
+        spent += ends[-1].iterations
+    return Way(pulled.x, replace(_best(ends), iterations=spent))
+
+
+def _at_once(fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
+    """Fits that do not need each other, in threads: what is compiled leaves the interpreter to the others.
+
+    One that leads nowhere is no loss where there is another. Raises ConvergenceError when all do.
+    """
+    found: list[Minimum] = []
+    lost = ConvergenceError("there was nothing to fit")
+    with ThreadPoolExecutor(len(fits)) as threads:
+        for running in [threads.submit(fit) for fit in fits]:
+            try:
+                found.append(running.result())
+            except ConvergenceError as error:
+                lost = error
+    if not found:
+        raise lost
+    return found
 
 
 def _retry(problem: Problem, x: Array, enough: float) -> list[Minimum]:
@@ -248,19 +349,6 @@ def _distinct(tries: Sequence[Minimum]) -> list[Minimum]:
     return distinct
 
 
-def _approach(problem: Problem, x: Array, linear: LinearEstimate, samples: int, enough: float) -> Minimum:
-    """From stage 1's parameters to the whole free motion, by way of pulled motion and of its beginning."""
-    inertia = [abs(linear.value[linear.names.index(f"inertia_{j + 1}")]) for j in range(problem.state_scale.size // 2)]
-    eased = [replace(problem, pull=np.array(inertia) * (2.0 * np.pi * PULL) ** 2)]
-    eased += [replace(problem, share=share) for share in HORIZONS if share * samples > LEAST_HORIZON * x.size]
-    spent = 0
-    for each in eased:
-        found = minimise(each.evaluate, x, HASTY)
-        x, spent = found.x, spent + found.iterations
-    found = minimise(problem.evaluate, x, enough)
-    return replace(found, iterations=spent + found.iterations)
-
-
 def _shapes(linear: LinearEstimate) -> list[dict[str, float]]:
     """Friction near standstill to start from, of every joint: sharp and soft."""
     viscous, coulomb = (
@@ -273,20 +361,20 @@ def _shapes(linear: LinearEstimate) -> list[dict[str, float]]:
     ]
 
 
-def _reshaped(problem: Problem, x: Array, shape: Mapping[str, float]) -> Array:
-    """The coordinates `x` with friction near standstill as at the start, of this shape."""
-    names = problem.coordinates.names
-    shape = {**shape, "stribeck_velocity": START["stribeck_velocity"]}
-    moved = np.array([name.rstrip("_12") in shape for name in names])
-    start = np.array([shape.get(name.rstrip("_12"), 0.0) for name in names])
-    value = np.where(moved, start, problem.coordinates.values(x[: len(names)]))
-    # A rise that has vanished, or grown as it shrank to nothing in velocity, has no slope left that brings it back.
-    low, high = RISES
-    lost = np.array([name.startswith("stribeck_rise") for name in names]) & ((value < low) | (value > high))
-    value = np.where(lost, START["stribeck_rise"], value)
-    moved |= lost
+def _polished(problem: Problem, x: Array, enough: float, likely: float) -> Minimum:
+    """From `x` until little is left to gain, and on if the sum of squares is below `likely`."""
+    found = problem.minimise(x, enough)
+    if found.at.cost >= likely:
+        return found
+    near = problem.minimise(found.x, NEAR, at=found.at)
+    return replace(near, iterations=found.iterations + near.iterations)
+
+
+def _reshaped(problem: Problem, x: Array, other: Array, kinds: tuple[str, ...] = SHAPE) -> Array:
+    """The coordinates `x` with these kinds of parameters as the coordinates `other` have them."""
+    shape = [name.rstrip("_12") in kinds for name in problem.coordinates.names]
     reshaped = x.copy()
-    reshaped[: len(names)][moved] = problem.coordinates.coordinates(value)[moved]
+    reshaped[: len(shape)][shape] = other[: len(shape)][shape]
     return reshaped
 
 

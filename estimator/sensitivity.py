@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from estimator.arrays import Array
 from estimator.physics import CONSTANTS, Physics
-from estimator.simulation import GAMMA, MOST_PIECES, finer_pieces, pieces_now
+from estimator.simulation import GAMMA, MOST_PIECES, bend_at, bump_at, finer_pieces, pieces_now
 
 # What can be differentiated by: the constants, the drive's times, the state at the first sample.
 CAUSES = (*CONSTANTS, "delay", "lag", "position_1", "position_2", "velocity_1", "velocity_2")
@@ -136,41 +136,44 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     if cycles != 0.0:
         sine, cosine = math.sin(cycles * q), math.cos(cycles * q)
         shape = 1.0 + ripple_sin * sine + ripple_cos * cosine
-    turn = t * (ripple_sin * cosine - ripple_cos * sine)
-    motor = t * shape
+    motor, turn = t * shape, t * (ripple_sin * cosine - ripple_cos * sine)
     loaded = load if motor > 0.0 else -load
-    bump = math.exp(-((v / fading) ** 2))
+    sharp, slow = 1.0 / width, 1.0 / fading
+    bump = bump_at(v * slow)
     level = coulomb * (1.0 + rise * bump) + load * abs(motor)
-    level_v = -2.0 * coulomb * rise * bump * v / fading**2
-    bend = math.tanh(v / width)
-    bent = (1.0 - bend * bend) / width
-    bent_v = -2.0 * bend * bent / width
-    bend_w = -v / width * bent
-    level_f = 2.0 * coulomb * rise * bump * v * v / fading**3
+    dry = asymmetry * v + level
+    level_v = -2.0 * coulomb * rise * bump * v * slow * slow
+    level_f = -level_v * v * slow
+    bend, bent = bend_at(v, sharp)
+    bent_v, bend_w = -2.0 * bend * bent * sharp, -v * sharp * bent
     passed = 1.0 - loaded * bend
     f = (2 * now + stage) * STAGE + joint * WIDE
     s = f + SLOPES
     rows[f + at[c]], rows[s + at[c]] = -v, 1.0
     rows[f + at[c + 2]], rows[s + at[c + 2]] = -(1.0 + rise * bump) * bend, (1.0 + rise * bump) * bent
     rows[f + at[c + 4]] = -1.0
-    rows[f + at[c + 6]] = -(level + asymmetry * v) * bend_w
-    rows[s + at[c + 6]] = -level * (bent + 2.0 * bend * bend_w) / width
+    rows[f + at[c + 6]] = -dry * bend_w
+    rows[s + at[c + 6]] = -level * (bent + 2.0 * bend * bend_w) * sharp
     rows[f + at[c + 8]], rows[s + at[c + 8]] = -coulomb * bump * bend, coulomb * bump * bent
     rows[f + at[c + 10]], rows[s + at[c + 10]] = -level_f * bend, level_f * bent
-    rows[f + at[c + 12]], rows[s + at[c + 12]] = -abs(motor) * bend, abs(motor) * bent
-    rows[f + at[c + 14]] = -v * bend
-    rows[f + at[c + 16]], rows[s + at[c + 16]] = t * sine * passed, t * sine * loaded * bent
-    rows[f + at[c + 18]], rows[s + at[c + 18]] = t * cosine * passed, t * cosine * loaded * bent
-    rows[f + at[c + 20]], rows[s + at[c + 20]] = q * turn * passed, q * turn * loaded * bent
-    rows[f + at[c + 24]], rows[s + at[c + 24]] = commanded * shape * passed, commanded * shape * loaded * bent
+    # Writing all this takes longer than working it out: what nobody asked for is left alone.
+    if at[c + 12] != NOWHERE:
+        rows[f + at[c + 12]], rows[s + at[c + 12]] = -abs(motor) * bend, abs(motor) * bent
+    if at[c + 14] != NOWHERE:
+        rows[f + at[c + 14]] = -v * bend
+    if min(at[c + 16], at[c + 18], at[c + 20]) < NOWHERE:
+        rows[f + at[c + 16]], rows[s + at[c + 16]] = t * sine * passed, t * sine * loaded * bent
+        rows[f + at[c + 18]], rows[s + at[c + 18]] = t * cosine * passed, t * cosine * loaded * bent
+        rows[f + at[c + 20]], rows[s + at[c + 20]] = q * turn * passed, q * turn * loaded * bent
+    if at[c + 24] != NOWHERE:
+        rows[f + at[c + 24]], rows[s + at[c + 24]] = commanded * shape * passed, commanded * shape * loaded * bent
     for cause in range(2):
         rows[f + at[DELAY + cause]] = scale * shape * passed * dt[cause, joint]
         rows[s + at[DELAY + cause]] = scale * shape * loaded * bent * dt[cause, joint]
-    left[stage, joint] = motor - offset - viscous * v - (asymmetry * v + level) * bend
-    slope[stage, joint] = viscous + level * bent
+    left[stage, joint], slope[stage, joint] = motor - offset - viscous * v - dry * bend, viscous + level * bent
     n = now * NUMBERS + stage * BY_STATE
     numbers[n + 5 * joint] = cycles * turn * passed
-    numbers[n + 5 * joint + 2] = -viscous - (asymmetry * v + level) * bent - (asymmetry + level_v) * bend
+    numbers[n + 5 * joint + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
     numbers[n + 8 + 2 * joint], numbers[n + 9 + 2 * joint] = (
         cycles * turn * loaded * bent,
         level_v * bent + level * bent_v,
@@ -227,16 +230,16 @@ def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any
         if stage == 0:
             m11, m12 = n11, n12
             w11, w22 = m11 + gh * slope[0, 0], m22 + gh * slope[0, 1]
-            w = w11 * w22 - m12 * m12
+            w = 1.0 / (w11 * w22 - m12 * m12)
             # Winv = [i11 i12; i12 i22]
-            i11, i12, i22 = w22 / w, -m12 / w, w11 / w
+            i11, i12, i22 = w22 * w, -m12 * w, w11 * w
             k1, k2 = i11 * left[0, 0] + i12 * left[0, 1], i12 * left[0, 0] + i22 * left[0, 1]
             here[0, 0] += h * x[1, 0]
             here[0, 1] += h * x[1, 1]
             here[1, 0] += h * k1
             here[1, 1] += h * k2
-    n = n11 * m22 - n12 * n12
-    j11, j12, j22 = m22 / n, -n12 / n, n11 / n
+    n = 1.0 / (n11 * m22 - n12 * n12)
+    j11, j12, j22 = m22 * n, -n12 * n, n11 * n
     a1, a2 = j11 * left[1, 0] + j12 * left[1, 1], j12 * left[1, 0] + j22 * left[1, 1]
     r1, r2 = a1 - 2.0 * k1, a2 - 2.0 * k2
     b1, b2 = m11 * r1 + m12 * r2, m12 * r1 + m22 * r2

@@ -36,7 +36,7 @@ PILOT_SHARES = (0.4, 0.6, 0.8, 1.0)
 """Of the limits: how far the pilot goes; more where the arm did not move enough to be identified."""
 
 MOST_STEPS = 4
-CERTAIN = 0.8
+CERTAIN = 0.85
 """A typical arm should come this far on its way to a limit; where it stays below, uncertainty costs too much range."""
 
 REPLAYED = 0.05
