@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-SHARED = ("__init__", "machine", "pty", "recorded_arm")
+SHARED = ("__init__", "elastic_slip", "machine", "pty", "recorded_arm")
 SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if path.stem not in SHARED)
 
 
