@@ -246,7 +246,7 @@ def fit_runs(
     ends = _at_once([partial(weighed.minimise, each.x, HASTY if hasty else NEAR) for each in _distinct(tries)])
     best = _best(ends)
     left = problem.cost(positions) * best.at.cost / weighed.cost(positions)
-    last = HASTY if hopeless else FINE if left < EXPLAINED * samples else NEAR
+    last = HASTY if hopeless else NEAR if hasty and left > EXPLAINED * samples else FINE
     minimum = weighed.minimise(best.x, last, LEAST_DAMPING, best.at)
     spent += sum(found.iterations for found in (*ends, minimum))
     return _fit(periods, weighed, minimum, outliers, spent)
