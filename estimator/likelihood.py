@@ -223,33 +223,73 @@ def fit_runs(
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
     coordinates = [problem.coordinates.coordinates(value) for value in (*given, *own)]
     ways = _ways(rough, [np.concatenate((x, states)) for x in coordinates], _springs(linear), samples, hasty)
+    left = min(each.free.at.cost for each in ways)
+    if hasty and left > HOPELESS * samples:
+        ended = _ended(problem, periods, [each.free for each in ways], HASTY)
+        last = HASTY
+    else:
+        ended = _tried_again(problem, rough, periods, ways, coordinates[-1], hasty)
+        last = NEAR if hasty and ended.left > EXPLAINED * samples else FINE
+    minimum = ended.weighed.minimise(ended.best.x, last, LEAST_DAMPING, ended.best.at)
+    spent = sum(each.free.iterations for each in ways) + ended.iterations + minimum.iterations
+    return _fit(periods, ended.weighed, minimum, ended.outliers, spent)
+
+
+def _tried_again(
+    problem: Problem, rough: Problem, periods: Sequence[SettledPeriod], ways: Sequence["Way"], wide: Array, hasty: bool
+) -> "Ended":
+    """From where the best of `ways` led, with other shapes of friction near standstill too, to the ends in short steps.
+
+    What explains the motion may still have that shape wrong, by a little of the sum: pulled motion shows it well, and
+    from a narrow one there is no way to a wide one, as which `wide` (parameters' coordinates) has it.
+    """
+    enough = HASTY if hasty else COARSE
     way = min(ways, key=lambda each: each.free.at.cost)
-    tries = [each.free for each in ways]
-    spent = sum(found.iterations for found in tries)
-    hopeless = hasty and way.free.at.cost > HOPELESS * samples
-    if not hopeless:
-        # What explains the motion may still have its friction's shape wrong, by a little of the sum: pulled motion
-        # shows the shape well, and from a narrow shape there is no way to a wide one.
-        likely = ALIKE * way.free.at.cost
-        again = [_reshaped(problem, way.free.x, other) for other in (way.pulled, coordinates[-1])]
-        if model.presliding:
-            # How far friction bends before it slides is seen better than how it rises then.
-            again.append(_reshaped(problem, way.free.x, coordinates[-1], RISE))
+    likely = ALIKE * way.free.at.cost
+    shapes = [_reshaped(problem, way.free.x, way.pulled)]
+    if any(name.startswith("presliding") for name in problem.coordinates.names):
+        # How far friction bends before it slides is seen better than how it rises then.
+        shapes.append(_reshaped(problem, way.free.x, wide, RISE))
+    alike = [each.free for each in ways if each.free.at.cost < likely]
+    with ThreadPoolExecutor(1) as aside:
+        # From a wide shape it is far: the others come to their ends meanwhile.
+        coming = aside.submit(_polished, rough, _reshaped(problem, way.free.x, wide), enough, likely)
         tries = _at_once(
-            [partial(rough.minimise, each.x, NEAR, at=each.at) for each in tries if each.at.cost < likely]
-            + [partial(_polished, rough, x, HASTY if hasty else COARSE, likely) for x in again]
+            [partial(rough.minimise, each.x, NEAR, at=each.at) for each in alike]
+            + [partial(_polished, rough, x, enough, likely) for x in shapes]
         )
-        spent += sum(found.iterations for found in tries)
+        ended = _ended(problem, periods, tries, HASTY if hasty else NEAR)
+        try:
+            late = coming.result()
+        except ConvergenceError:
+            return ended
+    spent = ended.iterations + sum(found.iterations for found in (*tries, late))
+    if late.at.cost < _best(tries).at.cost + CLOSE and all(abs(late.at.cost - each.at.cost) > SAME for each in tries):
+        ended = _ended(problem, periods, [*tries, late], HASTY if hasty else NEAR)
+        spent += ended.iterations
+    return replace(ended, iterations=spent)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Where tries lead in short steps of integration, weighed by what the best of them leaves."""
+
+    weighed: Problem
+    outliers: int
+    best: Minimum
+    left: float
+    """Sum of squares of the best in units of the noise."""
+    iterations: int
+
+
+def _ended(problem: Problem, periods: Sequence[SettledPeriod], tries: Sequence[Minimum], enough: float) -> Ended:
     positions = problem.positions(_best(tries).x)
     weights, outliers = _weights(periods, positions)
     weighed = replace(problem, weights=weights)
-    ends = _at_once([partial(weighed.minimise, each.x, HASTY if hasty else NEAR) for each in _distinct(tries)])
+    ends = _at_once([partial(weighed.minimise, each.x, enough) for each in _distinct(tries)])
     best = _best(ends)
     left = problem.cost(positions) * best.at.cost / weighed.cost(positions)
-    last = HASTY if hopeless else NEAR if hasty and left > EXPLAINED * samples else FINE
-    minimum = weighed.minimise(best.x, last, LEAST_DAMPING, best.at)
-    spent += sum(found.iterations for found in (*ends, minimum))
-    return _fit(periods, weighed, minimum, outliers, spent)
+    return Ended(weighed, outliers, best, left, sum(found.iterations for found in ends))
 
 
 @dataclass(frozen=True)
