@@ -7,7 +7,7 @@ two joints); under `textbook` the same on the arm of configs/fake_two_link_ideal
 over inertias, gravity, viscous and Coulomb friction. How each peer was tuned stands in estimator/peers.py and
 hil/mujoco_peer.py; mujoco.sysid takes part where it is installed (extra `peers`), started within 50 % of the truth.
 
-Time: this project's own estimate is timed in the same process, after one run to compile and before the peers;
+Time: the median of three runs of each method, in one process, after one to compile, this project's own estimate first;
 building mujoco.sysid's model and residual is not counted either. On the demo `hil` has the Stribeck friction and
 current lag of its configuration, which cost time; mujoco.sysid has the Coulomb friction that it can have, and
 `hil_coulomb` the same, which no more fits that arm than its own does. On the textbook arm all three have Coulomb
@@ -18,6 +18,7 @@ project's estimate two or three of its fits, so that a busy machine says little 
 import argparse
 import json
 import os
+import statistics
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from hil.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RECORDINGS = {"demo": "fake_two_link.toml", "textbook": "fake_two_link_ideal.toml"}
+TIMES = 3  # of which every method's median time counts
 KEYS = ("seconds", "worst_relative_error", "held_out_rms")
 
 
@@ -42,7 +44,10 @@ def measure(name: str, seed: int, mujoco: bool) -> dict[str, Any]:
         run = RunFolder.create(Path(folder) / "run", config)
         run_experiment(config, run, config.path, lambda _: None)
         compare_run(run, mujoco=False)  # compiles
-        return compare_run(run, mujoco)["methods"]
+        runs = [compare_run(run, mujoco)["methods"] for _ in range(TIMES)]
+    for method, entry in runs[0].items():
+        entry["seconds"] = statistics.median(each[method]["seconds"] for each in runs)
+    return runs[0]
 
 
 def installed() -> bool:
