@@ -22,6 +22,7 @@ from estimator.normal_equations import normal_equations
 LONGEST_LAG = 400  # samples
 MOST_OF_RUN = 0.05
 FEWEST_LAGS = 4
+VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 
 
 class Scatter:
@@ -123,3 +124,17 @@ def _larger(robust: Array, white: Array) -> Array:
     factor, turned = np.linalg.eigh(0.5 * (ratio + ratio.T))
     covariance: Array = (root @ (turned * np.maximum(factor, 1.0))) @ (root @ turned).T
     return covariance
+
+
+def by_parameters(covariance: Array, slopes: Array, value: Array) -> Array:
+    """Covariance of the parameters (parameters, parameters) from that of their coordinates.
+
+    A positive parameter that leaves no trace is as good as zero: it is known to its own size. Its coordinate is
+    the logarithm of what is above its floor, so that the slope is that size.
+    """
+    hidden = np.isinf(np.diag(covariance))
+    finite: Array = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T
+    faint = hidden & (np.diag(slopes) < VANISHED * np.abs(value))
+    finite[hidden, hidden] = np.inf
+    finite[faint, faint] = value[faint] ** 2
+    return finite

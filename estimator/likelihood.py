@@ -18,7 +18,14 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
-from estimator.covariance import LONGEST_LAG, Scatter, correlation_time, robust_covariance, structured_share
+from estimator.covariance import (
+    LONGEST_LAG,
+    Scatter,
+    by_parameters,
+    correlation_time,
+    robust_covariance,
+    structured_share,
+)
 from estimator.errors import ConvergenceError
 from estimator.least_squares import LinearEstimate
 from estimator.levenberg_marquardt import FIRST_DAMPING, LEAST_DAMPING, Minimum, Quadratic, alike, minimise
@@ -65,7 +72,6 @@ START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_s
 RISE = ("stribeck_rise", "stribeck_velocity")
 SHAPE = ("coulomb_width", "presliding_stiffness", "presliding_damping", *RISE)  # of friction near standstill
 LEAST_LAG = 1e-4  # s, at the start
-VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 LEAST_WINDOW = 0.005  # of a run: rounding is correlated, a little, over more lags than its autocorrelation shows
 OUTLIER = 4.0  # standard deviations; rounding never leaves more than 1.7
 
@@ -482,25 +488,11 @@ def _fit(periods: Sequence[SettledPeriod], problem: Problem, minimum: Minimum, o
     value = problem.coordinates.values(x[:count])
     return Fit(
         value,
-        _by_parameters(robust, slopes, value),
-        _by_parameters(white, slopes, value),
+        by_parameters(robust, slopes, value),
+        by_parameters(white, slopes, value),
         tuple(problem.start(x, run) for run in range(len(periods))),
         positions,
         outliers,
         float(lags),
         iterations,
     )
-
-
-def _by_parameters(covariance: Array, slopes: Array, value: Array) -> Array:
-    """Covariance of the parameters (parameters, parameters) from that of their coordinates.
-
-    A positive parameter that leaves no trace is as good as zero: it is known to its own size. Its coordinate is
-    the logarithm of what is above its floor, so that the slope is that size.
-    """
-    hidden = np.isinf(np.diag(covariance))
-    finite: Array = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T
-    faint = hidden & (np.diag(slopes) < VANISHED * np.abs(value))
-    finite[hidden, hidden] = np.inf
-    finite[faint, faint] = value[faint] ** 2
-    return finite

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from estimator.arrays import Array
 from estimator.errors import ConvergenceError
@@ -26,6 +27,7 @@ ITERATIONS = 80
 UNFINISHED = 1e-3  # of the sum: less than this still to gain is no reason to give up
 ENOUGH_SEGMENTS = 3
 SEEN = 1e-12  # of the largest eigenvalue
+PART = 1e-4  # of a coordinate in what is not seen, squared: less is rounding
 FIRST_DAMPING = 1e-3
 LEAST_DAMPING = 1e-8
 MOST_DAMPING = 1e5
@@ -47,31 +49,50 @@ class Segmented:
     """Each segment's gradient by the shared coordinates, its own eliminated (segments, shared)."""
     iterations: int
 
-    def covariance(self) -> Array:
+    def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
         """Sandwich covariance of the shared coordinates (shared, shared), segments taken as independent.
+
+        If `groups` (segments,) says which recording each is from, all is as much more uncertain as the recordings
+        disagree more than their segments would make them: a repeated motion repeats the model's error. The last `own`
+        coordinates belong to one recording each.
 
         It holds when the residuals of a segment hang together, as model error makes them: Liang and Zeger,
         "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13. Fewer than
         ENOUGH_SEGMENTS times as many segments as coordinates cannot tell what correlates with what: they tell
-        one factor by which all is more uncertain than white noise would make it.
+        one factor by which all is more uncertain than white noise would make it. Infinite for a coordinate that can
+        change, alone or with others, and leave no trace.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
-        bread = _inverse(self.information / np.outer(norm, norm)) / np.outer(norm, norm)
+        bread, hidden = _inverse(self.information / np.outer(norm, norm))
+        bread /= np.outer(norm, norm)
         few = segments / max(1, segments - 1)
         if segments < ENOUGH_SEGMENTS * size:
-            pooled = float(np.einsum("si,ij,sj->", self.scores, bread, self.scores)) / size
-            return np.asarray(few * pooled * bread)
-        covariance: Array = few * bread @ (self.scores.T @ self.scores) @ bread
-        return covariance
+            covariance = few * _size(self.scores, bread) / size * bread
+        else:
+            covariance = few * bread @ (self.scores.T @ self.scores) @ bread
+        if groups is not None and np.unique(groups).size > 1:
+            together = np.stack([self.scores[groups == group].sum(axis=0) for group in np.unique(groups)])
+            fewer = len(together) / (len(together) - 1)
+            ratio = fewer * _size(together, bread) / (size - own) / (few * _size(self.scores, bread) / size)
+            covariance = max(1.0, ratio) * covariance
+        covariance[hidden, hidden] = np.inf
+        return np.asarray(covariance)
 
 
-def _inverse(matrix: Array) -> Array:
-    """Of a matrix that is positive semidefinite but for rounding, without what is not seen at all."""
+def _size(scores: Array, bread: Array) -> float:
+    """Sum of the squares of scores (scores, shared) in units of what white noise would make of them."""
+    return float(np.einsum("si,ij,sj->", scores, bread, scores))
+
+
+def _inverse(matrix: Array) -> tuple[Array, Array]:
+    """Of a matrix that is positive semidefinite but for rounding, without the directions that are not seen at all;
+    and which coordinates have part in those."""
     size, direction = np.linalg.eigh(matrix)
     seen = size > SEEN * size[-1]
     inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
-    return inverse
+    part = np.sum(direction[:, ~seen] ** 2, axis=1)
+    return inverse, part > PART
 
 
 @dataclass(frozen=True)

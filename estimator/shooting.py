@@ -19,6 +19,7 @@ import numpy as np
 
 from estimator.arrays import Array
 from estimator.coordinates import Coordinates, scales_of
+from estimator.covariance import by_parameters
 from estimator.errors import ConvergenceError
 from estimator.model import Model
 from estimator.physics import Physics
@@ -30,7 +31,7 @@ from estimator.simulation import simulate
 
 WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a second of motion
 STARTING_WIDTH = 0.05  # rad/s
-STARTING_BEND = 0.01  # rad, of friction that yields before it slides
+STARTING_BEND = 0.003  # rad, of friction that yields before it slides
 RISES_FADE = (0.2, 2.0)  # rad/s
 START = {"stribeck_rise": 0.2, "load": 0.02, "delay": 0.0, "lag": 1e-3}
 SHORT = 0.25  # of the segments' length, to begin with
@@ -250,16 +251,19 @@ def _estimate(
     count = len(model.names)
     slope = np.eye(found.shared.size) * ANGLE_SCALE
     slope[:count, :count] = coordinates.slopes(found.shared[:count])
-    covariance = slope @ found.covariance() @ slope.T
+    value = ANGLE_SCALE * found.shared
+    value[:count] = coordinates.values(found.shared[:count])
+    recording = np.array([segment.recording for segment in problem.segments])
+    covariance = by_parameters(found.covariance(recording, problem.zeros), slope, value)
     samples = np.stack([_samples(segment) for segment in problem.segments])
     squares = problem.errors(coordinates, found) ** 2 * samples
     return ShootingEstimate(
         model,
         model.names,
         model.units,
-        coordinates.values(found.shared[:count]),
+        value[:count],
         covariance[:count, :count],
-        ANGLE_SCALE * found.shared[count:].reshape(-1, model.joints),
+        value[count:].reshape(-1, model.joints),
         np.sqrt(np.diag(covariance)[count:]).reshape(-1, model.joints),
         np.sqrt(squares.sum(axis=0) / samples.sum(axis=0)),
         len(problem.segments),

@@ -69,7 +69,7 @@ def show_any(result: dict[str, Any], json_only: bool) -> None:
 
     print(f"{result['joints']}-joint arm, {result['config']}")
     for name, entry in (*result["parameters"].items(), *result["extra"].items()):
-        print(f"{name:20s} {entry['unit']:10s} {entry['value']:12.5g} {entry['std']:9.1e}")
+        print(f"{name:22s} {entry['unit']:10s} {entry['value']:12.5g} {entry['std']:9.1e}")
     rms = ", ".join(f"{1000 * value:.3g}" for value in result["fit"]["residual_rms_rad"])
     for entry in result.get("zeros", ()):
         shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(entry["zero"], entry["std"], strict=True))

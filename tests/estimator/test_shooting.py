@@ -13,6 +13,7 @@ from estimator.idim import fit_inverse_dynamics
 from estimator.model import Model
 from estimator.prediction import prediction_rms
 from estimator.recording import Recording
+from estimator.segmented_least_squares import Segmented
 from estimator.shooting import estimate_by_shooting
 from fakes.arm import Arm, base_parameters
 from fakes.plant import make_plant
@@ -154,3 +155,27 @@ def test_too_short_is_refused(recording: Recording) -> None:
         )
     with pytest.raises(RecordingError, match="record longer or faster"):
         fit_inverse_dynamics([recording], 0.05, 0.05)
+
+
+def test_what_changes_together_and_leaves_no_trace_is_not_known() -> None:
+    """Of three coordinates the motion shows the first and the sum of the others."""
+    information = np.array([[4.0, 0.0, 0.0], [0.0, 9.0, 9.0], [0.0, 9.0, 9.0]])
+    scores = np.array([[1.0, 0.5, 0.5], [-0.5, 1.0, 1.0]])
+    found = Segmented(np.zeros(3), np.zeros((2, 4)), 1.0, information, scores, 1)
+    std = np.sqrt(np.diag(found.covariance()))
+    assert np.isfinite(std[0]) and std[0] > 0.0
+    assert np.isinf(std[1:]).all()
+
+
+def test_recordings_that_disagree_make_all_less_certain() -> None:
+    """Twelve segments of three recordings: once each its own noise, once the same error in all of a recording's."""
+    random = np.random.default_rng(1)
+    groups = np.repeat([0, 1, 2], 4)
+    noise = random.normal(size=(12, 2))
+    repeated = np.repeat([[3.0, -1.0], [-2.0, 2.0], [-1.0, -1.0]], 4, axis=0)
+    alone, alike = (
+        Segmented(np.zeros(2), np.zeros((12, 4)), 1.0, np.eye(2), scores, 1) for scores in (noise, repeated)
+    )
+    grown = [np.diag(found.covariance(groups) / found.covariance()) for found in (alone, alike)]
+    assert grown[0].max() < 2.5
+    assert grown[1].min() > 4.0
