@@ -81,9 +81,9 @@ def choose(
 ) -> Choice:
     """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
 
-    Coulomb, Stribeck and load-dependent friction come first; then friction that yields before it slides; then ripple
-    over the angle and friction that differs with direction, on top of the best. Ends when the prediction's error is
-    the encoder's own noise. Raises ConvergenceError when no model can be fitted. `torque_scale` is part of every
+    Coulomb, Stribeck and load-dependent friction come first; then ripple over the angle, friction that yields before it
+    slides and friction that differs with direction, on top of the best. Ends when the prediction's error is the
+    encoder's own noise. Raises ConvergenceError when no model can be fitted. `torque_scale` is part of every
     model, or of none; `starts` as of `estimator.identify.identify`.
     """
     trials: list[Trial] = []
@@ -109,8 +109,8 @@ def _ladder(joints: int, drive: Drive) -> Iterator[Model]:
     yield Model(joints, "coulomb", drive)
     yield Model(joints, "stribeck", drive)
     yield Model(joints, "stribeck_load", drive)
-    yield Model(joints, "stribeck_load", drive, presliding=True)
     yield Model(joints, "stribeck_load", drive, ripple=True)
+    yield Model(joints, "stribeck_load", drive, presliding=True)
     yield Model(joints, "coulomb", drive, asymmetry=True)
 
 
@@ -118,7 +118,7 @@ def _on_top(model: Model, best: Model) -> Model:
     """Direction is added to the best so far; presliding and ripple only show with all of friction in place."""
     if model.asymmetry:
         return replace(best, asymmetry=True)
-    return replace(model, presliding=model.presliding or best.presliding)
+    return replace(model, ripple=model.ripple or best.ripple)
 
 
 def _beyond_chance(richer: Estimate | None, plainer: Estimate | None) -> bool:
