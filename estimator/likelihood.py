@@ -373,14 +373,6 @@ def _at_once(fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
     return found
 
 
-def _retry(problem: Problem, x: Array, enough: float) -> list[Minimum]:
-    """The minimum from `x`; none if that leads nowhere, which is no loss where there is another."""
-    try:
-        return [minimise(problem.evaluate, x, enough)]
-    except ConvergenceError:
-        return []
-
-
 def _best(tries: Sequence[Minimum]) -> Minimum:
     return min(tries, key=lambda found: found.at.cost)
 
