@@ -1,8 +1,9 @@
 """What play in the gears costs an estimator that has none: the realistic fake arm with more and more of it.
 
-    python benchmarks/backlash.py [--json] [--play 0 0.0005 0.0015 0.004]
+    python benchmarks/backlash.py [--json] [--play 0 0.0005 0.0015 0.004] [--presliding]
 
 Play [rad] is from flank to flank, on both joints, between a rotor of its own and the output shaft with the encoder.
+--presliding gives the model friction that yields before it slides, which might take play's place.
 """
 
 import argparse
@@ -20,11 +21,13 @@ CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 GROUPS = {"inertia": ("inertia", "coupling", "armature"), "gravity": ("gravity",), "friction": ("viscous", "coulomb")}
 
 
-def measure(play: float) -> dict[str, float]:
+def measure(play: float, presliding: bool) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.toml"
         drives = "[[fake.arm.drives]]\n"
         text = CONFIG.read_text(encoding="utf-8")
+        if presliding:
+            text = text.replace("[model]\n", "[model]\npresliding = true\n")
         path.write_text(text.replace(drives, f"{drives}backlash = {play}\n") if play else text, encoding="utf-8")
         config = load_config(path)
         run = RunFolder.create(Path(folder) / "run", config)
@@ -50,8 +53,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--play", type=float, nargs="+", default=[0.0, 0.0005, 0.0015, 0.004])
+    parser.add_argument("--presliding", action="store_true")
     options = parser.parse_args()
-    found = {f"{play:g}": measure(play) for play in options.play}
+    found = {f"{play:g}": measure(play, options.presliding) for play in options.play}
     if options.json:
         print(json.dumps(found))
         return
