@@ -14,6 +14,7 @@ import math
 from unittest.mock import patch
 
 import numpy as np
+from backlash import GROUPS
 from elastic_slip import SlippingMotor
 from machine import machine
 from recorded_arm import record, servo_arm, wave
@@ -30,7 +31,6 @@ FRICTION = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15
 PEAK = (0.6, 0.35)  # N m
 INERTIA = 0.012  # kg m^2, about what either joint feels
 LAWS: dict[str, type[Motor]] = {"bristles": Motor, "slip": SlippingMotor}
-GROUPS = {"inertia": ("inertia", "coupling", "armature"), "gravity": ("gravity",), "friction": ("viscous", "coulomb")}
 
 
 def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding: bool) -> dict[str, float]:

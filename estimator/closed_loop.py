@@ -15,9 +15,9 @@ import numba
 import numpy as np
 
 from estimator.arrays import Array
-from estimator.bristles import bend, first_bend, has_bristles, without_dry_friction
+from estimator.bristles import first_bend, has_bristles, without_dry_friction
 from estimator.physics import Physics
-from estimator.simulation import finer_pieces, pieces_now, step_on, steps_per_sample
+from estimator.simulation import finer_pieces, pieces_now, step_bent, steps_per_sample
 
 SETTLING_PERIODS = 4
 
@@ -168,12 +168,7 @@ def _loop(
             left = pieces
             while left > 0:
                 n = pieces_now(p, v1, v2, a1, a2, piece, left)
-                half = 0.5 * n * piece
-                if bristly:
-                    bend(p, b, m, v1, v2, v1 + half * a1, v2 + half * a2, m1, m2, half)
-                q1, q2, v1, v2, a1, a2 = step_on(m, q1, q2, v1, v2, m1, m2, n * piece)
-                if bristly:
-                    bend(p, b, m, v1, v2, v1 - half * a1, v2 - half * a2, m1, m2, half)
+                q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, m1, m2, n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
     state[2, 0], state[2, 1] = t1, t2

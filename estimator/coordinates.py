@@ -19,7 +19,7 @@ MOST_COUPLING = 0.95  # of its bound, at the start
 BEND = 0.01  # rad: much of it, for friction that yields before it slides
 NEAREST = 1e-3  # of a width's floor: what always stays above it, or no step would lead back
 WIDENING = 2.0  # of a width, in one step
-SHAPES = ("stribeck_rise", "stribeck_velocity")
+STRIBECK = ("stribeck_rise", "stribeck_velocity")
 RESHAPING = 1.0  # of the logarithms of these, in one step
 EITHER_SIGN = ("gravity", "offset", "delay", "ripple_sin", "ripple_cos", "ripple_cycles", "zero")
 
@@ -94,7 +94,7 @@ class Coordinates:
 
     @cached_property
     def _shapes(self) -> list[int]:
-        return [i for i, name in enumerate(self.names) if _kind(name) in SHAPES]
+        return [i for i, name in enumerate(self.names) if _kind(name) in STRIBECK]
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:

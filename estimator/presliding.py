@@ -44,17 +44,9 @@ from estimator.sensitivity import (
 from estimator.simulation import MOST_PIECES, pieces_now
 
 
-def sensitive(
-    physics: Physics,
-    start: Array,
-    causes: tuple[str, ...],
-    step: float,
-    most_pieces: int = MOST_PIECES,
-    pull: Array | None = None,
-) -> Sensitive:
-    """The simulation that fits these physics; arguments as of `Sensitive`."""
-    kind = PreslidingSensitive if has_bristles(physics) else Sensitive
-    return kind(physics, start, causes, step, most_pieces, pull)
+def sensitive(physics: Physics) -> "type[Sensitive]":
+    """The simulation with derivatives that fits these physics."""
+    return PreslidingSensitive if has_bristles(physics) else Sensitive
 
 
 class PreslidingSensitive(Sensitive):

@@ -126,7 +126,7 @@ class Shooting:
         joints = self._model.joints
         zeros = tuple(f"zero_{joint + 1}" for joint in range(joints) if self.zeros)
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
-        motion = sensitive(
+        motion = sensitive(physics)(
             physics,
             own.reshape(2, -1) * self.state_scale,
             (*coordinates.names, *zeros, *state),

@@ -56,7 +56,9 @@ class SimulatedRun:
         samples."""
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
-        motion = sensitive(physics, start, (*names, *state), 1.0 / (self.rate * self.steps), self.most_pieces, pull)
+        motion = sensitive(physics)(
+            physics, start, (*names, *state), 1.0 / (self.rate * self.steps), self.most_pieces, pull
+        )
         times = {"delay": physics.delay, "lag": physics.lag}
         torque, slopes = torque_and_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
         samples = round(share * samples)

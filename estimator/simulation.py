@@ -157,6 +157,31 @@ def step_on(
     return q1 + 0.5 * h * (v1 + u1), q2 + 0.5 * h * (v2 + u2), v1 + h * a1, v2 + h * a2, a1, a2
 
 
+def step_bent(
+    p: Any,
+    bristly: bool,
+    m: Any,
+    b: Any,
+    q1: float,
+    q2: float,
+    v1: float,
+    v2: float,
+    a1: float,
+    a2: float,
+    t1: float,
+    t2: float,
+    h: float,
+) -> tuple[float, float, float, float, float, float]:
+    """`step_on` between the two halves of the bristles' step; a1 and a2 are the last accelerations [rad/s^2]."""
+    half = 0.5 * h
+    if bristly:
+        bend(p, b, m, v1, v2, v1 + half * a1, v2 + half * a2, t1, t2, half)
+    q1, q2, v1, v2, a1, a2 = step_on(m, q1, q2, v1, v2, t1, t2, h)
+    if bristly:
+        bend(p, b, m, v1, v2, v1 - half * a1, v2 - half * a2, t1, t2, half)
+    return q1, q2, v1, v2, a1, a2
+
+
 def _loop(p: Any, bristly: bool, m: Any, state: Any, torque: Any, step: float, pieces: int, position: Any) -> None:
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
     b = state[2]
@@ -170,20 +195,15 @@ def _loop(p: Any, bristly: bool, m: Any, state: Any, torque: Any, step: float, p
             left = pieces
             while left > 0:
                 n = pieces_now(p, v1, v2, a1, a2, piece, left)
-                half = 0.5 * n * piece
-                if bristly:
-                    bend(p, b, m, v1, v2, v1 + half * a1, v2 + half * a2, t1, t2, half)
-                q1, q2, v1, v2, a1, a2 = step_on(m, q1, q2, v1, v2, t1, t2, n * piece)
-                if bristly:
-                    bend(p, b, m, v1, v2, v1 - half * a1, v2 - half * a2, t1, t2, half)
+                q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, t1, t2, n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
 
 
 # What is only called from compiled code needs no wrappers, which take a second to compile. It is inlined: a call
 # counts references to its arrays, which takes longer than a step's arithmetic.
-bump_at, bend_at, _drive, _forces, pieces_now, step_on = map(
-    inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on)
+bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
+    inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
 )
 _simulate: Callable[[Array, bool, Array, Array, Array, float, int, Array], None] = numba.njit(
     cache=True, nogil=True, error_model="numpy"

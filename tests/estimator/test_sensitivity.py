@@ -44,7 +44,7 @@ def test_derivatives_are_those_of_the_simulation(bristles: dict[str, float]) -> 
     # With bristles no step over the velocity has a width, without them they have no stiffness.
     absent = "coulomb_width" if bristles else "presliding"
     causes = tuple(cause for cause in CAUSES if not cause.startswith(absent))
-    motion = sensitive(Physics.of(values), start, causes, 1.0 / (RATE * STEPS))
+    motion = sensitive(Physics.of(values))(Physics.of(values), start, causes, 1.0 / (RATE * STEPS))
     assert isinstance(motion, PreslidingSensitive) == bool(bristles)
     parts = [motion.advance(motor[:, part], slopes[:, :, part]) for part in (slice(0, 250), slice(250, SAMPLES))]
     found = np.concatenate([angle for angle, _ in parts], axis=1)
