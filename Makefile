@@ -20,6 +20,8 @@ lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/vulture
 
 site: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --editable ".[docs]"

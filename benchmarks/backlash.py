@@ -12,10 +12,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from hil.config import load_config
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
-from hil.run_folder import RunFolder
+from hil.config.schema import load_config
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 GROUPS = {"inertia": ("inertia", "coupling", "armature"), "gravity": ("gravity",), "friction": ("viscous", "coulomb")}

@@ -31,13 +31,13 @@ from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHand
 
 from benchmarks.machine import machine
 from benchmarks.pty import responder_binary, served_pty
-from drivers.control_table import load_control_table
-from drivers.exchange import Exchange
-from drivers.joint import Joint
-from drivers.port import open_port
-from drivers.servo_model import Mode, servo_model
-from drivers.state import Converter, spans
-from hil.config import Config, load_config
+from hil.config.schema import Config, load_config
+from hil.drivers.control_table import load_control_table
+from hil.drivers.exchange import Exchange
+from hil.drivers.joint import Joint
+from hil.drivers.port import open_port
+from hil.drivers.servo_model import Mode, servo_model
+from hil.drivers.state import Converter, spans
 
 BAUD = 1_000_000
 BYTE_NS = 10_000
@@ -83,8 +83,8 @@ def make_exchange(port: Any, servos: int, *, fast: bool = False) -> Exchange:
 @contextmanager
 def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
     """Everything that the experiment does for one sample: exchange in SI units, guard, recorder."""
-    from hil.guard import Guard
-    from hil.recording import Phase, Recorder
+    from hil.experiment.guard import Guard
+    from hil.runs.recording import Phase, Recorder
 
     joints = [Joint(f"joint{index}", index + 1, servo_model("XM430-W350")) for index in range(servos)]
     guard = Guard(_without_limits(servos))

@@ -29,13 +29,13 @@ from machine import machine
 from scipy.optimize import minimize
 from scipy.signal import savgol_filter
 
-from estimator.idim import fit_inverse_dynamics, uniform
-from estimator.prediction import prediction_errors, prediction_rms
-from estimator.recording import Recording
-from estimator.shooting import ShootingEstimate, estimate_by_shooting
-from hil.csv_config import load_csv_config
-from hil.csv_recording import read_csv
-from hil.wanted_model import wanted_model
+from hil.config.csv_columns import load_csv_config
+from hil.estimation.csv_recording import read_csv
+from hil.estimation.model_from_config import wanted_model
+from hil.estimator.baselines.idim import fit_inverse_dynamics, uniform
+from hil.estimator.data.recording import Recording
+from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
+from hil.estimator.selection.prediction import prediction_errors, prediction_rms
 
 CONFIG = Path(__file__).parents[1] / "configs" / "recordings" / "dfki_double_pendulum.toml"
 SEPARATE = 30.0  # Hz, of positions where regressors and torques have a cut-off of their own

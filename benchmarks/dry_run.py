@@ -24,17 +24,17 @@ from typing import Any
 
 import numpy as np
 
-from hil.amplitude import Amplitude, largest_amplitude
-from hil.config import Config, parse_config
-from hil.design import design_problem, plain_wave
-from hil.dry_run import GUARDED, peaks_of
-from hil.ensemble import prior_ensemble
+from hil.config.schema import Config, parse_config
+from hil.dry_run.amplitude import Amplitude, largest_amplitude
+from hil.dry_run.ensemble import prior_ensemble
+from hil.dry_run.prediction import GUARDED, peaks_of
+from hil.dry_run.prior import quantities
+from hil.dry_run.waves import design_problem, plain_wave
 from hil.errors import NotSettled, SafetyStop
-from hil.experiment import run_experiment
+from hil.experiment.run import run_experiment
 from hil.pilot import identify_in_steps
-from hil.prior import quantities
-from hil.recording import load_samples
-from hil.run_folder import RunFolder
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 PRIOR = """[arm.prior]
@@ -214,9 +214,9 @@ def worst_relative_std(result: dict[str, Any]) -> float:
 
 def design_study(seeds: int = 2) -> dict[str, Any]:
     """Designed against plain, both scaled to the same limits, judged on the true arm's nominal model."""
-    from estimator.optimal_excitation import design_optimal
-    from estimator.physics import Physics
-    from fakes.arm import base_parameters
+    from hil.estimator.excitation.optimal_design import design_optimal
+    from hil.estimator.models.parameters import Physics
+    from hil.fakes.plants.arm import base_parameters
 
     config = parse_config((CONFIGS / "first_time.toml").read_text(encoding="utf-8"), CONFIGS / "first_time.toml")
     assert config.fake is not None

@@ -4,8 +4,8 @@ Iwan, "On a class of models for the yielding behavior of continuous and composit
 34 (1967) 612. Unlike bristles it remembers every reversal that no later one has wiped out, and knows no rate.
 """
 
-from fakes.arm import Drive
-from fakes.motor import Motor
+from hil.fakes.plants.arm import Drive
+from hil.fakes.plants.motor import Motor
 
 STIFFNESS = (3.0, 1.5, 0.8, 0.4)  # of each spring, times its share of the whole
 SHARE = 1.0 / len(STIFFNESS)  # of the level at which all have slipped

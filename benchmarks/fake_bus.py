@@ -25,16 +25,16 @@ from typing import Any
 import serial
 from machine import machine
 
-from drivers.packet import BROADCAST_ID, Framer, Instruction, encode
-from fakes.bus import FakeBus
-from fakes.clock import VirtualClock
-from fakes.registers import load_model
-from fakes.servo import Servo
-from fakes.two_link import TwoLink
-from hil.config import load_config
-from hil.experiment import run_experiment
-from hil.run_folder import RunFolder
-from hil.stream import Stream
+from hil.config.schema import load_config
+from hil.drivers.packet import BROADCAST_ID, Framer, Instruction, encode
+from hil.experiment.run import run_experiment
+from hil.experiment.stream import Stream
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.plants.two_link import TwoLink
+from hil.fakes.servo.registers import load_model
+from hil.fakes.servo.servo import Servo
+from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 RATE = 1000

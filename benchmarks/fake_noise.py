@@ -13,11 +13,11 @@ from random import Random
 
 from machine import machine
 
-from drivers.packet import BROADCAST_ID, Framer, Instruction, encode
-from fakes.bus import FakeBus
-from fakes.clock import VirtualClock
-from fakes.registers import load_model
-from fakes.servo import Servo
+from hil.drivers.packet import BROADCAST_ID, Framer, Instruction, encode
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.servo.registers import load_model
+from hil.fakes.servo.servo import Servo
 
 ASK_EVERY = 10
 PAUSE_S = 3.0  # then boots are over, and the longest reply at the slowest baud

@@ -7,8 +7,8 @@ undisturbed motion. After each run the emulated servos themselves are asked. An 
 
 unsafe          torque neither off nor stopped by the watchdog, or current still flowing 100 ms after the fault (after
                 the guard's last look where no single sample shows it: a joint held, a sign turned, lost packets)
-beyond_limit    a joint farther beyond its limit than hil.stopping predicts for the way in which this run was stopped
-unreadable      the recording cannot be read
+beyond_limit    a joint farther beyond its limit than hil.dry_run.stopping_distance predicts for the way in which this
+run was stopped unreadable      the recording cannot be read
 unnamed         the message does not name the cause
 
 How far the joints went beyond their limits is printed as a share of what was predicted, by way of stopping.
@@ -31,15 +31,15 @@ from typing import Any
 import numpy as np
 import serial
 
-from fakes.faults import Fault, FaultKind
-from hil.config import Config, parse_config
-from hil.ensemble import Ensemble, prior_ensemble
+from hil.config.schema import Config, parse_config
+from hil.dry_run.ensemble import Ensemble, prior_ensemble
+from hil.dry_run.stopping_distance import LONGEST_S, Stopping, Way, beyond_when_passed, stopping_distance
 from hil.errors import Cause, HilError, SafetyStop
-from hil.experiment import run_experiment
-from hil.plan import Plan, make_plan
-from hil.recording import Phase, load_samples
-from hil.run_folder import RunFolder
-from hil.stopping import LONGEST_S, Stopping, Way, beyond_when_passed, stopping_distance
+from hil.experiment.run import run_experiment
+from hil.fakes.bus.faults import Fault, FaultKind
+from hil.plan.plan import Plan, make_plan
+from hil.runs.recording import Phase, load_samples
+from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 PRIOR = """[arm.prior]

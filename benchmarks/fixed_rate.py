@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import machine
-from drivers.clock import WallClock
-from drivers.rate import FixedRate
-from hil.realtime import real_time
+from hil.drivers.clock import WallClock
+from hil.drivers.rate import FixedRate
+from hil.experiment.realtime import real_time
 
 STALL_PERIODS = 10.5
 STALL_MISSES = 9
@@ -59,7 +59,7 @@ def absolute_sleep(rate: float, count: int) -> tuple[Lateness, int]:
 
 
 def ours(rate: float, count: int) -> tuple[Lateness, int]:
-    """The driver's FixedRate, with what the system permits of hil.realtime."""
+    """The driver's FixedRate, with what the system permits of hil.experiment.realtime."""
     late = np.empty(count)
     with real_time():
         ticks = FixedRate(WallClock(), rate)

@@ -18,7 +18,7 @@ from typing import Any
 from identify import figures, identify
 from machine import machine
 
-from hil.config import parse_config
+from hil.config.schema import parse_config
 from hil.errors import SafetyStop
 
 SOURCE = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"

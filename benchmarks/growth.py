@@ -17,15 +17,15 @@ import numpy as np
 from machine import machine
 from recorded_arm import COMMAND_TO_SAMPLE, RATE, STEP, servo_arm
 
-from estimator.drive import motor_torque
-from estimator.excitation import design_multisine
-from estimator.identify import identify
-from estimator.least_squares import fit_lines
-from estimator.model import Model
-from estimator.period import SettledPeriod
-from estimator.physics import Physics
-from estimator.simulation import simulate, steps_per_sample
-from fakes.arm import base_parameters
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.excitation.multisine import design_multisine
+from hil.estimator.fit.stage1 import fit_lines
+from hil.estimator.identify import identify
+from hil.estimator.models.model import Model
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.arm import simulate, steps_per_sample
+from hil.estimator.simulation.drive import motor_torque
+from hil.fakes.plants.arm import base_parameters
 
 SIZES = (4_000, 16_000, 62_500, 250_000, 1_000_000)
 LINES = 25  # per joint

@@ -15,12 +15,12 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.faults import CONFIG, short_config
-from drivers.state import State
-from hil.config import Config
-from hil.experiment import run_experiment
-from hil.guard import Guard
-from hil.recording import Phase, load_samples
-from hil.run_folder import RunFolder
+from hil.config.schema import Config
+from hil.drivers.state import State
+from hil.experiment.guard import Guard
+from hil.experiment.run import run_experiment
+from hil.runs.recording import Phase, load_samples
+from hil.runs.run_folder import RunFolder
 
 ROUNDS = 200
 

@@ -19,11 +19,11 @@ from typing import Any
 
 from machine import machine
 
-from hil.config import Config, load_config
+from hil.config.schema import Config, load_config
 from hil.errors import SafetyStop
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
-from hil.run_folder import RunFolder
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.runs.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 GROUPS = {

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from drivers.rate import FixedRate, Tick
-from hil import stream
-from hil.config import Config, load_config
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
-from hil.recording import load_samples
-from hil.run_folder import RunFolder
+from hil.config.schema import Config, load_config
+from hil.drivers.rate import FixedRate, Tick
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment import stream
+from hil.experiment.run import run_experiment
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link_ideal.toml"
 

@@ -27,11 +27,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
-from drivers.bus import ServoBus
-from drivers.errors import DriverError
-from hil.config import Config, parse_config
-from hil.experiment import run_experiment
-from hil.run_folder import RunFolder
+from hil.config.schema import Config, parse_config
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError
+from hil.experiment.run import run_experiment
+from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 ASKED_AFTER_S = 0.105

@@ -18,12 +18,12 @@ import numpy as np
 from machine import machine
 from recorded_arm import Recorded, record, servo_arm, wave
 
-from estimator.identify import identify
-from estimator.model import Model
-from estimator.period import SettledPeriod
-from estimator.physics import Physics
-from estimator.simulated_run import SimulatedRun
-from fakes.arm import base_parameters
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.simulated_run import SimulatedRun
+from hil.estimator.identify import identify
+from hil.estimator.models.model import Model
+from hil.estimator.models.parameters import Physics
+from hil.fakes.plants.arm import base_parameters
 
 WAVES = 10
 NOISE = 0.5  # encoder steps

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from machine import machine
 
-from estimator.paper import (
+from hil.estimator.baselines.paper import (
     AMPLITUDES,
     FUNDAMENTAL,
     NOISE,

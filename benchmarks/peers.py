@@ -4,8 +4,9 @@
 
 `seconds`, `worst_relative_error` and `held_out_rms`, each by method, on the default demo recording (4,000 samples of
 two joints); under `textbook` the same on the arm of configs/fake_two_link_ideal.toml. The worst relative error is
-over inertias, gravity, viscous and Coulomb friction. How each peer was tuned stands in estimator/peers.py and
-hil/mujoco_peer.py; mujoco.sysid takes part where it is installed (extra `peers`), started within 50 % of the truth.
+over inertias, gravity, viscous and Coulomb friction. How each peer was tuned stands in estimator/baselines/compare.py
+and hil/estimation/mujoco_peer.py; mujoco.sysid takes part where it is installed (extra `peers`), started within 50 %
+of the truth.
 
 Time: the median of three runs of each method, in one process, after one to compile, this project's own estimate first;
 building mujoco.sysid's model and residual is not counted either. On the demo `hil` has the Stribeck friction and
@@ -25,10 +26,10 @@ from typing import Any
 
 from machine import machine
 
-from hil.compare import OURS, OURS_PLAIN, compare_run
-from hil.config import load_config
-from hil.experiment import run_experiment
-from hil.run_folder import RunFolder
+from hil.config.schema import load_config
+from hil.estimation.compare import OURS, OURS_PLAIN, compare_run
+from hil.experiment.run import run_experiment
+from hil.runs.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RECORDINGS = {"demo": "fake_two_link.toml", "textbook": "fake_two_link_ideal.toml"}

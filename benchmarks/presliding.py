@@ -19,13 +19,13 @@ from elastic_slip import SlippingMotor
 from machine import machine
 from recorded_arm import record, servo_arm, wave
 
-from estimator.choice import relative_error
-from estimator.errors import ConvergenceError, PeriodicityError
-from estimator.identify import identify, predict
-from estimator.model import Model
-from estimator.period import SettledPeriod
-from fakes.arm import Arm, base_parameters
-from fakes.motor import Motor
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import ConvergenceError, PeriodicityError
+from hil.estimator.identify import identify, predict
+from hil.estimator.models.model import Model
+from hil.estimator.selection.settled import relative_error
+from hil.fakes.plants.arm import Arm, base_parameters
+from hil.fakes.plants.motor import Motor
 
 FRICTION = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}
 PEAK = (0.6, 0.35)  # N m
@@ -53,7 +53,7 @@ def measure(stiffness: float, seeds: int, law: type[Motor]) -> dict[str, dict[st
     arm = servo_arm({**FRICTION, "presliding_stiffness": stiffness, "presliding_damping": damping})
     runs: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
     for seed in range(seeds):
-        with patch("fakes.two_link.Motor", law):
+        with patch("hil.fakes.plants.two_link.Motor", law):
             period, held_out = (record(arm, wave(2 * seed + each, PEAK)).rounded() for each in (1, 2))
         for name, entries in runs.items():
             entries.append(figures(arm, period, held_out, name == "with"))

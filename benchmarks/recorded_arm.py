@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from estimator.excitation import Multisine, design_multisine, zippered_lines
-from estimator.period import SettledPeriod
-from fakes.arm import Arm
-from fakes.plant import make_plant
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.excitation.multisine import Multisine, design_multisine, zippered_lines
+from hil.fakes.plants.arm import Arm
+from hil.fakes.plants.plant import make_plant
 
 RATE = 400.0
 PERIOD = 10.0

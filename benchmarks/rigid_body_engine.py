@@ -19,11 +19,11 @@ import numpy as np
 from machine import machine
 from recorded_arm import BAND, COMMAND_TO_SAMPLE, CURRENT_STEP, DRIVES, LINKS, PERIOD, RATE, SERVO, STEP
 
-from estimator.choice import Choice, choose
-from estimator.errors import RecordingError
-from estimator.excitation import design_multisine, zippered_lines
-from estimator.period import SettledPeriod
-from fakes.arm import Arm, base_parameters
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import RecordingError
+from hil.estimator.excitation.multisine import design_multisine, zippered_lines
+from hil.estimator.selection.settled import Choice, choose
+from hil.fakes.plants.arm import Arm, base_parameters
 
 PEAK = (0.80, 0.42)  # N m
 # s. The engine steps to first order, and what that does to the motion is no fault of an estimate: at 2e-5 s its

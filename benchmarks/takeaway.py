@@ -22,14 +22,14 @@ import numpy as np
 from machine import machine
 
 from hil import load_model
-from hil.config import load_config
-from hil.dynamics import ArmModel
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
+from hil.arm_model import ArmModel
+from hil.config.schema import load_config
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
 from hil.export.formats import export
 from hil.report.page import write_report
 from hil.report.run_data import RunData
-from hil.run_folder import RunFolder
+from hil.runs.run_folder import RunFolder
 
 ROOT = Path(__file__).parents[1]
 SAMPLES = 1_000_000
@@ -54,7 +54,7 @@ def identified(folder: Path) -> Path:
 
 def report(run: Path) -> dict[str, Any]:
     page = run / "report.html"
-    code = f"import sys; sys.argv = ['hil', 'report', {str(run)!r}]; from hil.cli import main; main()"
+    code = f"import sys; sys.argv = ['hil', 'report', {str(run)!r}]; from hil.cli.app import main; main()"
     return {
         "report made, new process [s]": best_seconds(
             lambda: subprocess.run([sys.executable, "-c", code], check=True, capture_output=True), 3

@@ -14,7 +14,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def command_reference() -> str:
     """Every subcommand's help as Markdown."""
-    from hil.cli import app
+    from hil.cli.app import app
 
     group: Any = typer.main.get_command(app)
     with group.make_context("hil", [], resilient_parsing=True) as context:

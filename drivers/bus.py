@@ -4,15 +4,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
-from drivers.control_table import load_control_table, model_names
-from drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongSetting
-from drivers.exchange import Exchange
-from drivers.joint import Joint
-from drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
-from drivers.port import Port, open_port
-from drivers.servo import Servo, describe_error
-from drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
-from drivers.state import NAN, Converter, State, spans
+from hil.drivers.control_table import load_control_table, model_names
+from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongSetting
+from hil.drivers.exchange import Exchange
+from hil.drivers.joint import Joint
+from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
+from hil.drivers.port import Port, open_port
+from hil.drivers.servo import Servo, describe_error
+from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
+from hil.drivers.state import NAN, Converter, State, spans
 
 _PROBES = 3
 """How often Fast Sync Read may stay without an answer before Sync Read is used instead."""

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 
-from drivers.errors import UnknownModel
+from hil.drivers.errors import UnknownModel
 
 _SIGNED = frozenset(
     {

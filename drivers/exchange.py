@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 from fastcrc import crc16
 
-from drivers.control_table import Register
-from drivers.packet import BROADCAST_ID, HEADER, Instruction
-from drivers.port import Port
-from drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
+from hil.drivers.control_table import Register
+from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
+from hil.drivers.port import Port
+from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
 HOST_S = 0.75e-3
 """Allowed for the computer itself, USB frames included, on top of what wire, servos and adapter take."""
@@ -28,7 +28,7 @@ _pack_crc = struct.Struct("<H").pack
 class Reply(NamedTuple):
     """One exchange: times on the port's clock [s], which of the spans was read, and one answer per servo.
 
-    See drivers.sync_read for what an answer is; None where none came.
+    See hil.drivers.sync_read for what an answer is; None where none came.
     """
 
     time_before_write: float

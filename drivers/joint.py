@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from drivers.servo_model import FULL_PWM_TICKS, VELOCITY_UNIT, Mode, ServoModel
+from hil.drivers.servo_model import FULL_PWM_TICKS, VELOCITY_UNIT, Mode, ServoModel
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ from typing import Any, cast
 
 import serial
 
-from drivers.clock import Clock, WallClock
-from drivers.errors import NotPermitted, PortLost, PortNotOpened
-from drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
+from hil.drivers.clock import Clock, WallClock
+from hil.drivers.errors import NotPermitted, PortLost, PortNotOpened
+from hil.drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
 
 _FAILURES = (OSError, termios.error)
 # OSError covers SerialException. A pulled cable gives termios.error, which is no OSError, from flushing the input.

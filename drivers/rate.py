@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from drivers.clock import Clock
+from hil.drivers.clock import Clock
 
 
 class Tick(NamedTuple):

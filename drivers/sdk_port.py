@@ -1,6 +1,6 @@
 """The port that `dynamixel-sdk`'s packet handler works on, in place of its own PortHandler."""
 
-from drivers.port import Port
+from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
 """How long set-up work waits for a reply beyond its wire time, whatever the adapter: writing EEPROM takes a servo

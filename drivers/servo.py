@@ -10,11 +10,11 @@ from typing import TypeVar
 
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
-from drivers.control_table import ControlTable
-from drivers.errors import NoReply, ServoRefused, WrongReply
-from drivers.packet import ALERT, HardwareError, StatusError
-from drivers.port import Port
-from drivers.sdk_port import SdkPort
+from hil.drivers.control_table import ControlTable
+from hil.drivers.errors import NoReply, ServoRefused, WrongReply
+from hil.drivers.packet import ALERT, HardwareError, StatusError
+from hil.drivers.port import Port
+from hil.drivers.sdk_port import SdkPort
 
 _T = TypeVar("_T")
 

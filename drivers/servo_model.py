@@ -11,7 +11,7 @@ from enum import IntEnum
 from types import MappingProxyType
 from typing import NamedTuple
 
-from drivers.errors import UnknownModel
+from hil.drivers.errors import UnknownModel
 
 VELOCITY_UNIT = 0.229 * 2 * math.pi / 60
 """rad/s per tick of Present Velocity."""

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from drivers.control_table import ControlTable
-from drivers.exchange import Reply
-from drivers.joint import Joint
-from drivers.servo_model import VOLTAGE_UNIT, Mode
-from drivers.sync_read import Answer, Span
+from hil.drivers.control_table import ControlTable
+from hil.drivers.exchange import Reply
+from hil.drivers.joint import Joint
+from hil.drivers.servo_model import VOLTAGE_UNIT, Mode
+from hil.drivers.sync_read import Answer, Span
 
 NAN = float("nan")
 

@@ -11,8 +11,8 @@ from typing import Protocol
 
 from fastcrc import crc16
 
-from drivers.control_table import ControlTable
-from drivers.packet import ALERT, BROADCAST_ID, HEADER, Framer, Instruction, Packet, encode
+from hil.drivers.control_table import ControlTable
+from hil.drivers.packet import ALERT, BROADCAST_ID, HEADER, Framer, Instruction, Packet, encode
 
 Answer = tuple[int, ...] | None
 

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.arrays import Array
-from estimator.coordinates import Coordinates
-from estimator.drive import motor_torque
-from estimator.errors import ModelError
-from estimator.identify import Estimate
-from estimator.levenberg_marquardt import Quadratic, minimise
-from estimator.normal_equations import normal_equations
-from estimator.period import SettledPeriod
-from estimator.physics import Physics
-from estimator.simulation import simulate, steps_per_sample
+from hil.estimator.arrays import Array
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import ModelError
+from hil.estimator.fit.levenberg_marquardt import Quadratic, minimise
+from hil.estimator.fit.normal_equations import normal_equations
+from hil.estimator.fit.reparametrisation import Coordinates
+from hil.estimator.identify import Estimate
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.arm import simulate, steps_per_sample
+from hil.estimator.simulation.drive import motor_torque
 
 ANGLE_SCALE = 0.1  # rad
 DIFFERENCE = 1e-6  # of a coordinate, all of the size of 1

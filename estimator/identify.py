@@ -5,15 +5,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimator.arrays import Array
-from estimator.drive import motor_torque
-from estimator.errors import ModelError, PeriodicityError, ShapeError
-from estimator.least_squares import fit_lines
-from estimator.likelihood import fit_runs
-from estimator.model import Model
-from estimator.period import SettledPeriod, without_spikes
-from estimator.physics import Physics
-from estimator.simulation import simulate, steps_per_sample
+from hil.estimator.arrays import Array
+from hil.estimator.data.settled_period import SettledPeriod, without_spikes
+from hil.estimator.errors import ModelError, PeriodicityError, ShapeError
+from hil.estimator.fit.stage1 import fit_lines
+from hil.estimator.fit.stage2 import fit_runs
+from hil.estimator.models.model import Model
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.arm import simulate, steps_per_sample
+from hil.estimator.simulation.drive import motor_torque
 
 MOST_PERIODS = 50  # simulated until the motion is periodic
 PERIODIC = 1e-7  # rad and rad/s, from one period's end to the next
@@ -25,7 +25,7 @@ class Estimate:
     """What settled periods say of the arm.
 
     `std` and `covariance` hold what position errors leave open, scaled by the residual as it is and widened
-    where it is correlated (`estimator.covariance`), so that rounding is in them as it came out (a residual of
+    where it is correlated (`hil.estimator.fit.covariance`), so that rounding is in them as it came out (a residual of
     0.2887 encoder steps RMS is rounding alone). They hold nothing of what repeats in every sample: an error of
     the torque constant, by which all parameters of a joint scale, of the encoder's zero or linearity, or of the
     model. A residual well above 0.29 steps says that the model lacks something and that the parameters may be

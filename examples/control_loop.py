@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import fakes
-from drivers.bus import ServoBus
-from drivers.rate import FixedRate
-from hil import load_model
-from hil.config import Config, load_config
-from hil.dynamics import ArmModel
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
-from hil.guard import Guard
-from hil.run_folder import RunFolder
+from hil import fakes, load_model
+from hil.arm_model import ArmModel
+from hil.config.schema import Config, load_config
+from hil.drivers.bus import ServoBus
+from hil.drivers.rate import FixedRate
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.guard import Guard
+from hil.experiment.run import run_experiment
+from hil.runs.run_folder import RunFolder
 
 Array = NDArray[np.float64]
 Controller = Callable[[int, Array, Array], Array]

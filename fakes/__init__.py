@@ -2,7 +2,7 @@
 
 
 def register() -> None:
-    """Teach pyserial the URL `fake://PATH/TO/ARM.toml`; see `fakes.protocol_fake`. Harmless when repeated."""
+    """Teach pyserial the URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Harmless when repeated."""
     import serial
 
     if __name__ not in serial.protocol_handler_packages:

@@ -6,17 +6,17 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from drivers.clock import Clock
-from drivers.packet import MAX_ID
-from fakes.arm import Arm
-from fakes.bus import FakeBus
-from fakes.faults import Fault
-from fakes.health import Overload, Thermal
-from fakes.plant import Plant, PlantError, load_plant, make_plant
-from fakes.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
-from fakes.servo import Servo
-from fakes.supply import Supply
-from fakes.table_errors import describe
+from hil.drivers.clock import Clock
+from hil.drivers.packet import MAX_ID
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.faults import Fault
+from hil.fakes.bus.supply import Supply
+from hil.fakes.plants.arm import Arm
+from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_plant
+from hil.fakes.servo.health import Overload, Thermal
+from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
+from hil.fakes.servo.servo import Servo
+from hil.fakes.table_errors import describe
 
 
 class DescriptionError(ValueError):
@@ -100,7 +100,8 @@ class FakeArm(BaseModel):
     ]
     arm: Annotated[Arm | None, Field(description="links and drives")] = None
     plant: Annotated[
-        str | None, Field(description='"module:factory" of another mechanism instead of arm; see fakes.plant')
+        str | None,
+        Field(description='"module:factory" of another mechanism instead of arm; see hil.fakes.plants.plant'),
     ] = None
     plant_options: Annotated[dict[str, Any], Field(description="what the factory is called with")] = {}
     supply: Annotated[Supply | None, Field(description="resistance of the supply; none unless given")] = None

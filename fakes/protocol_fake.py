@@ -8,7 +8,7 @@ Everything happens on `port.clock`: a program that waits must wait on that clock
 does not move the arm. In particular dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
 sees no answers. With `fake://PATH/TO/ARM.toml?time=real` the arm lives in real time and any program will do.
 
-A pulled cable (see `fakes.faults`) fails as on Linux: writing and reading raise `serial.SerialException`,
+A pulled cable (see `hil.fakes.bus.faults`) fails as on Linux: writing and reading raise `serial.SerialException`,
 `reset_input_buffer` raises `termios.error`. The port then has to be closed and, once the cable is back, opened again.
 """
 
@@ -21,11 +21,11 @@ from pathlib import Path
 import serial
 from serial.serialutil import SerialBase
 
-from drivers.clock import Clock, WallClock
-from fakes.bus import FakeBus
-from fakes.clock import VirtualClock
-from fakes.description import DescriptionError, FakeArm, load_fake, make_bus
-from fakes.plant import PlantError
+from hil.drivers.clock import Clock, WallClock
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
+from hil.fakes.plants.plant import PlantError
 
 SCHEME = "fake://"
 REAL_TIME = "?time=real"

@@ -17,8 +17,8 @@ from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
 
-from fakes.bus import FakeBus
-from fakes.description import FakeArm, make_bus
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.description import FakeArm, make_bus
 
 OVERRUN_S = 1e-3
 """A reply handed over later than this after it was due counts as a real-time overrun [s]."""

@@ -11,7 +11,7 @@
         with arm.lock:
             assert arm.bus.servos[1].hardware_error == 0
 
-Both take the path of a TOML file with a [fake] table, a `fakes.description.FakeArm`, or nothing, and `seed` and
+Both take the path of a TOML file with a [fake] table, a `hil.fakes.description.FakeArm`, or nothing, and `seed` and
 `faults` to change of it.
 """
 
@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:  # so that pytest starts as fast as without this plugin
-    from fakes.description import FakeArm
-    from fakes.faults import Fault
-    from fakes.protocol_fake import FakeSerial
-    from fakes.pty_server import PtyServer
+    from hil.fakes.bus.faults import Fault
+    from hil.fakes.description import FakeArm
+    from hil.fakes.protocol_fake import FakeSerial
+    from hil.fakes.pty_server import PtyServer
 
 _SERVO = {"model": "XM430-W350", "zero_ticks": 2048}
 _LINK = {"length": 0.15, "mass": 0.2, "centre": 0.08, "inertia": 5e-4}
@@ -49,7 +49,7 @@ _DEFAULT = {
 
 def default_arm() -> "FakeArm":
     """Two links that hang at rest, moved by two XM430-W350 with IDs 1 and 2 at 1 Mbaud."""
-    from fakes.description import FakeArm
+    from hil.fakes.description import FakeArm
 
     return FakeArm.model_validate(_DEFAULT)
 
@@ -57,7 +57,7 @@ def default_arm() -> "FakeArm":
 @pytest.fixture
 def fake_arm() -> Iterator[Callable[..., "FakeSerial"]]:
     """Makes open pyserial ports onto fake arms in virtual time; closes them after the test."""
-    from fakes.protocol_fake import open_fake
+    from hil.fakes.protocol_fake import open_fake
 
     with ExitStack() as opened:
 
@@ -79,7 +79,7 @@ def fake_arm() -> Iterator[Callable[..., "FakeSerial"]]:
 @pytest.fixture
 def fake_pty() -> Iterator[Callable[..., "PtyServer"]]:
     """Makes fake arms on terminal devices in real time, served by a thread; takes them away after the test."""
-    from fakes.pty_server import PtyServer
+    from hil.fakes.pty_server import PtyServer
 
     with ExitStack() as opened:
 
@@ -101,7 +101,7 @@ def fake_pty() -> Iterator[Callable[..., "PtyServer"]]:
 
 
 def _described(arm: "FakeArm | Path | str | None", seed: int | None, faults: "Sequence[Fault]") -> "FakeArm":
-    from fakes.description import load_fake
+    from hil.fakes.description import load_fake
 
     if arm is None:
         arm = default_arm()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from os import PathLike
 
-    from hil.dynamics import ArmModel
+    from hil.arm_model import ArmModel
 
 __version__ = "0.1.0"
 

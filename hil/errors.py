@@ -14,9 +14,9 @@ HilError                    exit code
     ├── NoSafeTorque        1   a dry run found none that keeps the arm within its limits
     └── RecordingCutShort   1   the recording holds no settled period
 
-drivers.errors.DriverError  1   between computer and servos; its leaves are listed there.
+hil.drivers.errors.DriverError  1   between computer and servos; its leaves are listed there.
                                 UnknownModel, PortNotOpened, WrongModel and WrongSetting are input: 2
-estimator.errors.EstimationError  1   the recording does not determine the parameters; leaves listed there
+hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; leaves listed there
 """
 
 from enum import Enum
@@ -47,7 +47,7 @@ class Cause(Enum):
 class HilError(Exception):
     """Root of hil's own errors.
 
-    last_samples: what had been recorded last before it (rows of hil.recording), where an experiment was running.
+    last_samples: what had been recorded last before it (rows of hil.runs.recording), where an experiment was running.
     """
 
     exit_code = 1

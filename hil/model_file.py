@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.dynamics import ArmModel, JointFacts
+from hil.arm_model import ArmModel, JointFacts
 from hil.errors import ResultError
 
 SCHEMA = 1

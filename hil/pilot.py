@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.errors import EstimationError
-from estimator.physics import Physics
-from hil.amplitude import Amplitude, largest_amplitude
-from hil.config import Config
-from hil.design import designed_plan, roomy_plan
-from hil.dry_run import GUARDED, QUANTITIES, UNITS, peaks_of, predict
-from hil.ensemble import Ensemble, nominal, prior_ensemble, result_ensemble
+from hil.config.schema import Config
+from hil.dry_run.amplitude import Amplitude, largest_amplitude
+from hil.dry_run.ensemble import Ensemble, nominal, prior_ensemble, result_ensemble
+from hil.dry_run.nearest_arms import likely_arms
+from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of, predict
+from hil.dry_run.waves import designed_plan, roomy_plan
 from hil.errors import ExperimentError, NoSafeTorque
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
-from hil.likely_arms import likely_arms
-from hil.plan import Plan
-from hil.recording import load_samples
-from hil.run_folder import RunFolder
-from hil.stream import Watch
+from hil.estimation.settled_estimate import estimate_run
+from hil.estimator.errors import EstimationError
+from hil.estimator.models.parameters import Physics
+from hil.experiment.run import run_experiment
+from hil.experiment.stream import Watch
+from hil.plan.plan import Plan
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ Say = Callable[[str], None]
 @dataclass(frozen=True)
 class Step:
     """One run on the way: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
-    (quantities, joints), in hil.dry_run.QUANTITIES.
+    (quantities, joints), in hil.dry_run.prediction.QUANTITIES.
     """
 
     name: str

@@ -1,6 +1,6 @@
 """What a robot description has no place for, in words: said on the terminal and in the file, never dropped silently."""
 
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
 
 MEANING = {
     "armature": "inertia of the rotor through the gears, seen by its own joint only",

@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
 from hil.errors import ExportError
 
 ROD = 0.75

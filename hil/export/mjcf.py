@@ -3,7 +3,7 @@
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
 from hil.export.left_out import left_out
 from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text

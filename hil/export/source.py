@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
 from hil.errors import RunFolderError
 from hil.model_file import model_of, read_result
 
@@ -32,8 +32,8 @@ class Source:
 
     @cached_property
     def samples(self) -> NDArray[np.void]:
-        """The recording's rows (hil.recording.sample_type); raises RunFolderError."""
-        from hil.recording import load_samples
+        """The recording's rows (hil.runs.recording.sample_type); raises RunFolderError."""
+        from hil.runs.recording import load_samples
 
         return load_samples(self.run / "samples.npy", len(self.model.joints))
 

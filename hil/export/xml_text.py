@@ -3,7 +3,7 @@
 from xml.etree import ElementTree as ET
 
 from hil import __version__
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
 
 
 def numbers(*values: float) -> str:

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config import Config
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
+from hil.config.schema import Config
 from hil.errors import RunFolderError
 from hil.model_file import model_of, read_result
-from hil.period_file import PlayedPeriod, load_periods
-from hil.plan import HELD_OUT, IDENTIFY
-from hil.recording import load_samples
-from hil.run_folder import RunFolder
+from hil.plan.plan import HELD_OUT, IDENTIFY
+from hil.runs.period_file import PlayedPeriod, load_periods
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

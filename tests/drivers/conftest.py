@@ -10,15 +10,16 @@ from pathlib import Path
 
 import pytest
 
-import fakes
-from drivers.bus import BusConfig
-from drivers.clock import WallClock
-from drivers.joint import Joint
-from drivers.servo_model import servo_model
-from fakes.bus import FakeBus
-from fakes.description import load_fake, make_bus
+from hil import fakes
+from hil.drivers.bus import BusConfig
+from hil.drivers.clock import WallClock
+from hil.drivers.joint import Joint
+from hil.drivers.servo_model import servo_model
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.description import load_fake, make_bus
+from tests.support.paths import CONFIGS
 
-CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link_ideal.toml"
+CONFIG = CONFIGS / "fake_two_link_ideal.toml"
 
 JOINTS = (
     Joint("shoulder", 1, servo_model("XM430-W350"), zero_ticks=3072),

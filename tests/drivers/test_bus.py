@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from drivers.bus import BusConfig, ServoBus
-from drivers.errors import PortLost, ServoFault, ServoRefused, WrongSetting
-from drivers.joint import Joint
-from drivers.packet import HardwareError
-from drivers.servo_model import Mode, servo_model
+from hil.drivers.bus import BusConfig, ServoBus
+from hil.drivers.errors import PortLost, ServoFault, ServoRefused, WrongSetting
+from hil.drivers.joint import Joint
+from hil.drivers.packet import HardwareError
+from hil.drivers.servo_model import Mode, servo_model
 
 from .conftest import JOINTS
 
@@ -60,7 +60,7 @@ def test_fast_sync_read_can_be_forbidden(fake_config: Make) -> None:
 def test_a_firmware_that_should_have_it_and_does_not_answer_is_read_the_old_way(
     fake_config: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from fakes.instructions import Instructions
+    from hil.fakes.bus.instructions import Instructions
 
     monkeypatch.setattr(Instructions, "_fast_sync_read", lambda *_: None)
     with ServoBus.open(fake_config()) as bus:

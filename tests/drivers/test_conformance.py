@@ -12,12 +12,12 @@ from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from drivers.control_table import load_control_table
-from drivers.exchange import Exchange
-from drivers.packet import HEADER, crc, encode_status
-from drivers.port import Port
-from drivers.servo_model import Mode
-from drivers.state import spans
+from hil.drivers.control_table import load_control_table
+from hil.drivers.exchange import Exchange
+from hil.drivers.packet import HEADER, crc, encode_status
+from hil.drivers.port import Port
+from hil.drivers.servo_model import Mode
+from hil.drivers.state import spans
 
 XM430 = load_control_table("XM430-W350")
 

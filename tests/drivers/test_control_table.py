@@ -2,9 +2,9 @@
 
 import pytest
 
-from drivers.control_table import load_control_table, model_names
-from drivers.errors import UnknownModel
-from drivers.servo_model import SERVO_MODELS, Mode, servo_model
+from hil.drivers.control_table import load_control_table, model_names
+from hil.drivers.errors import UnknownModel
+from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model
 
 
 def test_registers_of_the_xm430_stand_where_the_manual_has_them() -> None:

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.control_table import load_control_table
-from drivers.errors import PortLost
-from drivers.exchange import Exchange
-from drivers.packet import HEADER, Framer, Instruction, crc, encode_status
-from drivers.port import Port
-from drivers.servo_model import Mode
-from drivers.state import spans
-from drivers.sync_read import FastSyncRead, Span, SyncRead
+from hil.drivers.control_table import load_control_table
+from hil.drivers.errors import PortLost
+from hil.drivers.exchange import Exchange
+from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode_status
+from hil.drivers.port import Port
+from hil.drivers.servo_model import Mode
+from hil.drivers.state import spans
+from hil.drivers.sync_read import FastSyncRead, Span, SyncRead
 
 XM430 = load_control_table("XM430-W350")
 XL430 = load_control_table("XL430-W250")

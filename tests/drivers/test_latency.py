@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.latency import (
+from hil.drivers.latency import (
     FACTORY_MS,
     adapter_latency,
     command_to_set,

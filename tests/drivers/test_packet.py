@@ -5,7 +5,7 @@ from dynamixel_sdk import Protocol2PacketHandler
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from drivers.packet import (
+from hil.drivers.packet import (
     BROADCAST_ID,
     HEADER,
     MAX_ID,

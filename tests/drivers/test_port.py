@@ -5,9 +5,9 @@ import time
 
 import pytest
 
-from drivers.errors import PortLost, PortNotOpened
-from drivers.port import open_port
-from drivers.sdk_port import SdkPort
+from hil.drivers.errors import PortLost, PortNotOpened
+from hil.drivers.port import open_port
+from hil.drivers.sdk_port import SdkPort
 
 
 @pytest.fixture

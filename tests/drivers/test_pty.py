@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from drivers.bus import BusConfig, ServoBus
-from drivers.errors import PortLost, PortNotOpened, TorqueNotOff
-from drivers.port import DescriptorPort, open_port
+from hil.drivers.bus import BusConfig, ServoBus
+from hil.drivers.errors import PortLost, PortNotOpened, TorqueNotOff
+from hil.drivers.port import DescriptorPort, open_port
 
 from .conftest import JOINTS, ServedPty
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import WallClock
-from drivers.rate import FixedRate
-from fakes.clock import VirtualClock
+from hil.drivers.clock import WallClock
+from hil.drivers.rate import FixedRate
+from hil.fakes.bus.clock import VirtualClock
 
 
 def test_deadlines_are_absolute_and_none_is_missed_by_late_wake_ups() -> None:

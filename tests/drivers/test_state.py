@@ -4,10 +4,10 @@ import math
 
 import pytest
 
-from drivers.exchange import Reply
-from drivers.joint import Joint
-from drivers.servo_model import servo_model
-from drivers.state import Converter, State
+from hil.drivers.exchange import Reply
+from hil.drivers.joint import Joint
+from hil.drivers.servo_model import servo_model
+from hil.drivers.state import Converter, State
 
 JOINTS = (
     Joint("shoulder", 1, servo_model("XM430-W350"), zero_ticks=3072),

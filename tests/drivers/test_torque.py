@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from drivers.bus import BusConfig, ServoBus
-from drivers.errors import ServoRefused, TorqueNotOff
-from fakes.faults import Fault, FaultKind
+from hil.drivers.bus import BusConfig, ServoBus
+from hil.drivers.errors import ServoRefused, TorqueNotOff
+from hil.fakes.bus.faults import Fault, FaultKind
 
 Make = Callable[..., BusConfig]
 GOAL_CURRENT, WATCHDOG, TORQUE = 102, 98, 64

@@ -6,9 +6,9 @@ import pytest
 
 from benchmarks import recorded_arm
 from benchmarks.recorded_arm import servo_arm
-from estimator.excitation import Multisine
-from estimator.period import SettledPeriod
-from fakes.arm import Arm
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.excitation.multisine import Multisine
+from hil.fakes.plants.arm import Arm
 
 IDEAL = {"coulomb_width": 0.05}
 STICKING = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}

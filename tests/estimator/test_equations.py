@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from estimator.arm_model import inverse_dynamics, parameter_names, parameter_units, regressor
-from estimator.coordinates import Coordinates, scales_of
-from estimator.drive import motor_torque
-from estimator.errors import ModelError, ShapeError
-from estimator.fourier import cut_off, held_lines, lines_of, motion_of
-from estimator.model import Model
-from estimator.physics import Physics
-from estimator.settling import period_difference
-from estimator.simulation import simulate
+from hil.estimator.data.fourier import cut_off, held_lines, lines_of, motion_of
+from hil.estimator.data.periodicity import period_difference
+from hil.estimator.errors import ModelError, ShapeError
+from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.models.model import Model
+from hil.estimator.models.parameters import Physics
+from hil.estimator.models.regressor import inverse_dynamics, parameter_names, parameter_units, regressor
+from hil.estimator.simulation.arm import simulate
+from hil.estimator.simulation.drive import motor_torque
 
 small = st.floats(-3.0, 3.0)
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.errors import ModelError, RecordingError, ShapeError, StandstillError, UnidentifiableError
-from estimator.excitation import Multisine
-from estimator.identify import Estimate, identify, predict
-from estimator.least_squares import fit_lines
-from estimator.model import Model
-from estimator.period import SettledPeriod
-from fakes.arm import Arm, base_parameters
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import ModelError, RecordingError, ShapeError, StandstillError, UnidentifiableError
+from hil.estimator.excitation.multisine import Multisine
+from hil.estimator.fit.stage1 import fit_lines
+from hil.estimator.identify import Estimate, identify, predict
+from hil.estimator.models.model import Model
+from hil.fakes.plants.arm import Arm, base_parameters
 
 Recorder = Callable[[Arm, Multisine], SettledPeriod]
 Wave = Callable[..., Multisine]

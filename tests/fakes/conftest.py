@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 import pytest
 from hypothesis import HealthCheck, settings
 
-from drivers.packet import Framer, Instruction, Packet, encode
-from fakes.bus import FakeBus
-from fakes.clock import VirtualClock
-from fakes.registers import load_model
-from fakes.servo import Servo
+from hil.drivers.packet import Framer, Instruction, Packet, encode
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.servo.registers import load_model
+from hil.fakes.servo.servo import Servo
 
 # A busy machine is no failure; the fixtures used with @given only build benches, so they may be shared.
 settings.register_profile("no deadline", deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

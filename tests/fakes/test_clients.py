@@ -16,7 +16,8 @@ from typing import Any
 import dynamixel_sdk as sdk
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 CONFIG = ROOT / "configs" / "fake_two_link.toml"
 WHY = 'needs the extra "clients": pip install hil[clients]'
 

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from fakes.clock import VirtualClock
-from fakes.description import DescriptionError, FakeArm, load_fake, make_bus
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
+from tests.support.paths import CONFIGS
 
-CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
+CONFIG = CONFIGS / "fake_two_link.toml"
 
 
 def edited(tmp_path: Path, old: str, new: str) -> Path:

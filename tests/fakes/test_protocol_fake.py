@@ -9,15 +9,16 @@ import pytest
 import serial
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2PacketHandler
 
-import fakes
-from drivers.packet import encode, encode_status
-from drivers.port import open_port
-from drivers.sdk_port import SdkPort
-from fakes.clock import VirtualClock
-from fakes.description import load_fake
-from fakes.protocol_fake import FakeSerial, open_fake
+from hil import fakes
+from hil.drivers.packet import encode, encode_status
+from hil.drivers.port import open_port
+from hil.drivers.sdk_port import SdkPort
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.description import load_fake
+from hil.fakes.protocol_fake import FakeSerial, open_fake
+from tests.support.paths import CONFIGS
 
-CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
+CONFIG = CONFIGS / "fake_two_link.toml"
 URL = f"fake://{CONFIG}"
 PING = encode(1, 1)
 PONG = encode_status(1, 0, b"\xfc\x03\x30")
@@ -34,7 +35,7 @@ def port() -> Iterator[FakeSerial]:
 def test_registering_twice_is_harmless() -> None:
     fakes.register()
     fakes.register()
-    assert serial.protocol_handler_packages.count("fakes") == 1
+    assert serial.protocol_handler_packages.count("hil.fakes") == 1
 
 
 def test_relative_path(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,7 +173,7 @@ def test_two_runs_are_the_same() -> None:
 
 
 def test_import_is_cheap() -> None:
-    code = "import sys, fakes; assert not {'serial', 'pydantic', 'numpy'} & set(sys.modules)"
+    code = "import sys, hil.fakes; assert not {'serial', 'pydantic', 'numpy'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=CONFIG.parents[1])
 
 

@@ -12,13 +12,13 @@ from threading import Thread
 import pytest
 import serial
 
-from drivers.packet import BROADCAST_ID, Instruction, encode, encode_status
-from fakes.description import load_fake
-from fakes.faults import Fault
-from fakes.pty_server import LinkError, PtyServer
-from hil.cli import main
+from hil.cli.app import main
+from hil.drivers.packet import BROADCAST_ID, Instruction, encode, encode_status
+from hil.fakes.bus.faults import Fault
+from hil.fakes.description import load_fake
+from hil.fakes.pty_server import LinkError, PtyServer
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs" / "fake_two_link.toml"
 PING = encode(1, Instruction.PING)
 PONG = encode_status(1, 0, b"\xfc\x03\x30")

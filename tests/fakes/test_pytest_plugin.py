@@ -5,11 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from tests.support.paths import ROOT
 
 THEIR_TESTS = f"""
-from drivers.packet import encode, encode_status
-from fakes.faults import Fault
+from hil.drivers.packet import encode, encode_status
+from hil.fakes.bus.faults import Fault
 import serial
 
 PONG = encode_status(1, 0, b"\\xfc\\x03\\x30")
@@ -40,7 +40,7 @@ def test_terminal(fake_pty):
 
 def test_fixtures_for_other_peoples_tests(tmp_path: Path) -> None:
     (tmp_path / "test_theirs.py").write_text(THEIR_TESTS, encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "fakes.pytest_plugin", "."]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
     done = subprocess.run(
         command,
         cwd=tmp_path,

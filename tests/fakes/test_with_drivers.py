@@ -5,15 +5,16 @@ from pathlib import Path
 
 import pytest
 
-import fakes
-from drivers.bus import BusConfig, ServoBus
-from drivers.errors import NoReply, ServoRefused, TorqueNotOff, WrongModel, WrongSetting
-from drivers.joint import Joint
-from drivers.packet import ALERT, HardwareError
-from drivers.servo_model import servo_model
-from fakes.protocol_fake import FakeSerial
+from hil import fakes
+from hil.drivers.bus import BusConfig, ServoBus
+from hil.drivers.errors import NoReply, ServoRefused, TorqueNotOff, WrongModel, WrongSetting
+from hil.drivers.joint import Joint
+from hil.drivers.packet import ALERT, HardwareError
+from hil.drivers.servo_model import servo_model
+from hil.fakes.protocol_fake import FakeSerial
+from tests.support.paths import CONFIGS
 
-CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
+CONFIG = CONFIGS / "fake_two_link.toml"
 JOINTS = (
     Joint("shoulder", 1, servo_model("XM430-W350"), zero_ticks=3072),
     Joint("elbow", 2, servo_model("XM430-W350"), zero_ticks=2048),

@@ -3,19 +3,18 @@
 The limits are what the tool promises, not what it happens to reach; benchmarks/identify.py prints the latter.
 """
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hil.config import load_config
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
-from hil.recording import load_samples
-from hil.run_folder import RunFolder
+from hil.config.schema import load_config
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 INERTIAS = ("inertia_1", "coupling", "inertia_2", "armature_2")
 GRAVITY = ("gravity_1", "gravity_2")
 FRICTION = ("viscous_1", "viscous_2", "coulomb_1", "coulomb_2")

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.arm_model import inverse_dynamics, parameter_names
 from hil import load_model
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
 from hil.errors import ResultError
+from hil.estimator.models.regressor import inverse_dynamics, parameter_names
 from hil.model_file import read_result
-from hil.run_folder import RunFolder
+from hil.runs.run_folder import RunFolder
 
 
 def motions(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:

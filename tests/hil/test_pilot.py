@@ -10,19 +10,18 @@ import pytest
 from rich.console import Console
 
 from benchmarks.dry_run import worst_relative_std
-from hil.config import load_config
+from hil.cli.result_table import print_result
+from hil.config.schema import load_config
 from hil.errors import NoSafeTorque
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
 from hil.pilot import Step, identify_in_steps, next_amplitude
-from hil.plan import make_plan
+from hil.plan.plan import make_plan
+from hil.plan.stabiliser import StabiliserShare
 from hil.report.page import make_page
 from hil.report.run_data import RunData
-from hil.result_table import print_result
-from hil.run_folder import RunFolder
-from hil.stabiliser import StabiliserShare
-
-CONFIGS = Path(__file__).parents[2] / "configs"
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
 
 
 @pytest.fixture(scope="module")

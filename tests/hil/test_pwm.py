@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from benchmarks.dry_run import is_within, run_on
-from drivers.servo_model import Mode
-from fakes.registers import load_model
-from hil.amplitude import Amplitude
-from hil.config import Config, load_config
-from hil.dry_run import predict, quantities_of
-from hil.ensemble import prior_ensemble
+from hil.config.schema import Config, load_config
+from hil.drivers.servo_model import Mode
+from hil.dry_run.amplitude import Amplitude
+from hil.dry_run.ensemble import prior_ensemble
+from hil.dry_run.prediction import predict, quantities_of
 from hil.errors import ConfigError
-from hil.estimate import estimate_run
-from hil.experiment import run_experiment
-from hil.plan import make_plan
-from hil.run_folder import RunFolder
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.fakes.servo.registers import load_model
+from hil.plan.plan import make_plan
+from hil.runs.run_folder import RunFolder
 
 ArmFile = Callable[..., Path]
 

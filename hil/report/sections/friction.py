@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from estimator.fourier import cut_off, lines_of, motion_of
-from hil.dynamics import ArmModel
-from hil.period_file import PlayedPeriod
+from hil.arm_model import ArmModel
+from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.report.chart import BLUE, GREY, Array, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
+from hil.runs.period_file import PlayedPeriod
 
 _CURVE = 401  # speeds on the curve
 _DOTS = 700

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from hil.period_file import PlayedPeriod
 from hil.report.chart import BLUE, GREEN, ORANGE, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
 from hil.report.words import percent, steps
+from hil.runs.period_file import PlayedPeriod
 
 
 def prediction(data: RunData) -> Section | None:

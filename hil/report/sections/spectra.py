@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from estimator.fourier import lines_of, noise_power
-from hil.period_file import PlayedPeriod
-from hil.plan import IDENTIFY
+from hil.estimator.data.fourier import lines_of, noise_power
+from hil.plan.plan import IDENTIFY
 from hil.report.chart import BLUE, GREEN, GREY, ORANGE, Array, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section, Table
 from hil.report.words import steps
+from hil.runs.period_file import PlayedPeriod
 
 _COLOURS = (BLUE, ORANGE)
 _KINDS = {

@@ -1,9 +1,9 @@
 """What the stabiliser gave of the torque that was commanded."""
 
+from hil.plan.stabiliser import StabiliserShare
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import number
-from hil.stabiliser import StabiliserShare
 
 
 def stabiliser(data: RunData) -> Section | None:

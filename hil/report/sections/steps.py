@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from hil.config import Config
-from hil.dry_run import quantities_of
+from hil.config.schema import Config
+from hil.dry_run.prediction import quantities_of
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import listed, number

@@ -1,9 +1,9 @@
 """The verdict in words: can this model be trusted, why, and what to do if not. The judgement is the result's own."""
 
+from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
-from hil.torque_constants import by_voltage_said, torque_constants_said
 
 _TITLES = {
     "yes": ("good", "This model can be trusted"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hil import load_model
-from hil.dynamics import ArmModel
+from hil.arm_model import ArmModel
 from hil.errors import ExportError
 from hil.export.formats import export
 from hil.export.mass_distribution import distribute

@@ -1,0 +1,136 @@
+"""Other methods on the same settled period, each tuned and timed: what a reader should compare with.
+
+All get the same positions and the same commands. Their torque is the command as it reaches the motors, with the
+delay that this project's own first stage found; none has to guess it. Each method's settings (cut-off, width of
+the Coulomb step, process noise) are searched, and the setting kept is the one whose simulation is nearest to the
+recording; the time counted is that of the kept setting alone.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.baselines.idim import InverseDynamics, fit_inverse_dynamics
+from hil.estimator.baselines.kalman import Filter, Filtered, fit_by_kalman
+from hil.estimator.baselines.paper_lines import fit_linearised
+from hil.estimator.baselines.rls import fit_recursively
+from hil.estimator.data.recording import Recording
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import EstimationError
+from hil.estimator.fit.stage1 import fit_lines
+from hil.estimator.selection.prediction import prediction_rms
+
+CUTOFFS = (6.0, 10.0, 15.0, 25.0, 40.0)  # Hz
+WIDTHS = (0.007, 0.02, 0.05, 0.15)  # rad/s
+VELOCITY_NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  # rad/s per sqrt(s)
+SHORT = 0.5  # s of simulation by which settings are compared
+PERIODS = 3  # of the settled period joined end to end for the filters, which need time to settle
+
+Fit = InverseDynamics | Filtered
+Setting = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Peer:
+    """What one method found."""
+
+    name: str
+    parameters: dict[str, float]
+    """Base parameters, and what its simulation needs beside them, by name [SI]."""
+    std: dict[str, float]
+    """Standard errors by its own account."""
+    seconds: float
+    """Of the kept setting."""
+    settings: str
+    """What was kept, in words."""
+    tried: int
+    """Settings tried."""
+
+
+def joined(period: SettledPeriod, periods: int) -> Recording:
+    """The settled period `periods` times end to end, as a recording of held commands."""
+    count = period.samples * periods
+    return Recording(
+        np.arange(count) / period.rate,
+        np.tile(period.torque, periods),
+        np.tile(period.position, periods),
+        period.position_step,
+        between="held",
+        command_to_sample=period.command_to_sample,
+    )
+
+
+def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -> Iterator[Peer]:
+    """IDIM-LS, RLS, EKF, UKF and the paper's linearised lines on one settled period, as each is done.
+
+    `length` [m] of link 1 and `gravity` [m/s^2] are for the paper's method, which needs them to tell inertias
+    apart; None leaves it out on an arm of two joints.
+    """
+    recording = joined(period, 1)
+    delay = fit_lines(period).delay
+
+    def inverse(setting: Setting) -> Fit:
+        return fit_inverse_dynamics([recording], setting[0], setting[1], delay)
+
+    def recursive(setting: Setting) -> Fit:
+        return fit_recursively([recording], setting[0], setting[1], delay)
+
+    filters = tuple(product(CUTOFFS, WIDTHS))
+    words = "cut-off {:g} Hz, Coulomb width {:g} rad/s"
+    idim = _best("idim_ls", inverse, filters, words, recording, delay)
+    yield idim
+    yield _best("rls", recursive, filters, words, recording, delay)
+    long = joined(period, PERIODS)
+    start = np.array([idim.parameters[name] for name in idim.std])
+    for kind in ("ekf", "ukf"):
+        yield _best_filter(kind, long, start, recording, delay)
+    if period.joints == 1 or length is not None:
+        began = time.perf_counter()
+        linear = fit_linearised(period, length, gravity)
+        seconds = time.perf_counter() - began
+        yield Peer("paper", linear.parameters | {"delay": delay}, linear.std, seconds, linear.remark, 1)
+
+
+def _best_filter(kind: Filter, long: Recording, start: Array, recording: Recording, delay: float) -> Peer:
+    def run(setting: Setting) -> Fit:
+        return fit_by_kalman(long, start, kind, setting[0], setting[1], delay)
+
+    settings = tuple(product(WIDTHS[:2], VELOCITY_NOISES))
+    words = "Coulomb width {:g} rad/s, velocity noise {:g} rad/s/sqrt(s)"
+    return _best(kind, run, settings, words, recording, delay)
+
+
+def _best(
+    name: str,
+    fit: Callable[[Setting], Fit],
+    settings: tuple[Setting, ...],
+    words: str,
+    recording: Recording,
+    delay: float,
+) -> Peer:
+    found: list[tuple[float, Peer]] = []
+    for setting in (settings[0], *settings):  # the first once more: compiled before the clock runs
+        began = time.perf_counter()
+        try:
+            result = fit(setting)
+        except (EstimationError, np.linalg.LinAlgError):
+            continue
+        seconds = time.perf_counter() - began
+        width = setting[1] if name in {"idim_ls", "rls"} else setting[0]
+        parameters = dict(zip(result.names, result.value.tolist(), strict=True)) | {"delay": delay}
+        parameters |= {f"coulomb_width_{joint + 1}": width for joint in range(recording.joints)}
+        std = dict(zip(result.names, result.std.tolist(), strict=True))
+        peer = Peer(name, parameters, std, seconds, words.format(*setting), len(settings))
+        found.append((_misfit(recording, parameters), peer))
+    if not found:
+        raise EstimationError(f"{name} failed with every one of its {len(settings)} settings")
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _misfit(recording: Recording, parameters: Mapping[str, float]) -> float:
+    rms = prediction_rms([recording], parameters, SHORT, recording.joints)
+    return float(np.sum(rms / recording.filled().std(axis=1)))

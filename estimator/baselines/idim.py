@@ -1,0 +1,128 @@
+"""Filtered inverse-dynamics least squares (IDIM-LS), the field's workhorse, as a start and as a peer.
+
+Position is low-pass filtered forwards and backwards, differentiated by central differences, the regressor
+evaluated, regressor and torque filtered alike and decimated, and one weighted linear least squares solved:
+Gautier and Poignet, "Extended Kalman filtering and weighted least squares dynamic identification of robot",
+Control Engineering Practice 9 (2001) 1361; Swevers, Verdonck, De Schutter, "Dynamic model identification
+for industrial robots", IEEE Control Systems 27 (2007) 58.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import RecordingError, UnidentifiableError
+from hil.estimator.models.regressor import parameter_names, regressor
+
+ORDER = 4  # of the Butterworth filter, doubled by running it both ways
+TRIM = 1.5  # cycles of the cut-off left out at either end, where the filter sees nothing beyond
+PER_CYCLE = 5.0  # samples kept per cycle of the cut-off
+WORST_CONDITION = 1e8
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Filtered regressors and torques, at about the rate at which they hold new information."""
+
+    regressor: Array
+    """(joints, samples, parameters)."""
+    torque: Array
+    """(joints, samples) [N m]."""
+
+
+@dataclass(frozen=True)
+class InverseDynamics:
+    """What the regression found."""
+
+    names: tuple[str, ...]
+    """Base parameters."""
+    value: Array
+    """(parameters,) [SI]."""
+    std: Array
+    """Standard errors if the residual were white (parameters,)."""
+    relative_residual: Array
+    """RMS of the torque left over that of the torque (joints,)."""
+
+
+def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, float]:
+    """Positions and torques (joints, samples) at equal intervals, and the interval [s].
+
+    A torque is the mean over the interval around its position, so that a held command lags by nothing.
+    """
+    dt = recording.interval
+    count = int((recording.time[-1] - recording.time[0]) / dt)
+    at = recording.time[0] + dt * np.arange(count)
+    filled = recording.filled()
+    position = np.stack([np.interp(at, recording.time, row) for row in filled])
+    edges = recording.time[0] + dt * (np.arange(count + 1) - 0.5)
+    return position, recording.mean_torque(edges, delay), dt
+
+
+def filtered_rows(
+    recording: Recording,
+    cutoff: float,
+    coulomb_width: float,
+    delay: float = 0.0,
+    position_cutoff: float | None = None,
+) -> Rows:
+    """Rows of the regression; arguments as of `fit_inverse_dynamics`. Raises RecordingError when nothing is left."""
+    position, torque, dt = uniform(recording, delay)
+    trim = int(np.ceil(TRIM / (cutoff * dt)))
+    keep = max(1, int(1.0 / (PER_CYCLE * cutoff * dt)))
+    highest = max(cutoff, position_cutoff or cutoff)
+    if highest >= 0.45 / dt or position.shape[1] < 3 * trim:
+        raise RecordingError(
+            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {highest:g} Hz: "
+            "record longer or faster"
+        )
+    filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
+    smooth = sosfiltfilt(butter(ORDER, position_cutoff or cutoff, fs=1.0 / dt, output="sos"), position, axis=1)
+    velocity = np.gradient(smooth, dt, axis=1)
+    acceleration = np.gradient(velocity, dt, axis=1)
+    Y = sosfiltfilt(filter_, regressor(smooth, velocity, acceleration, coulomb_width), axis=1)
+    tau = sosfiltfilt(filter_, torque, axis=1)
+    return Rows(Y[:, trim:-trim:keep], tau[:, trim:-trim:keep])
+
+
+def fit_inverse_dynamics(
+    recordings: Sequence[Recording],
+    cutoff: float,
+    coulomb_width: float,
+    delay: float = 0.0,
+    position_cutoff: float | None = None,
+) -> InverseDynamics:
+    """IDIM-LS over all `recordings`, each joint weighted by what a first solution left of its torque.
+
+    `cutoff` [Hz] of regressors and torques, `position_cutoff` [Hz] of the positions that the regressors are made of
+    (the same if none is given), `coulomb_width` [rad/s] of the Coulomb step, `delay` [s] of the torque. Raises
+    RecordingError, UnidentifiableError.
+    """
+    rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff) for recording in recordings]
+    Y = np.concatenate([row.regressor for row in rows], axis=1)
+    tau = np.concatenate([row.torque for row in rows], axis=1)
+    weight = np.ones(len(Y))
+    for _ in range(3):
+        theta, std = _solve(Y, tau, weight)
+        left = np.sqrt(np.mean((tau - Y @ theta) ** 2, axis=1))
+        weight = 1.0 / np.maximum(left, 1e-12)
+    level = np.sqrt(np.mean(tau**2, axis=1))
+    return InverseDynamics(parameter_names(len(Y)), theta, std, left / np.where(level > 0.0, level, 1.0))
+
+
+def _solve(Y: Array, tau: Array, weight: Array) -> tuple[Array, Array]:
+    A = (Y * weight[:, None, None]).reshape(-1, Y.shape[2])
+    b = (tau * weight[:, None]).reshape(-1)
+    norm = np.linalg.norm(A, axis=0)
+    U, size, Vt = np.linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
+    if size[-1] * WORST_CONDITION < size[0] or np.any(norm == 0.0):
+        raise UnidentifiableError(
+            "filtered inverse dynamics: the motion does not tell parameters apart; move both joints, faster and further"
+        )
+    theta = Vt.T @ ((U.T @ b) / size)
+    left = b - A @ (theta / norm)
+    variance = float(left @ left) / max(1, b.size - theta.size)
+    return theta / norm, np.sqrt(variance * np.sum((Vt.T / size) ** 2, axis=1)) / norm

@@ -1,0 +1,200 @@
+"""The seed paper's method on its own arm: as printed, and by maximum likelihood on the same Fourier coefficients.
+
+Zhu, Man, Cao, Zheng, Wang, "Parameter Estimation for Robotic Manipulator Systems", Machines 10 (2022) 392. Numbers in
+brackets are its equations; docs/paper.md walks through them and lists the errors in print.
+
+The arm is two point masses at the ends of two links, linearised about hanging. As printed, (16) and (17), it obeys
+q' = A q + B u: first order. Right is q'' = A q + B u, and without friction that never settles; so the corrected arm
+has viscous friction, (s^2 D + s F + K) q = u. `order` chooses between the two.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from hil.estimator.arrays import Array
+from hil.estimator.errors import ModelError, ShapeError
+
+Complex = npt.NDArray[np.complex128]
+Order = Literal[1, 2]
+
+FUNDAMENTAL = 0.01  # Hz, Table 2
+LINES = (3, 5, 7, 9, 11, 13, 17, 21, 27, 42)
+AMPLITUDES = (0.2, 1.5, 0.3, 0.5, 0.7, 0.8, 1.0, 1.2, 1.4, 2.0)  # N m
+NOISE = 0.1  # rad: "white noise 0.1*rand()", uniform from 0 to this
+
+
+@dataclass(frozen=True)
+class PaperArm:
+    """The paper's arm; the defaults are its Table 1."""
+
+    mass_1: float = 5.0
+    mass_2: float = 1.5
+    inertia_1: float = 5.0
+    inertia_2: float = 5.0
+    length_1: float = 1.0
+    length_2: float = 0.8
+    gravity: float = 9.81
+    viscous: float = 0.0
+    """Friction of each joint [N m s/rad]; the paper has none."""
+
+    def mass_matrix(self) -> Array:
+        """D (2, 2) of (3) at q2 = 0, with J1 and J2, which (14) and (15) lose [kg m^2]."""
+        alpha = (self.mass_1 + self.mass_2) * self.length_1**2 + self.inertia_1
+        beta = self.mass_2 * self.length_1 * self.length_2
+        delta = self.mass_2 * self.length_2**2
+        return np.array([[alpha + delta + 2.0 * beta, delta + beta], [delta + beta, delta + self.inertia_2]])
+
+    def stiffness(self) -> Array:
+        """K (2, 2): gravity, (7) with cos q1 in its first term, linearised about hanging [N m/rad]."""
+        first = (self.mass_1 + self.mass_2) * self.length_1 * self.gravity
+        second = self.mass_2 * self.length_2 * self.gravity
+        return np.array([[first + second, second], [second, second]])
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Cosines of torque: which harmonics, and what on which joint."""
+
+    lines: npt.NDArray[np.int64]
+    """Harmonics of FUNDAMENTAL (lines,)."""
+    torque: Array
+    """Amplitudes (2, lines) [N m]."""
+
+    @property
+    def frequency(self) -> Array:
+        """Angular (lines,) [rad/s]."""
+        return np.asarray(2.0 * np.pi * FUNDAMENTAL * self.lines, dtype=np.float64)
+
+
+def own_lines() -> Excitation:
+    """Table 2 on joint 1, and on joint 2 the same amplitudes one harmonic higher.
+
+    As printed, (19), both joints have the same torque on the same lines; then only sums of the two columns of the
+    transfer function are seen and A1 of (33) is singular. One harmonic apart is the least change that mends it.
+    """
+    lines, amplitude = np.array(LINES), np.array(AMPLITUDES)
+    nothing = np.zeros_like(amplitude)
+    torque = np.stack((np.concatenate((amplitude, nothing)), np.concatenate((nothing, amplitude))))
+    return Excitation(np.concatenate((lines, lines + 1)), torque)
+
+
+def printed_lines() -> Excitation:
+    """Table 2 on both joints at once, as printed."""
+    return Excitation(np.array(LINES), np.array([AMPLITUDES, AMPLITUDES]))
+
+
+def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
+    """Complex amplitudes of the joint angles on the lines (2, lines) [rad], (30)."""
+    s = 1j * excitation.frequency
+    D, K, F = arm.mass_matrix(), arm.stiffness(), np.eye(2) * arm.viscous
+    terms = (s * D[:, :, None] if order == 1 else s * s * D[:, :, None] + s * F[:, :, None]) + K[:, :, None]
+    angles = np.linalg.solve(np.moveaxis(terms, 2, 0), excitation.torque.T[:, :, None])[:, :, 0].T
+    return np.asarray(angles, dtype=np.complex128)
+
+
+def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, seed: int) -> Array:
+    """One fundamental period of the settled angles (2, samples) [rad], with the paper's noise on them."""
+    samples = round(rate / FUNDAMENTAL)
+    turn = np.exp(1j * np.outer(excitation.frequency, np.arange(samples) / rate))
+    clean = (response(arm, excitation, order) @ turn).real
+    return np.asarray(clean + NOISE * np.random.default_rng(seed).random(clean.shape))
+
+
+def coefficients(position: Array, excitation: Excitation) -> Complex:
+    """Complex Fourier coefficients on the lines (2, lines) of one period (2, samples), (48) and (60).
+
+    The noise's mean of NOISE / 2 falls on line 0, which is not used. Raises ShapeError.
+    """
+    if position.ndim != 2 or position.shape[0] != 2 or position.shape[1] <= 2 * excitation.lines.max():
+        raise ShapeError(
+            f"position is {position.shape}: one period of two joints (2, samples) is needed, with more than "
+            f"{2 * excitation.lines.max()} samples"
+        )
+    samples = position.shape[1]
+    lines: Complex = np.fft.rfft(position, axis=1)[:, excitation.lines] * 2.0 / samples
+    return lines
+
+
+def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm) -> tuple[float, float]:
+    """m1 and m2 [kg] as the paper has them: ordinary least squares, then its masses from the coefficients.
+
+    Joint i's coefficients obey (s^2 + a1 s + a0) q_i = (b11 s + b10) u1 + (b21 s + b20) u2 for the first-order
+    plant; (52) to (58) solve that for joint 1 and (63) to (69) for joint 2, line by line, real and imaginary part,
+    with the noisy q_i on both sides. m1 is then read from joint 1's six coefficients and m2 from joint 2's, as the
+    masses whose coefficients are nearest, each in relation to its own size. `known`: lengths and inertias; its masses
+    are the scale only. Noise in the regressors drives the coefficients towards zero, however much data there is.
+    Raises ModelError when both joints share their lines: the columns of (33) coincide.
+    """
+    s = 1j * excitation.frequency
+    u1, u2 = excitation.torque
+    masses = []
+    for joint in range(2):
+        q = coefficient[joint]
+        A = np.stack((-s * q, -q, s * u1, u1, s * u2, u2), axis=1)
+        goal = s * s * q
+        rows = np.concatenate((A.real, A.imag))
+        if np.linalg.matrix_rank(rows / np.linalg.norm(rows, axis=0)) < rows.shape[1]:
+            raise ModelError("both joints have the same torque on the same lines: (33) is singular; give each its own")
+        found = np.linalg.lstsq(rows, np.concatenate((goal.real, goal.imag)), rcond=None)[0]
+        masses.append(_nearest_masses(found, joint, known)[joint])
+    return masses[0], masses[1]
+
+
+@dataclass(frozen=True)
+class MassEstimate:
+    """The paper's two masses by maximum likelihood."""
+
+    mass_1: float
+    mass_2: float
+    std: tuple[float, float]
+    """Standard errors from the residual [kg]."""
+    viscous: float
+    """Friction found beside them, second order only [N m s/rad]."""
+
+
+def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm, order: Order) -> MassEstimate:
+    """m1 and m2 (and friction, for the second order) that make the measured coefficients most likely.
+
+    The noise of a Fourier coefficient is normal and alike on all lines, whatever it was in time, so the likelihood is
+    the sum of squares of measured less predicted coefficients. `known`: lengths, inertias, and where to start.
+    """
+
+    def arm(x: Array) -> PaperArm:
+        viscous = float(x[2]) if order == 2 else 0.0
+        return replace(known, mass_1=float(x[0]), mass_2=float(x[1]), viscous=viscous)
+
+    def misfit(x: Array) -> Array:
+        left = (response(arm(x), excitation, order) - coefficient).reshape(-1)
+        return np.concatenate((left.real, left.imag))
+
+    start = np.array([known.mass_1, known.mass_2, known.viscous][: 1 + order])
+    found = least_squares(misfit, start, x_scale=np.maximum(start, 0.1), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    variance = 2.0 * found.cost / (found.fun.size - start.size)
+    jacobian = np.asarray(found.jac, dtype=np.float64)
+    std = np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    viscous = float(found.x[2]) if order == 2 else 0.0
+    return MassEstimate(float(found.x[0]), float(found.x[1]), (float(std[0]), float(std[1])), viscous)
+
+
+def _nearest_masses(found: Array, joint: int, known: PaperArm) -> Array:
+    """The masses (2,) whose transfer coefficients are nearest to `found` (6,)."""
+    size = np.abs(_transfer(known, joint))
+
+    def misfit(x: Array) -> Array:
+        arm = replace(known, mass_1=abs(float(x[0])), mass_2=abs(float(x[1])))
+        return np.asarray((_transfer(arm, joint) - found) / size)
+
+    return np.abs(least_squares(misfit, [0.8 * known.mass_1, 0.8 * known.mass_2]).x)
+
+
+def _transfer(arm: PaperArm, joint: int) -> Array:
+    """a1, a0, b11, b10, b21, b20 of one joint of the first-order plant, (25) to (28)."""
+    B = np.linalg.inv(arm.mass_matrix())
+    A = -B @ arm.stiffness()
+    adjugate = np.array([[-A[1, 1], A[0, 1]], [A[1, 0], -A[0, 0]]]) @ B
+    b = ((B[joint, i], adjugate[joint, i]) for i in range(2))
+    return np.array([-np.trace(A), np.linalg.det(A), *next(b), *next(b)])

@@ -1,0 +1,1 @@
+"""Recordings, settled periods, segments, and their Fourier lines."""

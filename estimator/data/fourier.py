@@ -1,0 +1,70 @@
+"""A settled period as its Fourier lines: noise, cut-off, exact derivatives, the held command."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.estimator.arrays import Array
+
+Lines = npt.NDArray[np.complex128]
+
+SIGNAL_OVER_NOISE = 4.0  # in power, for a band of lines to count as signal
+BAND = 8  # lines looked at together
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Angles, velocities and accelerations of one period (joints, samples) [rad, rad/s, rad/s^2]."""
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+
+def lines_of(signal: Array) -> Lines:
+    """Coefficients (..., samples // 2 + 1) of one period (..., samples), the sum of c_k exp(j k w0 t)."""
+    return np.asarray(np.fft.rfft(signal, axis=-1) / signal.shape[-1])
+
+
+def noise_power(lines: Lines) -> Array:
+    """Mean |c|^2 of the noise in one line (joints,), from the upper half of the lines, where nothing was
+    excited.
+
+    The median of an exponentially distributed power is log 2 of its mean, and shrugs off single lines. Odd and even
+    lines are looked at apart: rounding of a motion whose second half mirrors its first has no even lines at all.
+    """
+    upper = np.abs(lines[:, lines.shape[1] // 2 :]) ** 2
+    medians = [np.median(upper[:, first::2], axis=1) for first in (0, 1)]
+    noise: Array = np.mean(medians, axis=0) / np.log(2.0)
+    return noise
+
+
+def cut_off(lines: Lines) -> int:
+    """The highest harmonic that is still signal on some joint, by the mean power of bands of lines."""
+    count = (lines.shape[1] - 1) // BAND
+    power = np.abs(lines[:, 1 : 1 + count * BAND]) ** 2
+    bands = power.reshape(lines.shape[0], count, BAND).mean(axis=2)
+    signal = np.nonzero((bands > SIGNAL_OVER_NOISE * noise_power(lines)[:, None]).any(axis=0))[0]
+    return int(BAND * (signal[-1] + 1)) if signal.size else 1
+
+
+def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) -> Motion:
+    """The motion that the lines up to `harmonics` make, differentiated exactly by j k w0."""
+    kept = np.zeros_like(lines)
+    kept[:, : harmonics + 1] = lines[:, : harmonics + 1]
+    turn = 1j * fundamental * np.arange(lines.shape[1])
+    waves = (np.fft.irfft(samples * kept * turn**order, samples, axis=-1) for order in range(3))
+    return Motion(*waves)
+
+
+def held_lines(command: Array, rate: float, delay: float) -> Lines:
+    """Lines of a command (joints, samples) that is held from each sample to the next and comes `delay` [s]
+    late.
+
+    Holding scales line k by sinc(f_k / rate) and delays it by half a sample. `delay` may be negative.
+    """
+    lines = lines_of(command)
+    frequency = np.arange(lines.shape[-1]) * rate / command.shape[-1]
+    held = np.sinc(frequency / rate) * np.exp(-2j * np.pi * frequency * (0.5 / rate + delay))
+    return np.asarray(lines * held)

@@ -1,0 +1,45 @@
+"""Whether an arm has settled: how far successive periods of a periodic experiment still differ."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.errors import ShapeError
+
+
+@dataclass(frozen=True)
+class Settling:
+    """RMS difference of each period from the one before."""
+
+    difference: Array
+    """(periods - 1, joints) [rad]."""
+    relative: Array
+    """The same over the RMS of the later period's motion about its mean (periods - 1, joints)."""
+
+
+def period_difference(position: Array) -> Settling:
+    """Compare each period of `position` (periods, joints, samples) [rad] with the one before.
+
+    Missing samples are NaN and left out of both; a joint with nothing left to compare counts as infinitely far. Raises
+    ShapeError for fewer than two periods.
+    """
+    if position.ndim != 3 or position.shape[0] < 2:
+        raise ShapeError(f"position is {position.shape}: it must be (periods, joints, samples), two periods or more")
+    difference = _rms(np.diff(position, axis=0))
+    later = position[1:]
+    seen = np.isfinite(later)
+    mean = np.where(seen, later, 0.0).sum(axis=2) / np.maximum(seen.sum(axis=2), 1)
+    motion = _rms(later - mean[:, :, None])
+    still = np.where(difference > 0.0, np.inf, 0.0)
+    relative = np.divide(difference, motion, out=still, where=(motion > 0.0) & np.isfinite(motion))
+    return Settling(difference, relative)
+
+
+def _rms(values: Array) -> Array:
+    """Over the last axis, NaN left out; infinite where nothing is left."""
+    seen = np.isfinite(values)
+    count = seen.sum(axis=-1)
+    total = np.sum(np.where(seen, values, 0.0) ** 2, axis=-1)
+    nothing = np.full(total.shape, np.inf)
+    return np.asarray(np.sqrt(np.divide(total, count, out=nothing, where=count > 0)))

@@ -1,0 +1,182 @@
+"""A recording of any motion: torque and position at the times they were really taken."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.errors import RecordingError, ShapeError, StandstillError
+
+Between = Literal["held", "linear"]
+
+FEWEST_SAMPLES = 32
+LEAST_VALID = 0.5  # of a joint's samples
+LEAST_MOTION = 4.0  # encoder steps from end to end
+MOST_GAP = 0.2  # s between samples: what moves in between is not seen
+MOST_ANGLE = 200.0  # rad: more is degrees or encoder steps
+MOST_SPEED = 500.0  # rad/s between samples, likewise
+MOST_TORQUE = 1e4  # N m
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Torque and position of an arm in any motion: ramps, swing-ups, what another tool recorded.
+
+    Positions that are missing are NaN. Raises ShapeError for arrays that do not fit together, RecordingError
+    for times that do not ascend, values that are not finite, gaps and values that no arm in SI units has,
+    StandstillError for a joint that moved by hardly more than its encoder's step.
+    """
+
+    time: Array
+    """When the positions were taken (samples,) [s]; the intervals need not be equal."""
+    torque: Array
+    """Motor torque (joints, samples) [N m]."""
+    position: Array
+    """Joint angles (joints, samples) [rad]."""
+    position_step: Array
+    """Quantisation of each joint's angle (joints,) [rad]."""
+    between: Between = "linear"
+    """Torque between its samples: `held` for a command, `linear` for a measurement."""
+    command_to_sample: float = 0.0
+    """Value k of the torque holds from this long before position k [s]."""
+
+    def __post_init__(self) -> None:
+        _check_shapes(self)
+        _check_times(self)
+        _check_values(self)
+        _check_motion(self)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return int(self.position.shape[0])
+
+    @property
+    def interval(self) -> float:
+        """Median time between samples [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    @property
+    def noise(self) -> Array:
+        """Standard deviation of one position as its rounding leaves it (joints,) [rad]."""
+        noise: Array = self.position_step / np.sqrt(12.0)
+        return noise
+
+    def filled(self) -> Array:
+        """Positions (joints, samples) with the missing ones interpolated between their neighbours [rad]."""
+        position = self.position.copy()
+        for row in position:
+            valid = np.isfinite(row)
+            if not valid.all():
+                row[~valid] = np.interp(self.time[~valid], self.time[valid], row[valid])
+        return position
+
+    def mean_torque(self, edges: Array, delay: float) -> Array:
+        """Mean torque between neighbouring `edges` (n,) [s], `delay` [s] late (joints, n - 1) [N m]."""
+        at = self.time - self.command_to_sample
+        wanted = edges - delay
+        rise = np.diff(at)
+        means = np.empty((self.joints, len(edges) - 1))
+        for joint, torque in enumerate(self.torque):
+            if self.between == "held":
+                total = np.concatenate(([0.0], np.cumsum(torque[:-1] * rise)))
+                k = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, at.size - 1)
+                integral = total[k] + torque[k] * (wanted - at[k])
+            else:
+                total = np.concatenate(([0.0], np.cumsum(0.5 * (torque[:-1] + torque[1:]) * rise)))
+                k = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, at.size - 2)
+                late = wanted - at[k]
+                slope = (torque[k + 1] - torque[k]) / rise[k] * ((wanted >= at[0]) & (wanted <= at[-1]))
+                # Past either end the last value stands.
+                start = np.where(wanted > at[-1], total[-1] - torque[-1] * rise[-1], total[k])
+                level = np.where(wanted > at[-1], torque[-1], torque[k])
+                integral = start + late * (level + 0.5 * slope * late)
+            means[joint] = np.diff(integral) / np.diff(edges)
+        return means
+
+
+def _check_shapes(recording: Recording) -> None:
+    position, torque, time = recording.position, recording.torque, recording.time
+    if position.ndim != 2 or torque.shape != position.shape or time.shape != position.shape[1:]:
+        raise ShapeError(
+            f"time {time.shape}, torque {torque.shape} and position {position.shape} must be (samples,) and twice "
+            "(joints, samples)"
+        )
+    if recording.position_step.shape != position.shape[:1]:
+        raise ShapeError(f"position_step is {recording.position_step.shape}, it must be {position.shape[:1]}")
+    if time.size < FEWEST_SAMPLES:
+        raise RecordingError(f"the recording has {time.size} samples, at least {FEWEST_SAMPLES} are needed")
+
+
+def _check_times(recording: Recording) -> None:
+    time = recording.time
+    bad = np.nonzero(~np.isfinite(time))[0]
+    if bad.size:
+        raise RecordingError(f"time of sample {bad[0] + 1} is not finite: leave out the samples without a time")
+    step = np.diff(time)
+    if np.any(step <= 0.0):
+        k = int(np.argmax(step <= 0.0))
+        raise RecordingError(
+            f"time goes from {time[k]:g} to {time[k + 1]:g} s at sample {k + 2}: it must ascend; sort the samples "
+            "and leave out doubles"
+        )
+    if float(np.median(step)) > MOST_GAP:
+        raise RecordingError(
+            f"samples are {float(np.median(step)):.3g} s apart, at most {MOST_GAP:g} s are of use: is time in seconds?"
+        )
+    if step.max() > 5.0 * MOST_GAP:
+        k = int(np.argmax(step))
+        raise RecordingError(
+            f"{step[k]:.3g} s are missing after sample {k + 1} at {time[k]:g} s: cut the recording there into two"
+        )
+
+
+def _check_values(recording: Recording) -> None:
+    if not (np.all(recording.position_step > 0.0) and np.isfinite(recording.command_to_sample)):
+        raise RecordingError(f"position_step {recording.position_step} rad must be positive, command_to_sample finite")
+    if not recording.torque.any():
+        raise RecordingError("all torques are 0: without torque only ratios of parameters can be found")
+    for joint in range(recording.joints):
+        torque, position = recording.torque[joint], recording.position[joint]
+        bad = np.nonzero(~np.isfinite(torque))[0]
+        if bad.size:
+            raise RecordingError(
+                f"joint {joint + 1}: {bad.size} torques are not finite, the first at sample {bad[0] + 1}, "
+                f"{recording.time[bad[0]]:g} s: cut the recording there or fill in what was commanded"
+            )
+        valid = np.isfinite(position)
+        if float(np.mean(valid)) < LEAST_VALID:
+            raise RecordingError(
+                f"joint {joint + 1}: {100 * float(np.mean(valid)):.0f} % of {position.size} positions are numbers, at "
+                f"least {100 * LEAST_VALID:.0f} % are needed"
+            )
+        most = float(np.abs(torque).max())
+        if most > MOST_TORQUE:
+            raise RecordingError(
+                f"joint {joint + 1}: torque reaches {most:.3g} N m, more than {MOST_TORQUE:g}: check its unit"
+            )
+
+
+def _check_motion(recording: Recording) -> None:
+    filled = recording.filled()
+    for joint, row in enumerate(filled):
+        swing = float(row.max() - row.min())
+        least = LEAST_MOTION * float(recording.position_step[joint])
+        if swing <= least:
+            raise StandstillError(
+                f"joint {joint + 1} moved by {swing:.2g} rad, at least {least:.2g} rad are needed: check the column "
+                "and its unit, or drive it harder"
+            )
+        speed = float(np.abs(np.diff(row) / np.diff(recording.time)).max())
+        if swing > MOST_ANGLE:
+            raise RecordingError(
+                f"joint {joint + 1} moves over {swing:.4g} rad, more than {MOST_ANGLE:g}: are these degrees or encoder "
+                "steps? Set the column's unit"
+            )
+        if speed > MOST_SPEED:
+            k = int(np.argmax(np.abs(np.diff(row) / np.diff(recording.time))))
+            raise RecordingError(
+                f"joint {joint + 1} jumps by {abs(row[k + 1] - row[k]):.3g} rad, {speed:.3g} rad/s, after sample "
+                f"{k + 1} at {recording.time[k]:g} s: unwrap the angle, or check its unit"
+            )

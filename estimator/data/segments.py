@@ -1,0 +1,139 @@
+"""A recording cut into segments on the grid of its simulation, each with its own start and its motor torque."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import RecordingError
+
+Indices = npt.NDArray[np.int64]
+
+LONGEST_STEP = 1e-3  # s
+FEWEST = 8  # samples in a segment
+START_WINDOW = 0.03  # s on either side, for the state that a segment starts from
+DIFFERENCE = 1e-7  # s
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A piece of a recording on the grid of its simulation."""
+
+    recording: int
+    """Which recording it is from."""
+    first: int
+    """Grid point of its start."""
+    steps: int
+    """Grid steps that it takes."""
+    index: Indices
+    """Grid points around each of its samples (samples, 4), counted from `first`."""
+    weight: Array
+    """Of each of them: cubic interpolation (samples, 4)."""
+    position: Array
+    """Measured (joints, samples) [rad]."""
+    state: Array
+    """Angles and velocities at its start by a local fit (2, joints) [rad, rad/s]."""
+
+    def at_samples(self, grid: Array) -> Array:
+        """Values (joints, grid points, ...) interpolated at the times of the samples (joints, samples, ...)."""
+        weight = self.weight.reshape(*self.weight.shape, *(1,) * (grid.ndim - 2))
+        values = np.zeros((grid.shape[0], len(self.index), *grid.shape[2:]))
+        for n in range(4):
+            values += grid[:, self.index[:, n]] * weight[:, n]
+        return values
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A recording's times as equal simulation steps."""
+
+    start: float
+    """[s]."""
+    step: float
+    """[s]."""
+    edges: Array
+    """(steps + 1,) [s]."""
+
+    @classmethod
+    def of(cls, recording: Recording) -> "Grid":
+        """From the first sample to the last, in steps of at most LONGEST_STEP."""
+        span = float(recording.time[-1] - recording.time[0])
+        count = int(np.ceil(span / LONGEST_STEP))
+        step = span / count
+        return cls(float(recording.time[0]), step, recording.time[0] + step * np.arange(count + 1))
+
+
+def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Segment]:
+    """Cut a recording into equal pieces of about `length` [s]; `number` says which recording it is.
+
+    Raises RecordingError when no piece holds FEWEST samples.
+    """
+    steps = len(grid.edges) - 1
+    pieces = max(1, round(steps * grid.step / length))
+    edges = np.round(np.linspace(0, steps, pieces + 1)).astype(np.int64)
+    place = (recording.time - grid.start) / grid.step
+    segments = []
+    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        inside = (place >= first - 1e-6) & (place < last) if last < steps else (place >= first - 1e-6)
+        if inside.sum() < FEWEST or not np.isfinite(recording.position[:, inside]).any(axis=1).all():
+            continue
+        index, weight = _cubic(place[inside] - first, last - first)
+        state = _state_at(recording, grid.start + grid.step * first)
+        segments.append(Segment(number, first, last - first, index, weight, recording.position[:, inside], state))
+    if not segments:
+        raise RecordingError(
+            f"no piece of {length:g} s holds {FEWEST} samples: record faster, or choose longer segments"
+        )
+    return segments
+
+
+def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
+    """Mean motor torque over each grid step (joints, steps) [N m], `delay` [s] late and lagging by `lag` [s]."""
+    torque = recording.mean_torque(grid.edges, delay)
+    if lag <= 0.0:
+        return torque
+    # lag y' = u - y over a step of constant u: exact, and so is the step's mean of y.
+    a = np.exp(-grid.step / lag)
+    start = torque[:, :1]
+    end, _ = lfilter([1.0 - a], [1.0, -a], torque, axis=1, zi=a * start)
+    before = np.concatenate((start, end[:, :-1]), axis=1)
+    mean: Array = torque - lag / grid.step * (end - before)
+    return mean
+
+
+def grid_torque_slopes(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
+    """Derivatives of `grid_torque` by delay and by lag (2, joints, steps) [N m/s], by central differences."""
+
+    def at(delay: float, lag: float) -> Array:
+        return grid_torque(recording, grid, delay, lag)
+
+    late = (at(delay + DIFFERENCE, lag) - at(delay - DIFFERENCE, lag)) / (2.0 * DIFFERENCE)
+    if lag <= 0.0:
+        return np.stack((late, np.zeros_like(late)))
+    change = min(DIFFERENCE, 0.1 * lag)
+    return np.stack((late, (at(delay, lag + change) - at(delay, lag - change)) / (2.0 * change)))
+
+
+def _cubic(place: Array, steps: int) -> tuple[Indices, Array]:
+    """Grid points around each place (samples, 4) and the weights of the cubic through them."""
+    first = np.clip(np.floor(place).astype(np.int64) - 1, 0, steps - 3)
+    index = first[:, None] + np.arange(4)
+    u = place - first
+    weight = np.ones((place.size, 4))
+    for i in range(4):
+        for j in range(4):
+            if i != j:
+                weight[:, i] *= (u - j) / (i - j)
+    return index, weight
+
+
+def _state_at(recording: Recording, time: float) -> Array:
+    """Angles and velocities (2, joints) at `time` by a cubic through the samples around it."""
+    window = max(START_WINDOW, 5.0 * recording.interval)
+    near = np.abs(recording.time - time) <= window
+    filled = recording.filled()[:, near]
+    cubic = np.polynomial.polynomial.polyfit(recording.time[near] - time, filled.T, 3)
+    return np.asarray(cubic[:2])

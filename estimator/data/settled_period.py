@@ -1,0 +1,151 @@
+"""One settled period: what the estimator works on."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from hil.estimator.arrays import Array, Mask
+from hil.estimator.errors import RecordingError, ShapeError, StandstillError
+from hil.estimator.simulation.closed_loop import Stabilised
+
+FEWEST_SAMPLES = 32
+SPIKE = 8.0
+LEAST_VALID = 0.5  # of a joint's samples
+LEAST_MOTION = 4.0  # encoder steps from end to end
+MOST_GAP = 4.0  # from the last sample to the first, in largest moves between neighbours
+
+
+@dataclass(frozen=True)
+class SettledPeriod:
+    """One period of a settled periodic experiment, or the mean of several, sampled without gaps in time.
+
+    Command k takes effect at the motors and holds until command k + 1; sample k is taken `command_to_sample`
+    later. Before the first command stands the last, as in every period before. Missing samples are NaN.
+
+    Raises ShapeError for arrays that do not fit together, RecordingError for values that are not finite,
+    for a rate or position step that is not positive and for a period with too few samples, StandstillError
+    for a joint that moved by hardly more than its encoder's step.
+    """
+
+    rate: float
+    """Samples per second."""
+    torque: Array
+    """Commanded motor torque (joints, samples), each held until the next [N m]."""
+    position: Array
+    """Joint angles (joints, samples) [rad]."""
+    command_to_sample: float
+    """From a command's effect at the motor to the sample of the same index [s]."""
+    position_step: Array
+    """Quantisation of each joint's angle (joints,) [rad]."""
+    periods: int = 1
+    """Settled periods averaged."""
+    position_std: Array | None = None
+    """Standard deviation of the mean angles by the scatter between periods (joints,) [rad], if known."""
+    stabiliser: Stabilised | None = None
+    """Where a software stabiliser gave part of `torque`: without it a simulated arm may not stay with the real one."""
+    valid: Mask = field(init=False)
+    """Where a sample was received (joints, samples)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "valid", np.isfinite(self.position))
+        _check_shapes(self)
+        _check_values(self)
+        _check_motion(self)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return int(self.position.shape[0])
+
+    @property
+    def samples(self) -> int:
+        """Samples in the period."""
+        return int(self.position.shape[1])
+
+    @property
+    def fundamental(self) -> float:
+        """Angular frequency of the period [rad/s]."""
+        return 2.0 * np.pi * self.rate / self.samples
+
+    @property
+    def noise(self) -> Array:
+        """Standard deviation of one sample's error (joints,) [rad]: rounding, and scatter where known."""
+        scatter = 0.0 if self.position_std is None else self.position_std
+        noise: Array = np.sqrt(self.position_step**2 / 12.0 + np.square(scatter))
+        return noise
+
+    def filled(self) -> Array:
+        """Positions (joints, samples) with the missing ones interpolated between their neighbours [rad]."""
+        position = self.position.copy()
+        index = np.arange(self.samples)
+        for row, valid in zip(position, self.valid, strict=True):
+            if not valid.all():
+                row[~valid] = np.interp(index[~valid], index[valid], row[valid], period=self.samples)
+        return position
+
+
+def without_spikes(period: SettledPeriod) -> SettledPeriod:
+    """The same period with single wild readings (a bit lost on the bus, say) marked as missing.
+
+    A reading is wild when it is further than SPIKE encoder steps, and than SPIKE times what is usual, from the
+    median of itself and its two neighbours on either side.
+    """
+    position = period.filled()
+    away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))
+    usual = np.maximum(1.5 * np.median(away, axis=1), np.maximum(period.position_step, period.noise))
+    wild = (away > SPIKE * usual[:, None]) & period.valid
+    if not wild.any():
+        return period
+    return replace(period, position=np.where(wild, np.nan, period.position))
+
+
+def _check_shapes(period: SettledPeriod) -> None:
+    if period.position.ndim != 2 or period.torque.shape != period.position.shape:
+        raise ShapeError(f"torque {period.torque.shape} and position {period.position.shape} must be (joints, samples)")
+    per_joint = (period.position.shape[0],)
+    if period.position_step.shape != per_joint:
+        raise ShapeError(f"position_step is {period.position_step.shape}, it must be {per_joint}: one per joint")
+    if period.position_std is not None and period.position_std.shape != per_joint:
+        raise ShapeError(f"position_std is {period.position_std.shape}, it must be {per_joint}: one per joint")
+
+
+def _check_values(period: SettledPeriod) -> None:
+    if not (period.rate > 0.0 and np.isfinite(period.command_to_sample) and np.all(period.position_step > 0.0)):
+        raise RecordingError(
+            f"rate {period.rate:g} 1/s and position_step {period.position_step} rad must be positive, "
+            f"command_to_sample {period.command_to_sample:g} s finite"
+        )
+    if period.samples < FEWEST_SAMPLES:
+        raise RecordingError(f"the period has {period.samples} samples, at least {FEWEST_SAMPLES} are needed")
+    for joint in range(period.joints):
+        bad = int(np.sum(~np.isfinite(period.torque[joint])))
+        if bad:
+            raise RecordingError(f"joint {joint + 1}: {bad} commanded torques are not finite")
+        received = float(np.mean(period.valid[joint]))
+        if received < LEAST_VALID:
+            raise RecordingError(
+                f"joint {joint + 1}: {100 * received:.0f} % of {period.samples} samples were received, at "
+                f"least {100 * LEAST_VALID:.0f} % are needed: look at the bus before you record again"
+            )
+
+
+def _check_motion(period: SettledPeriod) -> None:
+    for joint in range(period.joints):
+        swing = float(np.nanmax(period.position[joint]) - np.nanmin(period.position[joint]))
+        least = LEAST_MOTION * float(period.position_step[joint])
+        if swing <= least:
+            raise StandstillError(
+                f"joint {joint + 1} moved by {swing:.2g} rad, at least {least:.2g} rad are needed: "
+                "friction held it; raise its peak torque"
+            )
+    filled = period.filled()
+    for joint, row in enumerate(filled):
+        gap = abs(float(row[0] - row[-1]))
+        most = MOST_GAP * float(np.abs(np.diff(row)).max())
+        if gap > most:
+            raise RecordingError(
+                f"joint {joint + 1} ends the period {gap:.3g} rad from where it began, more than {most:.3g} "
+                f"rad, {MOST_GAP:g} times its largest move in one sample: it turned over or has not settled; "
+                "lower the peak torque or wait longer"
+            )

@@ -1,0 +1,1 @@
+"""Multisines, and multisines designed for the worst relative standard error."""

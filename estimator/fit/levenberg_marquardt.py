@@ -1,0 +1,142 @@
+"""Nonlinear least squares by Levenberg-Marquardt on normal equations, so that no Jacobian is ever whole."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.errors import ConvergenceError
+
+LONGEST = 2.0  # change of one coordinate in one step
+ITERATIONS = 60
+UNFINISHED = 1e-2
+FIRST_DAMPING = 1e-3  # of the squared length of each coordinate's column
+LEAST_DAMPING = 1e-9
+MOST_DAMPING = 1e3
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """A sum of squares |r|^2 at one point and how it changes there."""
+
+    cost: float
+    """The sum."""
+    normal: Array
+    """J'J of the Jacobian J of r (coordinates, coordinates)."""
+    gradient: Array
+    """J'r (coordinates,)."""
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where the sum of squares is least."""
+
+    x: Array
+    """Coordinates (coordinates,)."""
+    at: Quadratic
+    """The sum of squares there."""
+    iterations: int
+    """Points at which it was evaluated."""
+
+
+Evaluate = Callable[[Array], Quadratic]
+Move = Callable[[Array, Array], Array]
+Limits = Callable[[Array], tuple[Array, Array]]
+
+
+def alike(x: Array) -> tuple[Array, Array]:
+    """No coordinate changes by more than LONGEST in one step."""
+    return np.full(x.size, -LONGEST), np.full(x.size, LONGEST)
+
+
+def minimise(
+    evaluate: Evaluate,
+    start: Array,
+    enough: float,
+    damping: float = FIRST_DAMPING,
+    at: Quadratic | None = None,
+    *,
+    move: Move = np.add,
+    limits: Limits = alike,
+) -> Minimum:
+    """Minimise a sum of squares from `start`, coordinates of the size of 1; `at` is the sum there, if it is known.
+
+    `move` takes coordinates and a step to where the step leads; `limits` gives the least and the most that each
+    coordinate may change in a step from there.
+
+    Ends when a step lowers the sum, or would, by less than `enough` of it; a sum that is not finite counts as
+    too large. Damped steps are short along what is hardly seen and end too early there: near the end, `damping`
+    should start at LEAST_DAMPING. Raises ConvergenceError when `start` gives no finite sum, or when the sum still
+    falls by more than UNFINISHED of it after ITERATIONS.
+    """
+    x, here = start, evaluate(start) if at is None else at
+    if not np.isfinite(here.cost):
+        raise ConvergenceError("the starting values give no finite motion: check the torque and the period's units")
+    evaluations = int(at is None)
+    gained = np.inf
+    for _ in range(ITERATIONS):
+        found, damping, tried = _improve(evaluate, x, here, damping, enough, move, limits(x))
+        evaluations += tried
+        if found is None:
+            return Minimum(x, here, evaluations)
+        gained = here.cost - found[1].cost
+        x, here = found
+        if gained < enough * here.cost:
+            return Minimum(x, here, evaluations)
+    if gained < UNFINISHED * here.cost:
+        return Minimum(x, here, evaluations)
+    raise ConvergenceError(
+        f"after {ITERATIONS} iterations the sum of squares, {here.cost:.4g}, still falls by {gained:.2g} in each: "
+        "try a simpler model or data with more motion"
+    )
+
+
+def _improve(
+    evaluate: Evaluate,
+    x: Array,
+    at: Quadratic,
+    damping: float,
+    enough: float,
+    move: Move,
+    limits: tuple[Array, Array],
+) -> tuple[tuple[Array, Quadratic] | None, float, int]:
+    """A better point, or None when there is none in sight; the next step's damping; and the points tried."""
+    tried = 0
+    while damping < MOST_DAMPING:
+        step = _step(at.normal, at.gradient, damping, *limits)
+        foreseen = -float(step @ (2.0 * at.gradient + at.normal @ step))
+        if foreseen < enough * at.cost:
+            break
+        moved = move(x, step)
+        there = evaluate(moved)
+        tried += 1
+        gained = at.cost - there.cost
+        if gained > 0.0:
+            return (moved, there), max(LEAST_DAMPING, damping * (0.1 if gained > 0.5 * foreseen else 1.0)), tried
+        damping = max(10.0 * damping, FIRST_DAMPING)
+    return None, damping, tried
+
+
+def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
+    """The damped step, every coordinate moving by no less than `least` and no more than `most`.
+
+    A coordinate that would is held there and the others solved again: scaling the whole step would let one
+    that is all but flat, such as the logarithm of something that is zero, stop the rest.
+    """
+    scale = np.sqrt(np.diag(normal))
+    scale = np.maximum(scale, 1e-12 * scale.max())
+    matrix = normal / np.outer(scale, scale)
+    matrix[np.diag_indices_from(matrix)] += damping
+    slope = gradient / scale
+    step = np.zeros_like(gradient)
+    free = np.ones(gradient.size, dtype=np.bool_)
+    while free.any():
+        held = np.where(free, 0.0, step * scale)
+        step[free] = -np.linalg.solve(matrix[free][:, free], (slope + matrix @ held)[free]) / scale[free]
+        too_long = free & ((step < least) | (step > most))
+        if not too_long.any():
+            break
+        step[too_long] = np.clip(step, least, most)[too_long]
+        free &= ~too_long
+    return step

@@ -1,0 +1,291 @@
+"""Multiple shooting: maximum likelihood on any recording, cut into segments whose starting states are unknown.
+
+Free simulation forgets nothing: on a long recording an error of the model, or the chaos of an arm that turns
+over, drowns what the parameters do. On a segment of a second it cannot. Bock, "Recent advances in parameter
+identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems
+(1983). The segments are not joined: noise that a rigid arm does not have, such as play and flexing, may
+move the state between them.
+
+Short segments come first: started far from the truth, they find it; longer ones then sharpen it. Where a segment then
+is off by more than usual, because a joint stuck in it, say, as no smooth friction sticks, it counts so much less: the
+errors of segments differ in size, and who counts them alike lets the worst understood of them decide.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.recording import Recording
+from hil.estimator.data.segments import Grid, Segment, cut, grid_torque, grid_torque_slopes
+from hil.estimator.errors import ConvergenceError
+from hil.estimator.fit.covariance import by_parameters
+from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.fit.segmented_least_squares import Segmented, minimise_segmented
+from hil.estimator.models.model import Model
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.arm import simulate
+from hil.estimator.simulation.presliding_sensitivity import sensitive
+
+WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a second of motion
+STARTING_WIDTH = 0.05  # rad/s
+STARTING_BEND = 0.003  # rad, of friction that yields before it slides
+RISES_FADE = (0.2, 2.0)  # rad/s
+START = {"stribeck_rise": 0.2, "load": 0.02, "delay": 0.0, "lag": 1e-3}
+SHORT = 0.25  # of the segments' length, to begin with
+COARSE = 1e-3
+FINE = 3e-5
+ANGLE_SCALE = 0.1  # rad
+REWEIGHTED = 2  # fits after the first
+ALL = slice(None)
+
+
+@dataclass(frozen=True)
+class ShootingEstimate:
+    """What multiple shooting found."""
+
+    model: Model
+    names: tuple[str, ...]
+    """`model.names`."""
+    units: tuple[str, ...]
+    value: Array
+    """(parameters,) [SI]."""
+    covariance: Array
+    """(parameters, parameters), robust against model error: see `Segmented.covariance`."""
+    zeros: Array
+    """True less measured angle of each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
+    zeros_std: Array
+    """Their standard errors, shaped alike."""
+    residual_rms: Array
+    """Measured less simulated position (joints,) [rad]."""
+    segments: int
+    segment_length: float
+    """[s]."""
+    iterations: int
+
+    @property
+    def std(self) -> Array:
+        """Standard errors (parameters,)."""
+        std: Array = np.sqrt(np.diag(self.covariance))
+        return std
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values by name [SI]."""
+        return dict(zip(self.names, self.value.tolist(), strict=True))
+
+
+class Shooting:
+    """The residuals of all segments by coordinates."""
+
+    def __init__(
+        self, recordings: Sequence[Recording], model: Model, length: float, *, zeros: bool = False, of: slice = ALL
+    ) -> None:
+        self._recordings = recordings
+        self.zeros = len(recordings) * model.joints if zeros else 0
+        self._grids = [Grid.of(recording) for recording in recordings]
+        self.segments = [
+            segment
+            for number, (recording, grid) in enumerate(zip(recordings, self._grids, strict=True))
+            for segment in cut(recording, number, grid, length)[of]
+        ]
+        self.noise = np.max([recording.noise for recording in recordings], axis=0)[:, None]
+        velocity = float(np.sqrt(np.mean([np.mean(segment.state[1] ** 2) for segment in self.segments]))) + 0.1
+        torque = float(np.sqrt(np.mean([np.mean(recording.torque**2) for recording in recordings])))
+        self.state_scale = np.repeat([ANGLE_SCALE, velocity], model.joints).reshape(2, -1)
+        self._scales = (torque, velocity)
+        self._model = model
+        self._trust = np.ones((len(self.segments), model.joints))
+        self._driven: dict[tuple[float, float], list[tuple[Array, Array]]] = {}
+
+    def coordinates(self, inertia: float) -> Coordinates:
+        """The parameters' coordinates; `inertia` [kg m^2] of the arm as a scale."""
+        return Coordinates(self._model.names, scales_of(self._model.names, *self._scales, inertia), WIDTH_FLOOR)
+
+    def position(self, segment: Segment, physics: Physics, state: Array) -> Array:
+        """Simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
+        torque = self._torque(segment, physics)[0]
+        step = self._grids[segment.recording].step
+        grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step)
+        return segment.at_samples(np.concatenate((grid, end[:1].T), axis=1))
+
+    def residual(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> Array:
+        """Simulated less measured positions of one segment in units of their noise (rows,)."""
+        segment = self.segments[number]
+        position = self.position(
+            segment, self._physics(coordinates, segment, shared), own.reshape(2, -1) * self.state_scale
+        )
+        return self._rows(number, position)
+
+    def derivative(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> tuple[Array, Array]:
+        """The same, and its derivatives by the shared coordinates, then by the segment's own (rows, all)."""
+        segment = self.segments[number]
+        physics = self._physics(coordinates, segment, shared)
+        joints = self._model.joints
+        zeros = tuple(f"zero_{joint + 1}" for joint in range(joints) if self.zeros)
+        state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
+        motion = sensitive(physics)(
+            physics,
+            own.reshape(2, -1) * self.state_scale,
+            (*coordinates.names, *zeros, *state),
+            self._grids[segment.recording].step,
+        )
+        # The state after the last step is the sample before one more, of whatever torque.
+        torque, slopes = (
+            np.pad(each, ((0, 0),) * (each.ndim - 1) + ((0, 1),)) for each in self._torque(segment, physics)
+        )
+        grid, change = motion.advance(torque[:, :, None], slopes[:, :, :, None])
+        by_value = segment.at_samples(change)
+        count = len(coordinates.names)
+        columns = np.zeros((*by_value.shape[:2], shared.size + own.size))
+        columns[:, :, :count] = by_value[:, :, :count] @ coordinates.slopes(shared[:count])
+        columns[:, :, self._zeros_of(segment)] = by_value[:, :, count : count + len(zeros)] * ANGLE_SCALE
+        columns[:, :, shared.size :] = by_value[:, :, count + len(zeros) :] * self.state_scale.reshape(-1)
+        known = np.isfinite(segment.position)[:, :, None]
+        columns = np.where(known, columns / self._noise(number)[:, :, None], 0.0)
+        return self._rows(number, segment.at_samples(grid)), columns.reshape(-1, columns.shape[2])
+
+    def errors(self, coordinates: Coordinates, found: Segmented) -> Array:
+        """RMS of simulated less measured position, segment by segment (segments, joints) [rad]."""
+        rms = np.empty_like(self._trust)
+        for number, (segment, own) in enumerate(zip(self.segments, found.own, strict=True)):
+            rows = self.residual(coordinates, number, found.shared, own).reshape(self._model.joints, -1)
+            rms[number] = np.sqrt(np.sum((rows * self._noise(number)) ** 2, axis=1) / _samples(segment))
+        return rms
+
+    def weigh_down(self, errors: Array) -> None:
+        """Trust the segments whose `errors`, as of the method of this name, are larger than usual so much less."""
+        usual = np.median(errors, axis=0)
+        self._trust = np.minimum(1.0, usual / np.maximum(errors, 1e-12))
+
+    def start(self) -> Array:
+        """Each segment's own coordinates as its measured positions suggest (segments, 2 joints)."""
+        return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
+
+    def _zeros_of(self, segment: Segment) -> slice:
+        """Where a segment's encoder zeros stand among the shared coordinates; nowhere if they are known."""
+        count = len(self._model.names)
+        if not self.zeros:
+            return slice(count, count)
+        first = count + segment.recording * self._model.joints
+        return slice(first, first + self._model.joints)
+
+    def _physics(self, coordinates: Coordinates, segment: Segment, shared: Array) -> Physics:
+        count = len(coordinates.names)
+        values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
+        zeros = ANGLE_SCALE * shared[self._zeros_of(segment)]
+        return Physics.of(values | {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)})
+
+    def _noise(self, number: int) -> Array:
+        """How far a segment's samples are taken to be off (joints, 1) [rad]."""
+        noise: Array = self.noise / self._trust[number][:, None]
+        return noise
+
+    def _rows(self, number: int, position: Array) -> Array:
+        measured = self.segments[number].position
+        difference = np.where(np.isfinite(measured), position - measured, 0.0)
+        return np.asarray((difference / self._noise(number)).reshape(-1))
+
+    def _torque(self, segment: Segment, physics: Physics) -> tuple[Array, Array]:
+        """Motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
+        key = (physics.delay, physics.lag)
+        driven = self._driven.get(key)
+        if driven is None:
+            pairs = list(zip(self._recordings, self._grids, strict=True))
+            driven = [(grid_torque(*pair, *key), grid_torque_slopes(*pair, *key)) for pair in pairs]
+            if len(self._driven) > 8:
+                self._driven.clear()
+            self._driven[key] = driven
+        torque, slopes = driven[segment.recording]
+        part = slice(segment.first, segment.first + segment.steps)
+        return torque[:, part], slopes[:, :, part]
+
+
+def estimate_by_shooting(
+    recordings: Sequence[Recording],
+    model: Model,
+    start: Array,
+    *,
+    length: float = 1.0,
+    zeros: bool = False,
+    of: slice = ALL,
+) -> ShootingEstimate:
+    """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
+
+    `start`: base parameters (base parameters,) [SI], for instance of `hil.estimator.baselines.idim`. The same
+    recordings give the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one
+    offset a joint and recording, as of servos whose zero is set at every start; with gravity they are seen, without
+    they are not. `of` takes some of each recording's segments and leaves the others for a check. Raises RecordingError
+    when nothing is long enough, ConvergenceError.
+    """
+    short, problem = (Shooting(recordings, model, part * length, zeros=zeros, of=of) for part in (SHORT, 1.0))
+    coordinates = problem.coordinates(max(float(start[0]), 1e-6))
+    # Friction's rise has local minima: several starts, and the best end is kept.
+    ends: list[Segmented] = []
+    lost: list[ConvergenceError] = []
+    for x in _starts(problem, coordinates, model, start):
+        try:
+            near = _fit(short, coordinates, x, short.start(), COARSE)
+            ends.append(_fit(problem, coordinates, near.shared, problem.start(), FINE))
+        except ConvergenceError as error:
+            lost.append(error)
+    if not ends:
+        raise lost[0]
+    found = min(ends, key=lambda end: end.cost)
+    for _ in range(REWEIGHTED):
+        problem.weigh_down(problem.errors(coordinates, found))
+        found = _fit(problem, coordinates, found.shared, found.own, FINE)
+    return _estimate(problem, coordinates, model, found, length)
+
+
+def _fit(problem: Shooting, coordinates: Coordinates, shared: Array, own: Array, enough: float) -> Segmented:
+    residual, derivative = partial(problem.residual, coordinates), partial(problem.derivative, coordinates)
+    return minimise_segmented(residual, derivative, shared, own, enough)
+
+
+def _estimate(
+    problem: Shooting, coordinates: Coordinates, model: Model, found: Segmented, length: float
+) -> ShootingEstimate:
+    count = len(model.names)
+    slope = np.eye(found.shared.size) * ANGLE_SCALE
+    slope[:count, :count] = coordinates.slopes(found.shared[:count])
+    value = ANGLE_SCALE * found.shared
+    value[:count] = coordinates.values(found.shared[:count])
+    recording = np.array([segment.recording for segment in problem.segments])
+    covariance = by_parameters(found.covariance(recording, problem.zeros), slope, value)
+    samples = np.stack([_samples(segment) for segment in problem.segments])
+    squares = problem.errors(coordinates, found) ** 2 * samples
+    return ShootingEstimate(
+        model,
+        model.names,
+        model.units,
+        value[:count],
+        covariance[:count, :count],
+        value[count:].reshape(-1, model.joints),
+        np.sqrt(np.diag(covariance)[count:]).reshape(-1, model.joints),
+        np.sqrt(squares.sum(axis=0) / samples.sum(axis=0)),
+        len(problem.segments),
+        length,
+        found.iterations,
+    )
+
+
+def _samples(segment: Segment) -> Array:
+    """Samples that hold a position (joints,)."""
+    return np.asarray(np.isfinite(segment.position).sum(axis=1), dtype=np.float64)
+
+
+def _starts(problem: Shooting, coordinates: Coordinates, model: Model, base: Array) -> Iterator[Array]:
+    """Shared coordinates to start from: `base`, and what it does not say of friction."""
+    known = dict(zip(model.base_names, base.tolist(), strict=True))
+    known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), STARTING_WIDTH)
+    for joint in range(1, model.joints + 1):
+        known[f"presliding_stiffness_{joint}"] = abs(known[f"coulomb_{joint}"]) / STARTING_BEND
+        known[f"presliding_damping_{joint}"] = abs(known[f"viscous_{joint}"])
+    rising = "stribeck_velocity_1" in model.names
+    for velocity in RISES_FADE if rising else RISES_FADE[:1]:
+        unknown = START | {"stribeck_velocity": velocity}
+        value = np.array([known.get(name, unknown.get(name.rstrip("_12"), 0.0)) for name in model.names])
+        yield np.concatenate((coordinates.coordinates(value), np.zeros(problem.zeros)))

@@ -1,0 +1,43 @@
+"""The products of least squares, compiled, so that no BLAS spreads them over threads of its own.
+
+Those threads spin: beside ours, or on a busy machine, they make small products ten times slower, and the
+last digits would depend on their number.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+from hil.estimator.arrays import Array
+
+
+def normal_equations(jacobian: Array, residual: Array, weight: Array | None = None) -> tuple[Array, Array]:
+    """J'WJ (columns, columns) and J'Wr (columns,) of J (rows, columns), r (rows,) and the diagonal of W (rows,)."""
+    columns = jacobian.shape[1]
+    product = np.zeros((columns, columns + 1))
+    both = np.ascontiguousarray(jacobian)
+    _multiply(both, residual, np.ones(len(residual)) if weight is None else weight, product)
+    return product[:, :-1], product[:, -1]
+
+
+def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:
+    rows, columns = J.shape
+    # Four rows at once: a quarter of the sums to fetch and put back.
+    for first in range(0, rows, 4):
+        i, j, k, m = first, min(first + 1, rows - 1), min(first + 2, rows - 1), min(first + 3, rows - 1)
+        w = weight[i]
+        x = weight[j] if first + 1 < rows else 0.0
+        y = weight[k] if first + 2 < rows else 0.0
+        z = weight[m] if first + 3 < rows else 0.0
+        for a in range(columns):
+            p, q, s, t = w * J[i, a], x * J[j, a], y * J[k, a], z * J[m, a]
+            for b in range(columns):
+                product[a, b] += p * J[i, b] + q * J[j, b] + s * J[k, b] + t * J[m, b]
+            product[a, columns] += p * r[i] + q * r[j] + s * r[k] + t * r[m]
+
+
+_multiply: Callable[[Array, Array, Array, Array], None] = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"contract"}
+)(_loop)

@@ -1,0 +1,128 @@
+"""What the likelihood minimises: the weighed squares of measured less simulated positions of several runs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.fit.covariance import Scatter
+from hil.estimator.fit.levenberg_marquardt import FIRST_DAMPING, Minimum, Quadratic, alike, minimise
+from hil.estimator.fit.normal_equations import normal_equations
+from hil.estimator.fit.reparametrisation import Coordinates
+from hil.estimator.fit.simulated_run import SimulatedRun
+from hil.estimator.fit.stabilised_run import StabilisedRun
+from hil.estimator.models.parameters import Physics
+
+Run = SimulatedRun | StabilisedRun
+
+BOLD = 0.8  # share of its width that friction's step may lose at a time, near the end
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Residuals of several runs under one model, by coordinates: the parameters', then each run's first state."""
+
+    runs: tuple[Run, ...]
+    coordinates: Coordinates
+    state_scale: Array
+    """Of the state at the first sample (2 joints,) [rad, rad/s]."""
+    weights: tuple[Array, ...]
+    """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
+    share: float = 1.0
+    """Of each run, from its beginning, that is looked at."""
+    pull: Array | None = None
+    """Stiffness of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
+    narrowing: float = BOLD
+    """Share that friction's step may lose of its width at a time."""
+    held: bool = False
+    """Whether the parameters stay as they are."""
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return len(self.coordinates.names)
+
+    def physics(self, x: Array) -> Physics:
+        """The physics at the coordinates `x`."""
+        values = self.coordinates.values(x[: self.count]).tolist()
+        return Physics.of(dict(zip(self.coordinates.names, values, strict=True)))
+
+    def start(self, x: Array, run: int) -> Array:
+        """The state at the first sample of a run (2, joints) at the coordinates `x`."""
+        size = self.state_scale.size
+        first = self.count + run * size
+        return (x[first : first + size] * self.state_scale).reshape(2, -1)
+
+    def evaluate(self, x: Array) -> Quadratic:
+        """The weighted sum of squares at `x` with its normal equations."""
+        physics = self.physics(x)
+        total = Quadratic(0.0, np.zeros((x.size, x.size)), np.zeros(x.size))
+        if not np.all(np.isfinite(physics.vector)):
+            return replace(total, cost=np.inf)
+        for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
+            transform = self._transform(x, index)
+            n, b = np.zeros((transform.shape[0],) * 2), np.zeros(transform.shape[0])
+            cost = 0.0
+            for part, position, derivative in run.pieces(
+                physics, self.start(x, index), self.coordinates.names, self.pull, self.share
+            ):
+                square = np.square(weight[:, part]).reshape(-1)
+                r = (position - run.measured[:, part]).reshape(-1)
+                normal, gradient = normal_equations(derivative.reshape(r.size, -1), r, square)
+                n, b, cost = n + normal, b + gradient, cost + float(np.sum(square * r * r))
+                if not (np.isfinite(cost) and np.all(np.isfinite(n)) and np.all(np.isfinite(b))):
+                    return Quadratic(np.inf, total.normal, total.gradient)
+            total = Quadratic(
+                total.cost + cost,
+                total.normal + transform.T @ n @ transform,
+                total.gradient + transform.T @ b,
+            )
+        return total
+
+    def minimise(self, x: Array, enough: float, damping: float = FIRST_DAMPING, at: Quadratic | None = None) -> Minimum:
+        """Minimise the sum of squares from `x`, until it falls by less than `enough` of it; see `minimise`."""
+        return minimise(self.evaluate, x, enough, damping, at, move=self.coordinates.moved, limits=self._limits)
+
+    def _limits(self, x: Array) -> tuple[Array, Array]:
+        """The least and the most that each coordinate may change in a step."""
+        least, most = alike(x)
+        self.coordinates.limit(x[: self.count], least, most, self.narrowing)
+        if self.held:
+            least[: self.count] = most[: self.count] = 0.0
+        return least, most
+
+    def cost(self, positions: Sequence[Array]) -> float:
+        """The weighted sum of squares of simulated positions, run by run (joints, samples) [rad]."""
+        squares = [
+            np.square(weight * (position - run.measured))
+            for run, weight, position in zip(self.runs, self.weights, positions, strict=True)
+        ]
+        return float(sum(square.sum() for square in squares))
+
+    def positions(self, x: Array) -> tuple[Array, ...]:
+        """Simulated positions of each run (joints, samples) [rad]."""
+        physics = self.physics(x)
+        return tuple(run.position(physics, self.start(x, index)) for index, run in enumerate(self.runs))
+
+    def scatter(self, x: Array, lags: int) -> Array:
+        """Sum of products of the scores, in coordinates (coordinates, coordinates); see `covariance`."""
+        physics = self.physics(x)
+        total = np.zeros((x.size, x.size))
+        for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
+            transform = self._transform(x, index)
+            scatter = Scatter(transform.shape[0], lags)
+            for part, position, derivative in run.pieces(physics, self.start(x, index), self.coordinates.names):
+                square = weight[:, part] ** 2 * (position - run.measured[:, part])
+                scatter.add(np.einsum("js,jsc->sc", square, derivative))
+            total += transform.T @ scatter.sum() @ transform
+        return total
+
+    def _transform(self, x: Array, run: int) -> Array:
+        """Derivatives of a run's parameters and first state by all coordinates (those, coordinates)."""
+        size = self.state_scale.size
+        transform = np.zeros((self.count + size, x.size))
+        transform[: self.count, : self.count] = self.coordinates.slopes(x[: self.count])
+        first = self.count + run * size
+        transform[self.count :, first : first + size] = np.diag(self.state_scale)
+        return transform

@@ -1,0 +1,130 @@
+"""Unconstrained coordinates for the likelihood: no step of it can leave the physical parameters.
+
+Positive parameters are exponentials. Coupling is sqrt(inertia_1 inertia_2) tanh(z), which every arm of
+positive masses obeys and which keeps the mass matrix positive definite; the asymmetry of viscous friction is
+viscous tanh(z), which keeps friction positive both ways. The width of the Coulomb step stays above a floor.
+Gravity, offsets, ripple, the joints' zeros and delay may have either sign.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+
+LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
+MOST_COUPLING = 0.95  # of its bound, at the start
+BEND = 0.01  # rad: much of it, for friction that yields before it slides
+NEAREST = 1e-3  # of a width's floor: what always stays above it, or no step would lead back
+WIDENING = 2.0  # of a width, in one step
+STRIBECK = ("stribeck_rise", "stribeck_velocity")
+RESHAPING = 1.0  # of the logarithms of these, in one step
+EITHER_SIGN = ("gravity", "offset", "delay", "ripple_sin", "ripple_cos", "ripple_cycles", "zero")
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The map between parameters and coordinates of about the size of 1."""
+
+    names: tuple[str, ...]
+    """Parameters, as in `Model.names`."""
+    scales: Array
+    """Scale of each parameter (parameters,) [its unit], by `scales_of`."""
+    width_floor: float
+    """What the width of every Coulomb step stays above [rad/s]."""
+
+    def values(self, x: Array) -> Array:
+        """Parameters (parameters,) at the coordinates `x` (parameters,)."""
+        value = np.where(self._either_sign, x * self.scales, np.exp(np.where(self._either_sign, 0.0, x)))
+        value += self._floors
+        for share, first, second in self._shares:
+            value[share] = np.sqrt(value[first] * value[second]) * np.tanh(x[share])
+        return value
+
+    def coordinates(self, value: Array) -> Array:
+        """Coordinates of the parameters `value` (parameters,), moved into the physical range."""
+        above = np.maximum(value - self._floors, LEAST_SHARE * self.scales)
+        x = np.where(self._either_sign, value / self.scales, np.log(above))
+        for share, first, second in self._shares:
+            part = value[share] / np.sqrt(above[first] * above[second])
+            x[share] = np.arctanh(np.clip(part, -MOST_COUPLING, MOST_COUPLING))
+        return x
+
+    def moved(self, x: Array, step: Array) -> Array:
+        """Where `step` (coordinates,) leads from `x`; both may have coordinates of something else at their end.
+
+        The motion follows a width and not its logarithm: the width changes as a linear model foresees. By the
+        exponential of the step it would never arrive at its floor, and all that makes up for it would go too far.
+        """
+        y = x + step
+        widths = np.flatnonzero(self._floors)
+        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), NEAREST * self.width_floor))
+        return y
+
+    def limit(self, x: Array, least: Array, most: Array, narrowing: float) -> None:
+        """Lower in place what coordinates may change by in one step from `x` (coordinates,), if it is the shape of
+        friction near standstill: a width by no more than its share `narrowing` and by WIDENING, others by RESHAPING.
+
+        One that shrinks to nothing in a single step leaves no trace in the motion that would bring it back.
+        """
+        least[self._shapes], most[self._shapes] = -RESHAPING, RESHAPING
+        widths = np.flatnonzero(self._floors)
+        share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
+        least[widths], most[widths] = np.maximum(-1.0, -narrowing * share), WIDENING * share
+
+    def slopes(self, x: Array) -> Array:
+        """Derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
+        value = self.values(x)
+        slope = np.diag(np.where(self._either_sign, self.scales, value - self._floors))
+        for share, first, second in self._shares:
+            slope[share, share] = np.sqrt(value[first] * value[second]) / np.cosh(x[share]) ** 2
+            slope[share, first] += 0.5 * value[share]
+            slope[share, second] += 0.5 * value[share]
+        return slope
+
+    @cached_property
+    def _either_sign(self) -> Array:
+        return np.array([_kind(name) in EITHER_SIGN for name in self.names])
+
+    @cached_property
+    def _floors(self) -> Array:
+        return np.array([self.width_floor if _kind(name) == "coulomb_width" else 0.0 for name in self.names])
+
+    @cached_property
+    def _shapes(self) -> list[int]:
+        return [i for i, name in enumerate(self.names) if _kind(name) in STRIBECK]
+
+    @cached_property
+    def _shares(self) -> list[tuple[int, int, int]]:
+        """Indices of what is bounded by the geometric mean of two others, and of the two."""
+        bounds = {"coupling": ("inertia_1", "inertia_2")}
+        for joint in (1, 2):
+            bounds[f"viscous_asymmetry_{joint}"] = (f"viscous_{joint}", f"viscous_{joint}")
+        index = self.names.index
+        return [(index(name), index(a), index(b)) for name, (a, b) in bounds.items() if name in self.names]
+
+
+def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: float) -> Array:
+    """Scale of each parameter (parameters,).
+
+    From RMS torque [N m], RMS velocity [rad/s] and an inertia [kg m^2] of the arm and its motion.
+    """
+    scale: Mapping[str, float] = {
+        **dict.fromkeys(("inertia", "coupling", "armature"), inertia),
+        **dict.fromkeys(("gravity", "coulomb", "offset"), torque),
+        **dict.fromkeys(("viscous", "viscous_asymmetry", "presliding_damping"), torque / velocity),
+        "presliding_stiffness": torque / BEND,
+        **dict.fromkeys(("ripple_sin", "ripple_cos", "ripple_cycles", "zero"), 0.02),
+        "stribeck_velocity": velocity,
+        "coulomb_width": 0.05,
+        **dict.fromkeys(("stribeck_rise", "load", "torque_scale"), 1.0),
+        **dict.fromkeys(("delay", "lag"), 1e-3),
+    }
+    return np.array([scale[_kind(name)] for name in names])
+
+
+@cache
+def _kind(name: str) -> str:
+    return name.rstrip("_12")

@@ -1,0 +1,78 @@
+"""Where torque ripple over the joint's angle repeats: a scan that needs no starting value.
+
+For each number of cycles a turn, torque times its sine and cosine are two more columns of the regression on
+Fourier lines; the one that explains most of what friction and dynamics leave is where the likelihood starts.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.fourier import Motion, held_lines, lines_of
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.stage1 import COULOMB_WIDTH, LinearEstimate
+from hil.estimator.models.regressor import regressor
+
+CYCLES = np.arange(1.0, 40.01, 0.25)  # per turn of the joint
+STRIBECK_VELOCITY = 0.15  # rad/s: about right is enough to keep the rise of friction out of the ripple
+
+
+def find_ripple(periods: Sequence[SettledPeriod], linear: LinearEstimate) -> dict[str, float]:
+    """Cycles per turn of each joint's torque ripple and its sine and cosine parts, by parameter name."""
+    found: dict[str, float] = {}
+    for joint in range(periods[0].joints):
+        each = [
+            _prepared(period, motion, harmonics, joint, linear.delay)
+            for period, motion, harmonics in zip(periods, linear.motions, linear.harmonics, strict=True)
+        ]
+        Q = np.linalg.qr(np.concatenate([columns for columns, _, _, _ in each]))[0]
+        goal = _without(Q, np.concatenate([torque for _, torque, _, _ in each]))
+        best: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(2))
+        for cycles in CYCLES.tolist():
+            waves = [_waves(torque, angle, cycles, size) for _, size, torque, angle in _parts(each)]
+            extra = _without(Q, np.concatenate(waves))
+            share = np.asarray(np.linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
+            explained = float(goal @ goal - np.sum((goal - extra @ share) ** 2))
+            best = max(best, (explained, cycles, share), key=lambda trial: trial[0])
+        # Torque appears as measured = applied (1 + ripple), so what the columns explain is its opposite.
+        found |= {f"ripple_cycles_{joint + 1}": best[1]}
+        found |= {f"ripple_sin_{joint + 1}": -float(best[2][0]), f"ripple_cos_{joint + 1}": -float(best[2][1])}
+    return found
+
+
+def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, int, Array, Array]]:
+    return [(columns, columns.shape[0] // 2, torque, angle) for columns, _, torque, angle in each]
+
+
+def _prepared(
+    period: SettledPeriod, motion: Motion, harmonics: int, joint: int, delay: float
+) -> tuple[Array, Array, Array, Array]:
+    """Columns and torque of one joint's lines as real numbers, and its torque and angle over time (samples,)."""
+    Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
+    velocity = motion.velocity[joint]
+    sign = np.tanh(velocity / COULOMB_WIDTH)
+    lines = held_lines(period.torque, period.rate, delay - period.command_to_sample)[joint]
+    kept = lines.copy()
+    kept[harmonics + 1 :] = 0.0
+    torque = np.fft.irfft(kept * period.samples, period.samples)
+    friction = (sign * np.exp(-((velocity / STRIBECK_VELOCITY) ** 2)), sign * np.abs(torque))
+    columns = np.column_stack((Y, *friction))
+    columns = columns[:, np.abs(columns).max(axis=0) > 0.0]
+    rows = _real(lines_of(columns.T)[:, : harmonics + 1]).T
+    return rows, _real(lines[None, : harmonics + 1])[0], torque, motion.position[joint]
+
+
+def _waves(torque: Array, angle: Array, cycles: float, lines: int) -> Array:
+    waves = np.stack((torque * np.sin(cycles * angle), torque * np.cos(cycles * angle)))
+    return _real(lines_of(waves)[:, :lines]).T
+
+
+def _real(lines: np.ndarray) -> Array:
+    return np.concatenate((lines.real, lines.imag), axis=1)
+
+
+def _without(Q: Array, b: Array) -> Array:
+    """What is left of `b` outside the columns of `Q`."""
+    left: Array = b - Q @ (Q.T @ b)
+    return left

@@ -1,0 +1,196 @@
+"""Nonlinear least squares with unknowns shared by all segments and unknowns of each segment alone.
+
+A segment's own unknowns touch only its own residuals, so the normal equations have an arrow's shape: each
+segment's block is eliminated by itself (Schur complement), and its columns of the Jacobian are taken for all
+segments at once. Hundreds of starting states cost as much as four.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.estimator.arrays import Array
+from hil.estimator.errors import ConvergenceError
+
+Residual = Callable[[int, Array, Array], Array]
+"""Residuals (rows,) of one segment at shared coordinates (shared,) and its own (own,)."""
+
+Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
+"""The same residuals and their derivatives by shared coordinates, then by its own (rows, shared + own)."""
+
+LONGEST = 2.0  # change of one coordinate in one step
+ITERATIONS = 80
+UNFINISHED = 1e-3  # of the sum: less than this still to gain is no reason to give up
+ENOUGH_SEGMENTS = 3
+SEEN = 1e-12  # of the largest eigenvalue
+PART = 1e-4  # of a coordinate in what is not seen, squared: less is rounding
+FIRST_DAMPING = 1e-3
+LEAST_DAMPING = 1e-8
+MOST_DAMPING = 1e5
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """Where the sum of squares is least."""
+
+    shared: Array
+    """(shared,)."""
+    own: Array
+    """(segments, own)."""
+    cost: float
+    """Sum of squares."""
+    information: Array
+    """Of the shared coordinates, the segments' own eliminated (shared, shared)."""
+    scores: Array
+    """Each segment's gradient by the shared coordinates, its own eliminated (segments, shared)."""
+    iterations: int
+
+    def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
+        """Sandwich covariance of the shared coordinates (shared, shared), segments taken as independent.
+
+        If `groups` (segments,) says which recording each is from, all is as much more uncertain as the recordings
+        disagree more than their segments would make them: a repeated motion repeats the model's error. The last `own`
+        coordinates belong to one recording each.
+
+        It holds when the residuals of a segment hang together, as model error makes them: Liang and Zeger,
+        "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13. Fewer than
+        ENOUGH_SEGMENTS times as many segments as coordinates cannot tell what correlates with what: they tell
+        one factor by which all is more uncertain than white noise would make it. Infinite for a coordinate that can
+        change, alone or with others, and leave no trace.
+        """
+        segments, size = self.scores.shape
+        norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
+        bread, hidden = _inverse(self.information / np.outer(norm, norm))
+        bread /= np.outer(norm, norm)
+        few = segments / max(1, segments - 1)
+        if segments < ENOUGH_SEGMENTS * size:
+            covariance = few * _size(self.scores, bread) / size * bread
+        else:
+            covariance = few * bread @ (self.scores.T @ self.scores) @ bread
+        if groups is not None and np.unique(groups).size > 1:
+            together = np.stack([self.scores[groups == group].sum(axis=0) for group in np.unique(groups)])
+            fewer = len(together) / (len(together) - 1)
+            ratio = fewer * _size(together, bread) / (size - own) / (few * _size(self.scores, bread) / size)
+            covariance = max(1.0, ratio) * covariance
+        covariance[hidden, hidden] = np.inf
+        return np.asarray(covariance)
+
+
+def _size(scores: Array, bread: Array) -> float:
+    """Sum of the squares of scores (scores, shared) in units of what white noise would make of them."""
+    return float(np.einsum("si,ij,sj->", scores, bread, scores))
+
+
+def _inverse(matrix: Array) -> tuple[Array, Array]:
+    """Of a matrix that is positive semidefinite but for rounding, without the directions that are not seen at all;
+    and which coordinates have part in those."""
+    size, direction = np.linalg.eigh(matrix)
+    seen = size > SEEN * size[-1]
+    inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
+    part = np.sum(direction[:, ~seen] ** 2, axis=1)
+    return inverse, part > PART
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Normal equations, a block for each segment."""
+
+    shared: Array
+    """(segments, shared, shared)."""
+    mixed: Array
+    """(segments, shared, own)."""
+    own: Array
+    """(segments, own, own)."""
+    shared_gradient: Array
+    """(segments, shared)."""
+    own_gradient: Array
+    """(segments, own)."""
+
+    def reduced(self, damping: float) -> tuple[Array, Array, Array, Array]:
+        """Information and scores with the segments' own eliminated, and what recovers their own steps."""
+        eye = np.eye(self.own.shape[1])
+        scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14
+        damped = self.own + damping * self.own * eye + scale * eye
+        solve = np.linalg.solve(damped, np.swapaxes(self.mixed, 1, 2))
+        known = np.linalg.solve(damped, self.own_gradient[:, :, None])[:, :, 0]
+        information = self.shared.sum(axis=0) - np.einsum("sij,sjk->ik", self.mixed, solve)
+        scores = self.shared_gradient - np.einsum("sij,sj->si", self.mixed, known)
+        return information, scores, solve, known
+
+
+def minimise_segmented(
+    residual: Residual, derivative: Derivative, shared: Array, own: Array, enough: float
+) -> Segmented:
+    """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
+
+    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when a step gains
+    less than `enough` of the sum, or after ITERATIONS when it gained less than UNFINISHED. `residual` and
+    `derivative` are called from several threads; the result does not depend on their number. Raises
+    ConvergenceError.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        rows = _residuals(residual, shared, own, threads)
+        cost = _cost(rows)
+        if not np.isfinite(cost):
+            raise ConvergenceError("the starting values give no finite motion: check the units of torque and time")
+        damping = FIRST_DAMPING
+        for iteration in range(1, ITERATIONS + 1):
+            blocks = _blocks(derivative, shared, own, threads)
+            gained = 0.0
+            while damping < MOST_DAMPING:
+                there = _stepped(blocks, shared, own, damping)
+                rows_there = _residuals(residual, *there, threads)
+                gained = cost - _cost(rows_there)
+                if gained > 0.0:
+                    (shared, own), rows, cost = there, rows_there, cost - gained
+                    damping = max(0.2 * damping, LEAST_DAMPING)
+                    break
+                damping = max(8.0 * damping, FIRST_DAMPING)
+            if gained < enough * cost or (iteration == ITERATIONS and gained < UNFINISHED * cost):
+                blocks = _blocks(derivative, shared, own, threads)
+                information, scores, _, _ = blocks.reduced(0.0)
+                return Segmented(shared, own, cost, information, scores, iteration)
+    raise ConvergenceError(
+        f"after {ITERATIONS} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} in each: try a "
+        "simpler friction model or shorter segments"
+    )
+
+
+def _cost(rows: Sequence[Array]) -> float:
+    return float(sum(np.sum(np.square(row)) for row in rows))
+
+
+def _residuals(residual: Residual, shared: Array, own: Array, threads: ThreadPoolExecutor) -> list[Array]:
+    return list(threads.map(lambda s: residual(s, shared, own[s]), range(len(own))))
+
+
+def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPoolExecutor) -> _Blocks:
+    def block(segment: int) -> tuple[Array, Array]:
+        r, J = derivative(segment, shared, own[segment])
+        with np.errstate(over="ignore", invalid="ignore"):
+            return J.T @ J, J.T @ r
+
+    products = list(threads.map(block, range(len(own))))
+    normal = np.stack([product[0] for product in products])
+    gradient = np.stack([product[1] for product in products])
+    if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
+        raise ConvergenceError(
+            "a simulated motion runs away: check the units, signs and directions of torque and angle"
+        )
+    n = shared.size
+    return _Blocks(normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:], gradient[:, :n], gradient[:, n:])
+
+
+def _stepped(blocks: _Blocks, shared: Array, own: Array, damping: float) -> tuple[Array, Array]:
+    information, scores, solve, known = blocks.reduced(damping)
+    full = np.diag(blocks.shared.sum(axis=0))
+    scale = np.sqrt(np.maximum(full, 1e-12 * full.max()))
+    matrix = information / np.outer(scale, scale) + damping * np.eye(shared.size)
+    step = -np.linalg.lstsq(matrix, scores.sum(axis=0) / scale, rcond=1e-13)[0] / scale
+    step = np.clip(step, -LONGEST, LONGEST)
+    own_step = -known - np.einsum("sij,j->si", solve, step)
+    return shared + step, own + np.clip(own_step, -LONGEST, LONGEST)

@@ -1,0 +1,100 @@
+"""Stage 1: linear least squares on the Fourier lines of settled periods. No starting values, no local
+minima.
+
+The motion's lines up to where signal meets noise are differentiated exactly, the regressor evaluated on
+them, and regressor and torque compared line by line. The command's own derivative is one more column, whose
+coefficient is the delay of the motors: tau(t - delay) = tau(t) - delay tau'(t).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.fourier import Lines, Motion, cut_off, held_lines, lines_of, motion_of
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import ShapeError, UnidentifiableError
+from hil.estimator.models.regressor import parameter_names, regressor
+
+COULOMB_WIDTH = 0.05  # rad/s: about the velocity that the dropped lines leave in a sticking joint
+WORST_CONDITION = 1e8
+
+
+@dataclass(frozen=True)
+class LinearEstimate:
+    """What the regression found."""
+
+    names: tuple[str, ...]
+    """Base parameters."""
+    value: Array
+    """(parameters,) [SI]."""
+    std: Array
+    """Standard errors if the residual were white (parameters,): optimistic for other friction."""
+    delay: float
+    """Delay of the motors' torque [s]."""
+    motions: tuple[Motion, ...]
+    """Each period's motion from its lines up to `harmonics`."""
+    harmonics: tuple[int, ...]
+    """Highest harmonic used of each period."""
+
+    @property
+    def motion(self) -> Motion:
+        """Of the first period."""
+        return self.motions[0]
+
+
+def fit_lines(*periods: SettledPeriod) -> LinearEstimate:
+    """Estimate the base parameters from one or more settled periods of one arm.
+
+    Raises UnidentifiableError when the motion does not tell them apart, ShapeError for periods of arms with
+    different numbers of joints.
+    """
+    joints = periods[0].joints
+    if any(period.joints != joints for period in periods):
+        raise ShapeError(f"periods of {[period.joints for period in periods]} joints: they must be of one arm")
+    lines = [lines_of(period.filled()) for period in periods]
+    harmonics = tuple(map(cut_off, lines))
+    motions = tuple(
+        motion_of(line, highest, period.fundamental, period.samples)
+        for line, highest, period in zip(lines, harmonics, periods, strict=True)
+    )
+    equations = [_equations(*each) for each in zip(periods, motions, harmonics, strict=True)]
+    A = np.concatenate([columns for columns, _ in equations], axis=1)
+    torque = np.concatenate([goal for _, goal in equations], axis=1)
+
+    theta, _ = _solve(A, torque, np.ones(joints))
+    # The second time each joint counts by what the first left unexplained of it.
+    left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
+    theta, std = _solve(A, torque, 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max()))
+    return LinearEstimate(parameter_names(joints), theta[:-1], std[:-1], float(theta[-1]), motions, harmonics)
+
+
+def _equations(period: SettledPeriod, motion: Motion, harmonics: int) -> tuple[Lines, Lines]:
+    """One period's columns (joints, lines, unknowns) and torques (joints, lines), line by line."""
+    Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)
+    # One joint after the other: a long period's spectra of all regressors at once would fill the memory.
+    columns = np.stack([np.fft.rfft(rows, axis=0)[: harmonics + 1] for rows in Y]) / period.samples
+    torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : harmonics + 1]
+    slope = 1j * period.fundamental * np.arange(harmonics + 1) * torque
+    return np.concatenate((columns, slope[:, :, None]), axis=2), torque
+
+
+def _solve(columns: Lines, torque: Lines, weight: Array) -> tuple[Array, Array]:
+    """Weighted least squares of complex `torque` (joints, lines) on `columns` (joints, lines, unknowns)."""
+    weighted = (columns * weight[:, None, None]).reshape(-1, columns.shape[2])
+    A = np.concatenate((weighted.real, weighted.imag))
+    goal = (torque * weight[:, None]).reshape(-1)
+    b = np.concatenate((goal.real, goal.imag))
+    norm = np.linalg.norm(A, axis=0)
+    U, size, Vt = np.linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
+    if size[-1] * WORST_CONDITION < size[0]:
+        raise UnidentifiableError(
+            f"the regression's condition is {size[0] / max(size[-1], 1e-300):.2g}, at most "
+            f"{WORST_CONDITION:.0e} can be solved: the motion does not tell parameters apart; "
+            "excite more lines or raise the torque"
+        )
+    theta = Vt.T @ ((U.T @ b) / size)
+    left = b - A @ (theta / norm)
+    variance = float(left @ left) / max(1, b.size - theta.size)
+    std = np.sqrt(variance * np.sum((Vt.T / size) ** 2, axis=1))
+    return theta / norm, std / norm

@@ -1,0 +1,1 @@
+"""The arm's equations and parameters."""

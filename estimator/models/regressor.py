@@ -1,0 +1,106 @@
+"""The arm as a regressor: torque is linear in the base parameters, tau = Y(q, q', q'') theta.
+
+Two revolute joints in one plane, joint 1 from the horizontal, joint 2 from link 1, with s the sign of
+velocity:
+
+    tau1 = (inertia_1 + inertia_2 + 2 coupling cos q2) q1'' + (inertia_2 + coupling cos q2) q2''
+           - coupling sin q2 (2 q1' q2' + q2'^2) + gravity_1 cos q1 + gravity_2 cos(q1 + q2)
+           + viscous_1 q1' + coulomb_1 s1 + offset_1
+    tau2 = (inertia_2 + coupling cos q2) q1'' + (inertia_2 + armature_2) q2''
+           + coupling sin q2 q1'^2 + gravity_2 cos(q1 + q2) + viscous_2 q2' + coulomb_2 s2 + offset_2
+
+One joint is the same without all that belongs to the second: inertia_1, gravity_1 and friction.
+"""
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.errors import ModelError, ShapeError
+
+RIGID_BODY = {
+    1: ("inertia_1", "gravity_1"),
+    2: ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
+}
+UNITS = {
+    "inertia": "kg m^2",
+    "coupling": "kg m^2",
+    "armature": "kg m^2",
+    "gravity": "N m",
+    "viscous": "N m s/rad",
+    "coulomb": "N m",
+    "offset": "N m",
+}
+
+
+def parameter_names(joints: int) -> tuple[str, ...]:
+    """Names of the base parameters, in the order of every vector of them. Raises ModelError."""
+    if joints not in RIGID_BODY:
+        raise ModelError(f"an arm of {joints} joints: the arm model has one or two")
+    friction = (f"{term}_{joint + 1}" for term in ("viscous", "coulomb", "offset") for joint in range(joints))
+    return (*RIGID_BODY[joints], *friction)
+
+
+def parameter_units(joints: int) -> tuple[str, ...]:
+    """Units of the base parameters."""
+    return tuple(UNITS[name.split("_")[0]] for name in parameter_names(joints))
+
+
+def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0) -> Array:
+    """Y of the base parameters (joints, samples, parameters).
+
+    `position` [rad], `velocity` [rad/s], `acceleration` [rad/s^2]: (joints, samples). The sign of velocity is
+    tanh(velocity / coulomb_width) for a width [rad/s], one for all or one per joint, and sharp for 0.
+    Raises ShapeError when the three differ in shape, ModelError for an arm of other than one or two joints.
+    """
+    if not position.shape == velocity.shape == acceleration.shape:
+        raise ShapeError(
+            f"position {position.shape}, velocity {velocity.shape} and acceleration {acceleration.shape} "
+            "must have one shape (joints, samples)"
+        )
+    joints, samples = position.shape
+    names = parameter_names(joints)
+    Y = np.zeros((joints, samples, len(names)))
+    rigid = _pendulum(position, acceleration) if joints == 1 else _two_link(position, velocity, acceleration)
+    Y[:, :, : rigid.shape[2]] = rigid
+    signs = _signs(velocity, np.broadcast_to(coulomb_width, (joints,)))
+    for joint in range(joints):
+        first = rigid.shape[2] + joint
+        Y[joint, :, first] = velocity[joint]
+        Y[joint, :, first + joints] = signs[joint]
+        Y[joint, :, first + 2 * joints] = 1.0
+    return Y
+
+
+def inverse_dynamics(
+    theta: Array, position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0
+) -> Array:
+    """Joint torques [N m] (joints, samples) of this motion, from the equations at the head of this module.
+
+    `theta`: base parameters in the order of `parameter_names`; the rest as in `regressor`, errors too.
+    """
+    torque: Array = regressor(position, velocity, acceleration, coulomb_width) @ theta
+    return torque
+
+
+def _signs(velocity: Array, width: Array) -> Array:
+    soft = np.tanh(velocity / np.where(width > 0.0, width, 1.0)[:, None])
+    return np.where(width[:, None] > 0.0, soft, np.sign(velocity))
+
+
+def _pendulum(position: Array, acceleration: Array) -> Array:
+    return np.stack((acceleration, np.cos(position)), axis=2)
+
+
+def _two_link(position: Array, velocity: Array, acceleration: Array) -> Array:
+    q1, q2 = position
+    v1, v2 = velocity
+    a1, a2 = acceleration
+    cos_2, sin_2 = np.cos(q2), np.sin(q2)
+    level_1, level_2 = np.cos(q1), np.cos(q1 + q2)
+    nothing = np.zeros_like(q1)
+    both = a1 + a2
+    coupling_1 = cos_2 * (2.0 * a1 + a2) - sin_2 * (2.0 * v1 * v2 + v2**2)
+    coupling_2 = cos_2 * a1 + sin_2 * v1**2
+    first = np.stack((a1, coupling_1, both, nothing, level_1, level_2), axis=1)
+    second = np.stack((nothing, coupling_2, both, a2, nothing, level_2), axis=1)
+    return np.stack((first, second))

@@ -1,0 +1,1 @@
+"""Friction chosen by held-out error, and what the result is worth."""

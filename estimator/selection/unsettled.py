@@ -1,0 +1,104 @@
+"""Which friction model, for recordings that hold no settled period: judged by segments that were not fitted.
+
+Every other segment of each recording is fitted and the others are predicted, each from the state that its first samples
+show. The model that predicts them best is fitted once more to all. (The short segments that only find a start are not
+kept apart so; what is judged has seen none but its own half.)
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.recording import Recording
+from hil.estimator.data.segments import Grid, cut
+from hil.estimator.errors import ConvergenceError, RecordingError
+from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
+from hil.estimator.models.model import Drive, Friction, Model
+from hil.estimator.selection.prediction import prediction_errors
+
+WORTH = 0.98  # of the error of the best so far: what another term must reach to be kept
+FRICTIONS: tuple[Friction, ...] = ("coulomb", "stribeck", "stribeck_load")
+FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
+
+
+@dataclass(frozen=True)
+class SegmentTrial:
+    """One model and how it predicted the segments left out."""
+
+    model: Model
+    held_out: Array | None
+    """RMS error over the motion's RMS (joints,); None where the fit found no end."""
+    score: float
+    """Of the usual segment, the median, all joints together: where an arm turns over, one can be off by any amount."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class SegmentChoice:
+    """The models tried, in order, the one chosen, and its fit to all segments."""
+
+    trials: tuple[SegmentTrial, ...]
+    chosen: SegmentTrial
+    estimate: ShootingEstimate
+
+    @property
+    def gained(self) -> float:
+        """The plainest model's error over the chosen one's."""
+        return self.trials[0].score / self.chosen.score
+
+
+def choose_by_shooting(
+    recordings: Sequence[Recording],
+    drive: Drive,
+    start: Array,
+    *,
+    length: float = 1.0,
+    zeros: bool = False,
+    torque_scale: bool = False,
+) -> SegmentChoice:
+    """Fit richer and richer friction, presliding and asymmetry on the best, as long as segments left out are predicted
+    better.
+
+    Arguments as of `estimate_by_shooting`; `torque_scale` is part of every model, or of none. Raises RecordingError for
+    recordings of fewer than two segments each, ConvergenceError when no model can be fitted.
+    """
+    if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
+        raise RecordingError(
+            f"no recording holds two segments of {length:g} s, one to fit and one to check: set model.friction to one "
+            "of the models, record longer, or choose shorter segments"
+        )
+
+    def tried(model: Model) -> SegmentTrial:
+        return _try(recordings, model, start, length, zeros)
+
+    joints = recordings[0].joints
+    trials = [tried(Model(joints, friction, drive, torque_scale=torque_scale)) for friction in FRICTIONS]
+    best = trials[0]
+    for trial in trials[1:]:
+        best = trial if trial.score < WORTH * best.score else best
+    for more in (partial(replace, presliding=True), partial(replace, asymmetry=True)):
+        trials.append(tried(more(best.model)))
+        best = trials[-1] if trials[-1].score < WORTH * best.score else best
+    if best.held_out is None:
+        raise ConvergenceError("no friction model could be fitted: look at the recording and its units")
+    estimate = estimate_by_shooting(recordings, best.model, start, length=length, zeros=zeros)
+    return SegmentChoice(tuple(trials), best, estimate)
+
+
+def _try(recordings: Sequence[Recording], model: Model, start: Array, length: float, zeros: bool) -> SegmentTrial:
+    began = time.perf_counter()
+    try:
+        found = estimate_by_shooting(recordings, model, start, length=length, zeros=zeros, of=FITTED)
+    except ConvergenceError:
+        return SegmentTrial(model, None, np.inf, time.perf_counter() - began)
+    shifts = found.zeros if zeros else None
+    errors, _ = prediction_errors(recordings, found.parameters, length, model.joints, shifts, PREDICTED)
+    motion = np.sqrt(np.mean([np.var(each.filled(), axis=1) for each in recordings], axis=0))
+    relative = errors / motion
+    score = float(np.median(np.sqrt(np.mean(relative**2, axis=1))))
+    held_out = np.sqrt(np.mean(relative**2, axis=0))
+    return SegmentTrial(model, held_out, score, time.perf_counter() - began)

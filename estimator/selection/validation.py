@@ -1,0 +1,127 @@
+"""How far an estimate can be trusted: residual against rounding, whiteness, conditioning, free simulation, lines."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array, Mask
+from hil.estimator.data.fourier import cut_off, lines_of, noise_power
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import PeriodicityError
+from hil.estimator.fit.covariance import autocorrelation
+from hil.estimator.identify import Estimate, predict
+from hil.estimator.selection.distortion import Distortion, distortion, excited_lines
+
+LAGS = 100
+
+
+@dataclass(frozen=True)
+class Levels:
+    """RMS by where it comes from, in encoder steps (joints,)."""
+
+    excited: Array
+    """Motion on the lines that some joint was driven with."""
+    distortion: Array
+    """Motion on the other lines, which is what the arm's nonlinearity made."""
+    noise: Array
+    """Of a sample, from the upper half of the lines."""
+    scatter: Array
+    """Of a sample of the mean period, from the scatter between periods; 0 if only one was kept."""
+    model_error: Array
+    """What the fit leaves beyond rounding and scatter."""
+    lines: Distortion
+    """Line by line, odd and even told apart where the excitation allows it."""
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What the checks found."""
+
+    residual_over_floor: Array
+    """RMS residual over the noise that is known, rounding and scatter (joints,); 1 explains everything."""
+    correlated_lags: Array
+    """Share of the residual's autocorrelations at 1 to LAGS samples outside the 95 % band of white noise
+    (joints,); 0.05 is white."""
+    free_run: Array | None
+    """RMS error of a simulation from rest over the motion's RMS (joints,), of the fitted period itself; None when
+    it does not settle."""
+    condition: float
+    """Condition number of the correlations between base parameters: 1 is independent."""
+    confounded: tuple[str, str, float]
+    """The two base parameters that are hardest to tell apart, and their correlation."""
+    relative_std: dict[str, float]
+    """Standard error over value of each base parameter but offsets."""
+    levels: Levels
+
+    @property
+    def weakest(self) -> str:
+        """The base parameter known least well for its size."""
+        return max(self.relative_std, key=lambda name: self.relative_std[name])
+
+
+def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
+    """Check `estimate` against the period it was fitted to."""
+    residual = np.nan_to_num(estimate.residual)
+    lags = min(LAGS, period.samples // 4)
+    band = 1.96 / np.sqrt(period.samples)
+    outside = [float(np.mean(np.abs(autocorrelation(row, lags)[1:]) > band)) for row in residual]
+    names = estimate.model.base_names
+    correlation = _correlation(estimate.covariance[: len(names), : len(names)])
+    off_diagonal = np.abs(np.triu(correlation, 1))
+    first, second = np.unravel_index(np.argmax(off_diagonal), off_diagonal.shape)
+    return Validation(
+        np.sqrt(np.nanmean(estimate.residual**2, axis=1)) / period.noise,
+        np.array(outside),
+        _free_run(period, estimate),
+        float(np.linalg.cond(correlation)),
+        (names[first], names[second], float(correlation[first, second])),
+        {
+            name: float(std / abs(value)) if value else np.inf
+            for name, value, std in zip(names, estimate.value, estimate.std, strict=False)
+            if not name.startswith("offset")
+        },
+        levels(period, estimate),
+    )
+
+
+def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
+    """Noise, distortion and model error of one period told apart."""
+    lines = lines_of(period.filled())
+    order = np.arange(lines.shape[1])
+    excited = excited_lines(period)
+    other = ~excited & (order > 0) & (order <= cut_off(lines))
+    noise = noise_power(lines)
+    step = period.position_step
+
+    def rms(chosen: Mask) -> Array:
+        power = 2.0 * np.sum(np.abs(lines[:, chosen]) ** 2 - noise[:, None], axis=1)
+        return np.asarray(np.sqrt(np.maximum(power, 0.0)) / step)
+
+    scatter = np.zeros(period.joints) if period.position_std is None else period.position_std / step
+    left = np.nanmean(estimate.residual**2, axis=1) - period.noise**2
+    return Levels(
+        rms(excited),
+        rms(other),
+        np.sqrt(noise * period.samples) / step,
+        scatter,
+        np.sqrt(np.maximum(left, 0.0)) / step,
+        distortion(period, estimate),
+    )
+
+
+def _free_run(period: SettledPeriod, estimate: Estimate) -> Array | None:
+    try:
+        predicted = predict(estimate, period.torque, period.rate, period.command_to_sample)
+    except PeriodicityError:
+        return None
+    motion = np.nanstd(period.position, axis=1)
+    error: Array = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1)) / motion
+    return error
+
+
+def _correlation(covariance: Array) -> Array:
+    size = np.sqrt(np.diag(covariance))
+    known = np.isfinite(size) & (size > 0.0)
+    correlation = np.eye(size.size)
+    correlation[np.ix_(known, known)] = covariance[np.ix_(known, known)] / np.outer(size[known], size[known])
+    return correlation

@@ -1,0 +1,1 @@
+"""The arm's compiled simulation and its forward sensitivities."""

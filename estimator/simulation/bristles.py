@@ -1,0 +1,85 @@
+"""Dry friction that yields before it slides: bristles between the surfaces, which bend, and slip when bent far enough.
+
+    friction = b + damping (1 - b / +-level(v)) v        b' = stiffness v (1 - b / +-level(v))
+
+with the sign of the velocity v and the level of `hil.estimator.simulation.arm`: C. Canudas de Wit, H. Olsson, K. J.
+Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic Control 40
+(1995) 419, its b being the bristles' torque here. Viscous friction comes on top, as ever.
+
+A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506): the bristles bend for half of it
+at the velocity where it starts, exactly; the arm moves with their torque, which then is one more offset, and their
+damping, one more viscous friction; and they bend for the other half at the velocity where it ends. The arm's own step
+is that of every other friction law. The level is taken at the velocity in the middle of the step, in the first half as
+the last step's acceleration foresees it: bristles that slip are the level and nothing else, and would be half a step
+late. Against a hundred steps per sample, three at 400 Hz are within 0.03 encoder steps RMS for 5 to 1000 N m/rad.
+"""
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.models.parameters import CONSTANTS, SLIDING, Physics
+
+# Of joint 1 in `Physics.vector`; joint 2 follows.
+VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING = (
+    CONSTANTS.index(f"{name}_1")
+    for name in (
+        *("viscous", "coulomb", "offset", "stribeck_rise", "stribeck_velocity", "load", "torque_scale"),
+        *("presliding_stiffness", "presliding_damping"),
+    )
+)
+
+
+def has_bristles(physics: Physics) -> bool:
+    """Whether dry friction yields before it slides, at one joint at least."""
+    return bool(np.any(physics.vector[STIFFNESS : STIFFNESS + 2] > 0.0))
+
+
+def first_bend(physics: Physics, velocity: Array) -> Array:
+    """The bristles' torque (joints,) [N m] where a simulation starts: as they are bent once a joint slides.
+
+    `velocity` (joints,) [rad/s]. Of a joint that hardly moves nobody knows how they are bent: hardly, this says.
+    """
+    joints = velocity.size
+    p = physics.vector
+    each = slice(0, joints)
+    level = p[COULOMB:][each] * (1.0 + p[RISE:][each] * np.exp(-((velocity / p[FADING:][each]) ** 2)))
+    bent: Array = np.where(p[STIFFNESS:][each] > 0.0, level * np.tanh(velocity / SLIDING), 0.0)
+    return bent
+
+
+# Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
+def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1: float, t2: float, time: float) -> None:
+    """Bend the bristles b (2,) [N m] for `time` [s] at the velocities v1 and v2 under the motor torques t1 and t2.
+
+    u1 and u2 are the velocities in the middle of the arm's step, where the level is taken: it is the whole of friction
+    once the bristles slip. Puts into the constants `m` what the arm then feels of them.
+    """
+    for joint in range(2):
+        stiffness = p[STIFFNESS + joint]
+        if stiffness > 0.0:
+            v, u, t = (v1, u1, t1) if joint == 0 else (v2, u2, t2)
+            rise = p[RISE + joint] * math.exp(-((u / p[FADING + joint]) ** 2))
+            level = p[COULOMB + joint] * (1.0 + rise) + p[LOAD + joint] * abs(p[SCALE + joint] * t)
+            end = math.copysign(level, v)
+            b[joint] = end + (b[joint] - end) * math.exp(-stiffness * abs(v) * time / level)
+            m[OFFSET + joint] = p[OFFSET + joint] + b[joint]
+            m[VISCOUS + joint] = p[VISCOUS + joint] + p[DAMPING + joint] * (1.0 - b[joint] / end)
+
+
+def without_dry_friction(vector: Array) -> Array:
+    """The constants of an arm whose dry friction is all in its bristles, for `bend` to fill in."""
+    left = vector.copy()
+    for joint in range(2):
+        if vector[STIFFNESS + joint] > 0.0:
+            left[[COULOMB + joint, LOAD + joint]] = 0.0
+    return left
+
+
+inner: Any = numba.njit(  # type: ignore[call-overload]
+    nogil=True, error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
+)
+bend = inner(bend)

@@ -1,0 +1,178 @@
+"""The arm's motion under commands that depend on its motion: a spring and damper in software, a brake.
+
+The equations and the integration step are those of `hil.estimator.simulation.arm`, torque scale and all. A command is
+worked out once a sample from the state of the sample before, as the computer on the bus does it, clipped, and held;
+the motor follows it with a first-order lag. A pure delay of the drive is taken as more of that lag, which is the same
+to first order.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.arm import finer_pieces, pieces_now, step_bent, steps_per_sample
+from hil.estimator.simulation.bristles import first_bend, has_bristles, without_dry_friction
+
+SETTLING_PERIODS = 4
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """torque = command + stiffness (pose - position) - damping velocity, of the former sample, within +-limit.
+
+    All (joints,) [N m/rad, N m s/rad, rad, N m].
+    """
+
+    stiffness: Array
+    damping: Array
+    pose: Array
+    limit: Array
+
+    @classmethod
+    def none(cls, joints: int) -> "Feedback":
+        """Commands as they are."""
+        nothing = np.zeros(joints)
+        return cls(nothing, nothing, nothing, np.full(joints, np.inf))
+
+
+@dataclass(frozen=True)
+class Response:
+    """A simulated motion."""
+
+    position: Array
+    """At the samples (joints, samples) [rad]."""
+    velocity: Array
+    """(joints, samples) [rad/s]."""
+    torque: Array
+    """Commanded, feedback included (joints, samples) [N m]."""
+    state: Array
+    """After the last sample: angles, velocities, motor torques, then angles and velocities at the last sample, and the
+    torque of friction's bristles (6, joints) [rad, rad/s, N m, rad, rad/s, N m]; what `respond` takes to go on."""
+
+
+@dataclass(frozen=True)
+class Stabilised:
+    """A period during which `feedback` gave part of the torque.
+
+    In the simulation the feedback acts on the simulated arm, as it did on the real one: the arm's instability is no
+    longer the simulation's, and where model and arm agree the torque is the one that was really commanded.
+    """
+
+    feedback: Feedback
+    excitation: Array
+    """Commanded torque less what the feedback gave of it (joints, samples) [N m]."""
+    former: Array
+    """Angles and velocities at the sample before the first (2, joints) [rad, rad/s]."""
+    former_torque: Array
+    """Commanded before the first command (joints,) [N m]."""
+
+    def positions(self, physics: Physics, start: Array, rate: float, command_to_sample: float) -> Array:
+        """Simulated angles (joints, samples) [rad] from `start` (2, joints) at the first sample."""
+        state = np.concatenate((start, self.former_torque[None], self.former))
+        return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
+
+    def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
+        """The same when nothing of the motion is known: from rest in `pose`, after some periods."""
+        state = resting(pose)
+        for _ in range(SETTLING_PERIODS):
+            response = respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback)
+            state = response.state
+        return response.position
+
+
+def _earlier(physics: Physics, command_to_sample: float) -> Physics:
+    """Commands take effect `command_to_sample` [s] before the sample of the same index: so much less lag."""
+    return Physics(physics.vector, physics.delay, max(physics.lag - command_to_sample, 1e-5))
+
+
+def resting(pose: Array) -> Array:
+    """The state of an arm at rest in `pose` (joints,) [rad], as `respond` takes it."""
+    nothing = np.zeros_like(pose)
+    return np.stack((pose, nothing, nothing, pose, nothing, nothing))
+
+
+def respond(physics: Physics, state: Array, command: Array, rate: float, feedback: Feedback) -> Response:
+    """Simulate one sample for each of `command` (joints, samples) [N m], at `rate` [1/s], from `state`.
+
+    Without its last row friction's bristles are bent as those of a sliding joint.
+    """
+    joints, samples = command.shape
+    steps = steps_per_sample(rate)
+    step = 1.0 / (rate * steps)
+    gains = np.zeros((4, 2))
+    gains[:, :joints] = feedback.stiffness, feedback.damping, feedback.pose, feedback.limit
+    # A pendulum is a two-joint arm whose second joint has no torque and moves nothing.
+    both = np.zeros((2, samples))
+    both[:joints] = command
+    full = np.zeros((6, 2))
+    full[5, :joints] = first_bend(physics, state[1])
+    full[: len(state), :joints] = state
+    position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
+    lag = physics.lag + max(physics.delay, 0.0)
+    moving = without_dry_friction(physics.vector)
+    _respond(
+        *(physics.vector, has_bristles(physics), moving, full, both, gains),
+        *(lag, step, steps, finer_pieces(physics, step), position, velocity, torque),
+    )
+    return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
+
+
+# Compiled code takes its arguments by position.
+def _loop(
+    p: Any,
+    bristly: bool,
+    m: Any,
+    state: Any,
+    command: Any,
+    gains: Any,
+    lag: float,
+    step: float,
+    steps: int,
+    pieces: int,
+    position: Any,
+    velocity: Any,
+    torque: Any,
+) -> None:
+    q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
+    t1, t2 = state[2, 0], state[2, 1]
+    s1, s2, w1, w2 = state[3, 0], state[3, 1], state[4, 0], state[4, 1]
+    b = state[5]
+    a1 = a2 = 0.0
+    piece = step / pieces
+    fallen = 1.0 - math.exp(-step / lag) if lag > 0.0 else 1.0
+    share = fallen * lag / step if lag > 0.0 else 0.0
+    for k in range(command.shape[1]):
+        c1 = command[0, k] + gains[0, 0] * (gains[2, 0] - s1) - gains[1, 0] * w1
+        c2 = command[1, k] + gains[0, 1] * (gains[2, 1] - s2) - gains[1, 1] * w2
+        c1 = min(max(c1, -gains[3, 0]), gains[3, 0])
+        c2 = min(max(c2, -gains[3, 1]), gains[3, 1])
+        s1, s2, w1, w2 = q1, q2, v1, v2
+        position[0, k] = q1
+        position[1, k] = q2
+        velocity[0, k] = v1
+        velocity[1, k] = v2
+        torque[0, k] = c1
+        torque[1, k] = c2
+        for _ in range(steps):
+            # The motor's mean torque over the step, exactly, while the command holds.
+            m1 = c1 + (t1 - c1) * share
+            m2 = c2 + (t2 - c2) * share
+            t1 += (c1 - t1) * fallen
+            t2 += (c2 - t2) * fallen
+            left = pieces
+            while left > 0:
+                n = pieces_now(p, v1, v2, a1, a2, piece, left)
+                q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, m1, m2, n * piece)
+                left -= n
+    state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
+    state[2, 0], state[2, 1] = t1, t2
+    state[3, 0], state[3, 1], state[4, 0], state[4, 1] = s1, s2, w1, w2
+
+
+_respond: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)

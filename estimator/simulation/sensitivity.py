@@ -1,0 +1,381 @@
+"""Forward sensitivities: the simulated motion and its derivatives by parameters and starting state, in one go.
+
+The derivative is that of the discrete scheme of `hil.estimator.simulation.arm` itself, step by step, so that it is the
+gradient of what is minimised and not of something close to it. One step is, with W = M + gamma h S (M mass
+matrix, S slopes of friction) and primes where stage 1 foresees the end,
+
+    W k = f        M' a = f'        W l = M (a - 2 k)        v += h (3 k + l) / 2        q += h v + h^2 k / 2
+
+All that depends on a parameter enters through three gaps: of W k = f, of M' a = f' and of the third equation.
+A change of them by r, g, e moves the new velocity by A r + B g + C e; A, B and C are two-by-two and common to
+all parameters. So one more parameter costs a few dozen operations a step, not one more simulation.
+
+A processor does those for several parameters at once, if its compiler knows that no row of their derivatives overlaps
+another: rows lie WIDE apart in arrays of one dimension. They are done one step behind the rest, since what was just
+written value by value cannot be read several at once without a wait.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from hil.estimator.arrays import Array
+from hil.estimator.models.parameters import CONSTANTS, Physics
+from hil.estimator.simulation.arm import GAMMA, MOST_PIECES, bend_at, bump_at, finer_pieces, pieces_now
+
+# What can be differentiated by: the constants, the drive's times, the state at the first sample.
+CAUSES = (*CONSTANTS, "delay", "lag", "position_1", "position_2", "velocity_1", "velocity_2")
+DELAY, STATE = len(CONSTANTS), len(CONSTANTS) + 2
+COUPLING, GRAVITY_1, GRAVITY_2, ZERO_1, ZERO_2 = map(
+    CONSTANTS.index, ("coupling", "gravity_1", "gravity_2", "zero_1", "zero_2")
+)
+
+AT_ONCE = 8  # causes that a processor may take at once: they are filled up to that, so that none is left over
+NOWHERE = AT_ONCE * math.ceil(len(CAUSES) / AT_ONCE)  # the column of what nobody asked for
+WIDE = NOWHERE + AT_ONCE
+# Rows of each step by causes: f1, f2, slope_1, slope_2, m11, m12, m22 of stage 1, then of stage 2.
+STAGE = 7 * WIDE
+SLOPES, MASSES = 2 * WIDE, 4 * WIDE  # from the stage's first row
+# Numbers of each step. By the state, of either stage: f1 and f2 by q1, q2, v1, v2; slope_1 by q1, v1; slope_2 by q2,
+# v2; m11 and m12 by q2. Then those of all parameters, see `arm_step`.
+BY_STATE = 14
+NUMBERS = 2 * BY_STATE + 24
+
+
+class Sensitive:
+    """A simulation that goes on piece by piece, so that long recordings need little memory.
+
+    `start` (2, joints): angles [rad] and velocities [rad/s] at the first sample; `causes`: names of what to
+    differentiate by, from CAUSES; `step` [s]: length of one integration step, cut into at most
+    `most_pieces` where a joint is near standstill; `pull` (joints,) [N m/rad]: stiffness of
+    springs from the simulated joints to angles given beside the torque, which are not there in the arm.
+    """
+
+    def __init__(
+        self,
+        physics: Physics,
+        start: Array,
+        causes: tuple[str, ...],
+        step: float,
+        most_pieces: int = MOST_PIECES,
+        pull: Array | None = None,
+    ) -> None:
+        self._joints = start.shape[1]
+        self._count = len(causes)
+        self._constants = physics.vector
+        self._step = step
+        self._pieces = finer_pieces(physics, step, most_pieces)
+        self._state = np.zeros((2, 2))
+        self._state[:, : self._joints] = start
+        self._places: npt.NDArray[np.int64] = np.full(len(CAUSES), NOWHERE)
+        self._places[[CAUSES.index(name) for name in causes]] = np.arange(len(causes))
+        z = np.zeros((4, WIDE))
+        z[np.arange(4), self._places[STATE:]] = 1.0
+        # Two steps' rows and numbers, of which one waits to be followed: before the first nothing changes.
+        rows = np.zeros((4, 7, WIDE))
+        # The mass matrix, m11, m12 and m22, is linear in the inertias.
+        for row, inertia in ((4, 0), (4, 2), (5, 2), (6, 2), (6, 3)):
+            rows[:, row, self._places[inertia]] = 1.0
+        spring = np.zeros((2, 2))
+        spring[0, : self._joints] = 0.0 if pull is None else pull
+        self._room = (rows.reshape(-1), np.zeros(2 * NUMBERS), *np.zeros((4, 2, 2)), spring, self._places)
+        self._z = z.reshape(-1)
+        self._turn = np.zeros(1, dtype=np.int64)
+
+    def advance(self, torque: Array, torque_slopes: Array, pulled_to: Array | None = None) -> tuple[Array, Array]:
+        """Go on by as many samples as `torque` has.
+
+        `torque` (joints, samples, steps): mean motor torque over each step after each sample [N m];
+        `torque_slopes` (2, joints, samples, steps): its derivatives by delay and lag [N m/s]; `pulled_to` (joints,
+        samples) [rad]: the springs' other ends, held from sample to sample. Returns the angles (joints, samples)
+        [rad] and their derivatives (joints, samples, causes).
+        """
+        joints, samples, steps = torque.shape
+        both = np.zeros((2, samples, steps))
+        both[:joints] = torque
+        slopes = np.zeros((2, 2, samples, steps))
+        slopes[:, :joints] = torque_slopes
+        ends = np.zeros((2, samples))
+        ends[:joints] = 0.0 if pulled_to is None else pulled_to
+        position = np.empty((2, samples))
+        derivative = np.empty((2, samples, self._count))
+        self._go_on(
+            *(self._constants, self._state, both, slopes, ends, self._step, self._pieces),
+            *(self._room, self._z, self._turn, position, derivative),
+        )
+        return position[:joints], derivative[:joints]
+
+    def _go_on(self, *given: Any) -> None:
+        _advance(*given)
+
+
+# Compiled code takes its arguments by position; p is `Physics.vector`, joint and stage are 0 or 1, `now` is 0 or 1 too,
+# the place of the step's rows and numbers. `room` is
+#   rows, numbers  as above, flat
+#   here           angles and velocities that the stage looks at (2, joints)
+#   left, slope    torques left for acceleration and slopes of friction (stages, joints)
+#   dt             motor torques by delay and lag (causes, joints)
+#   spring         stiffness and other end of the springs (2, joints)
+#   at             the column of each cause
+def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:
+    """Torque that a drive leaves its joint and the slope of its friction, as in the simulation, and what they change
+    with."""
+    rows, numbers, here, left, slope, dt, _, at = room
+    q, v = here[0, joint], here[1, joint]
+    c = 6 + joint
+    viscous, coulomb, offset, width = p[c], p[c + 2], p[c + 4], p[c + 6]
+    rise, fading, load, asymmetry = p[c + 8], p[c + 10], p[c + 12], p[c + 14]
+    ripple_sin, ripple_cos, cycles = p[c + 16], p[c + 18], p[c + 20]
+    commanded, scale = t, p[c + 24]
+    t *= scale
+    sine, cosine, shape = 0.0, 1.0, 1.0
+    if cycles != 0.0:
+        sine, cosine = math.sin(cycles * q), math.cos(cycles * q)
+        shape = 1.0 + ripple_sin * sine + ripple_cos * cosine
+    motor, turn = t * shape, t * (ripple_sin * cosine - ripple_cos * sine)
+    loaded = load if motor > 0.0 else -load
+    sharp, slow = 1.0 / width, 1.0 / fading
+    bump = bump_at(v * slow)
+    level = coulomb * (1.0 + rise * bump) + load * abs(motor)
+    dry = asymmetry * v + level
+    level_v = -2.0 * coulomb * rise * bump * v * slow * slow
+    level_f = -level_v * v * slow
+    bend, bent = bend_at(v, sharp)
+    bent_v, bend_w = -2.0 * bend * bent * sharp, -v * sharp * bent
+    passed = 1.0 - loaded * bend
+    f = (2 * now + stage) * STAGE + joint * WIDE
+    s = f + SLOPES
+    rows[f + at[c]], rows[s + at[c]] = -v, 1.0
+    rows[f + at[c + 2]], rows[s + at[c + 2]] = -(1.0 + rise * bump) * bend, (1.0 + rise * bump) * bent
+    rows[f + at[c + 4]] = -1.0
+    rows[f + at[c + 6]] = -dry * bend_w
+    rows[s + at[c + 6]] = -level * (bent + 2.0 * bend * bend_w) * sharp
+    rows[f + at[c + 8]], rows[s + at[c + 8]] = -coulomb * bump * bend, coulomb * bump * bent
+    rows[f + at[c + 10]], rows[s + at[c + 10]] = -level_f * bend, level_f * bent
+    # Writing all this takes longer than working it out: what nobody asked for is left alone.
+    if at[c + 12] != NOWHERE:
+        rows[f + at[c + 12]], rows[s + at[c + 12]] = -abs(motor) * bend, abs(motor) * bent
+    if at[c + 14] != NOWHERE:
+        rows[f + at[c + 14]] = -v * bend
+    if min(at[c + 16], at[c + 18], at[c + 20]) < NOWHERE:
+        rows[f + at[c + 16]], rows[s + at[c + 16]] = t * sine * passed, t * sine * loaded * bent
+        rows[f + at[c + 18]], rows[s + at[c + 18]] = t * cosine * passed, t * cosine * loaded * bent
+        rows[f + at[c + 20]], rows[s + at[c + 20]] = q * turn * passed, q * turn * loaded * bent
+    if at[c + 24] != NOWHERE:
+        rows[f + at[c + 24]], rows[s + at[c + 24]] = commanded * shape * passed, commanded * shape * loaded * bent
+    for cause in range(2):
+        rows[f + at[DELAY + cause]] = scale * shape * passed * dt[cause, joint]
+        rows[s + at[DELAY + cause]] = scale * shape * loaded * bent * dt[cause, joint]
+    left[stage, joint], slope[stage, joint] = motor - offset - viscous * v - dry * bend, viscous + level * bent
+    n = now * NUMBERS + stage * BY_STATE
+    numbers[n + 5 * joint] = cycles * turn * passed
+    numbers[n + 5 * joint + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
+    numbers[n + 8 + 2 * joint], numbers[n + 9 + 2 * joint] = (
+        cycles * turn * loaded * bent,
+        level_v * bent + level * bent_v,
+    )
+
+
+def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple[float, float]:
+    """Mass matrix's first row under the motor torques t1 and t2; torques left and slopes of friction in `room`, and
+    what all of them change with."""
+    rows, numbers, here, left, _, _, spring, at = room
+    for joint in range(2):
+        _drive(p, joint, stage, now, t1 if joint == 0 else t2, room)
+    q1, q2, v1, v2 = here[0, 0] + p[ZERO_1], here[0, 1] + p[ZERO_2], here[1, 0], here[1, 1]
+    cos_1, sin_1, cos_2, sin_2 = math.cos(q1), math.sin(q1), math.cos(q2), math.sin(q2)
+    cos_12, sin_12 = cos_1 * cos_2 - sin_1 * sin_2, sin_1 * cos_2 + cos_1 * sin_2
+    across, turning = p[COUPLING] * cos_2, p[COUPLING] * sin_2
+    fall_1, fall_12 = p[GRAVITY_1] * sin_1, p[GRAVITY_2] * sin_12
+    whirl = (2.0 * v1 + v2) * v2
+    f1_q2, f2_q2 = fall_12 + across * whirl, fall_12 - across * v1 * v1
+    for joint in range(2):
+        left[stage, joint] += spring[0, joint] * (spring[1, joint] - here[0, joint])
+    left[stage, 0] += turning * whirl - p[GRAVITY_1] * cos_1 - p[GRAVITY_2] * cos_12
+    left[stage, 1] -= turning * v1 * v1 + p[GRAVITY_2] * cos_12
+    f1 = (2 * now + stage) * STAGE
+    f2, m11, m12 = f1 + WIDE, f1 + MASSES, f1 + MASSES + WIDE
+    rows[m11 + at[COUPLING]], rows[m12 + at[COUPLING]] = 2.0 * cos_2, cos_2
+    rows[f1 + at[COUPLING]], rows[f2 + at[COUPLING]] = sin_2 * whirl, -sin_2 * v1 * v1
+    rows[f1 + at[GRAVITY_1]] = -cos_1
+    rows[f1 + at[GRAVITY_2]] = rows[f2 + at[GRAVITY_2]] = -cos_12
+    rows[f1 + at[ZERO_1]], rows[f2 + at[ZERO_1]] = fall_1 + fall_12, fall_12
+    rows[f1 + at[ZERO_2]], rows[f2 + at[ZERO_2]] = f1_q2, f2_q2
+    rows[m11 + at[ZERO_2]], rows[m12 + at[ZERO_2]] = -2.0 * turning, -turning
+    n = now * NUMBERS + stage * BY_STATE
+    numbers[n] += fall_1 + fall_12 - spring[0, 0]
+    numbers[n + 1] = f1_q2
+    numbers[n + 2] += 2.0 * turning * v2
+    numbers[n + 3] = 2.0 * turning * (v1 + v2)
+    numbers[n + 4] = fall_12
+    numbers[n + 5] += f2_q2 - spring[0, 1]
+    numbers[n + 6] = -2.0 * turning * v1
+    numbers[n + 12], numbers[n + 13] = -2.0 * turning, -turning
+    return p[0] + p[2] + 2.0 * across, p[2] + across
+
+
+def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any) -> tuple[float, float]:
+    """One step of the state x (2, joints), its rows and numbers; the accelerations."""
+    _, numbers, here, left, slope, _, _, _ = room
+    gh, half = GAMMA * h, 0.5 * h * h
+    m22 = p[2] + p[3]
+    m11 = m12 = n11 = n12 = i11 = i12 = i22 = k1 = k2 = 0.0
+    here[0, 0], here[0, 1], here[1, 0], here[1, 1] = x[0, 0], x[0, 1], x[1, 0], x[1, 1]
+    for stage in range(2):
+        n11, n12 = _arm(p, stage, now, t1, t2, room)
+        if stage == 0:
+            m11, m12 = n11, n12
+            w11, w22 = m11 + gh * slope[0, 0], m22 + gh * slope[0, 1]
+            w = 1.0 / (w11 * w22 - m12 * m12)
+            # Winv = [i11 i12; i12 i22]
+            i11, i12, i22 = w22 * w, -m12 * w, w11 * w
+            k1, k2 = i11 * left[0, 0] + i12 * left[0, 1], i12 * left[0, 0] + i22 * left[0, 1]
+            here[0, 0] += h * x[1, 0]
+            here[0, 1] += h * x[1, 1]
+            here[1, 0] += h * k1
+            here[1, 1] += h * k2
+    n = 1.0 / (n11 * m22 - n12 * n12)
+    j11, j12, j22 = m22 * n, -n12 * n, n11 * n
+    a1, a2 = j11 * left[1, 0] + j12 * left[1, 1], j12 * left[1, 0] + j22 * left[1, 1]
+    r1, r2 = a1 - 2.0 * k1, a2 - 2.0 * k2
+    b1, b2 = m11 * r1 + m12 * r2, m12 * r1 + m22 * r2
+    l1, l2 = i11 * b1 + i12 * b2, i12 * b1 + i22 * b2
+    # C = h/2 Winv; Q = C M; B = Q M'inv; A = (3 h/2 + h B f'_v - 2 Q) Winv
+    c11, c12, c22 = 0.5 * h * i11, 0.5 * h * i12, 0.5 * h * i22
+    o11, o12 = c11 * m11 + c12 * m12, c11 * m12 + c12 * m22
+    o21, o22 = c12 * m11 + c22 * m12, c12 * m12 + c22 * m22
+    b11, b12 = o11 * j11 + o12 * j12, o11 * j12 + o12 * j22
+    b21, b22 = o21 * j11 + o22 * j12, o21 * j12 + o22 * j22
+    v = now * NUMBERS + BY_STATE
+    d11 = 1.5 * h + h * (b11 * numbers[v + 2] + b12 * numbers[v + 6]) - 2.0 * o11
+    d12 = h * (b11 * numbers[v + 3] + b12 * numbers[v + 7]) - 2.0 * o12
+    d21 = h * (b21 * numbers[v + 2] + b22 * numbers[v + 6]) - 2.0 * o21
+    d22 = 1.5 * h + h * (b21 * numbers[v + 3] + b22 * numbers[v + 7]) - 2.0 * o22
+    n = v + BY_STATE
+    numbers[n], numbers[n + 1], numbers[n + 2], numbers[n + 3] = k1, k2, gh * k1, gh * k2
+    numbers[n + 4], numbers[n + 5], numbers[n + 6], numbers[n + 7] = r1 - l1, r2 - l2, gh * l1, gh * l2
+    numbers[n + 8], numbers[n + 9] = a1, a2
+    numbers[n + 10], numbers[n + 11] = d11 * i11 + d12 * i12, d11 * i12 + d12 * i22
+    numbers[n + 12], numbers[n + 13] = d21 * i11 + d22 * i12, d21 * i12 + d22 * i22
+    numbers[n + 14], numbers[n + 15], numbers[n + 16], numbers[n + 17] = b11, b12, b21, b22
+    numbers[n + 18], numbers[n + 19], numbers[n + 20] = c11, c12, c22
+    numbers[n + 21] = h
+    s1, s2 = 1.5 * k1 + 0.5 * l1, 1.5 * k2 + 0.5 * l2
+    x[0, 0] += h * x[1, 0] + half * k1
+    x[0, 1] += h * x[1, 1] + half * k2
+    x[1, 0] += h * s1
+    x[1, 1] += h * s2
+    return s1, s2
+
+
+def follow(rows: Any, numbers: Any, Z: Any, before: int, count: int) -> None:
+    """The state's derivatives Z after the step at `before`."""
+    # That this is 0 or 1 tells the compiler that no index is negative, which Python would count from the end.
+    before &= 1
+    w, v = 2 * before * STAGE, before * NUMBERS
+    e, n = v + BY_STATE, v + 2 * BY_STATE
+    h = numbers[n + 21]
+    for i in range(count):
+        z1, z2, z3, z4 = Z[i], Z[WIDE + i], Z[2 * WIDE + i], Z[3 * WIDE + i]
+        m11 = rows[w + 4 * WIDE + i] + numbers[v + 12] * z2
+        m12 = rows[w + 5 * WIDE + i] + numbers[v + 13] * z2
+        m22 = rows[w + 6 * WIDE + i]
+        s1 = rows[w + 2 * WIDE + i] + numbers[v + 8] * z1 + numbers[v + 9] * z3
+        s2 = rows[w + 3 * WIDE + i] + numbers[v + 10] * z2 + numbers[v + 11] * z4
+        f1 = rows[w + i] + numbers[v] * z1 + numbers[v + 1] * z2 + numbers[v + 2] * z3 + numbers[v + 3] * z4
+        f2 = rows[w + WIDE + i] + numbers[v + 4] * z1 + numbers[v + 5] * z2 + numbers[v + 6] * z3 + numbers[v + 7] * z4
+        r1 = f1 - m11 * numbers[n] - m12 * numbers[n + 1] - s1 * numbers[n + 2]
+        r2 = f2 - m12 * numbers[n] - m22 * numbers[n + 1] - s2 * numbers[n + 3]
+        e1 = m11 * numbers[n + 4] + m12 * numbers[n + 5] - s1 * numbers[n + 6]
+        e2 = m12 * numbers[n + 4] + m22 * numbers[n + 5] - s2 * numbers[n + 7]
+        # Stage 2 looks at angles that have moved by h v.
+        y1, y2 = z1 + h * z3, z2 + h * z4
+        m11 = rows[w + 11 * WIDE + i] + numbers[e + 12] * y2
+        m12 = rows[w + 12 * WIDE + i] + numbers[e + 13] * y2
+        m22 = rows[w + 13 * WIDE + i]
+        f1 = rows[w + 7 * WIDE + i] + numbers[e] * y1 + numbers[e + 1] * y2 + numbers[e + 2] * z3 + numbers[e + 3] * z4
+        f2 = (
+            rows[w + 8 * WIDE + i]
+            + numbers[e + 4] * y1
+            + numbers[e + 5] * y2
+            + numbers[e + 6] * z3
+            + numbers[e + 7] * z4
+        )
+        g1 = f1 - m11 * numbers[n + 8] - m12 * numbers[n + 9]
+        g2 = f2 - m12 * numbers[n + 8] - m22 * numbers[n + 9]
+        c1, c2 = numbers[n + 18] * r1 + numbers[n + 19] * r2, numbers[n + 19] * r1 + numbers[n + 20] * r2
+        Z[i] = y1 + h * c1
+        Z[WIDE + i] = y2 + h * c2
+        Z[2 * WIDE + i] = (
+            z3
+            + (numbers[n + 10] * r1 + numbers[n + 11] * r2)
+            + (numbers[n + 14] * g1 + numbers[n + 15] * g2)
+            + (numbers[n + 18] * e1 + numbers[n + 19] * e2)
+        )
+        Z[3 * WIDE + i] = (
+            z4
+            + (numbers[n + 12] * r1 + numbers[n + 13] * r2)
+            + (numbers[n + 16] * g1 + numbers[n + 17] * g2)
+            + (numbers[n + 19] * e1 + numbers[n + 20] * e2)
+        )
+
+
+def _loop(
+    p: Any,
+    x: Any,
+    torque: Any,
+    slopes: Any,
+    ends: Any,
+    step: float,
+    pieces: int,
+    room: Any,
+    Z: Any,
+    turn: Any,
+    position: Any,
+    derivative: Any,
+) -> None:
+    rows, numbers, _, _, _, dt, spring, _ = room
+    causes = derivative.shape[2]
+    count = (causes + AT_ONCE - 1) // AT_ONCE * AT_ONCE
+    now = turn[0]
+    a1 = a2 = 0.0
+    piece = step / pieces
+    for k in range(position.shape[1]):
+        position[0, k], position[1, k] = x[0, 0], x[0, 1]
+        spring[1, 0], spring[1, 1] = ends[0, k], ends[1, k]
+        written = False
+        for s in range(torque.shape[2]):
+            t1, t2 = torque[0, k, s], torque[1, k, s]
+            for cause in range(2):
+                dt[cause, 0], dt[cause, 1] = slopes[cause, 0, k, s], slopes[cause, 1, k, s]
+            left = pieces
+            while left > 0:
+                n = pieces_now(p, x[1, 0], x[1, 1], a1, a2, piece, left)
+                a1, a2 = arm_step(p, x, t1, t2, n * piece, now, room)
+                left -= n
+                now = 1 - now
+                follow(rows, numbers, Z, now, count)
+                if not written:
+                    for i in range(causes):
+                        derivative[0, k, i] = Z[i]
+                        derivative[1, k, i] = Z[WIDE + i]
+                    written = True
+    turn[0] = now
+
+
+# Only the loop is called from Python; wrappers for the others would take a second more to compile. Calls that are not
+# inlined would spend more time counting references to arrays than on arithmetic.
+fused: Any = numba.njit(  # type: ignore[call-overload]
+    nogil=True,
+    error_model="numpy",
+    fastmath={"contract"},
+    forceinline=True,
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
+)
+_drive, _arm, arm_step, follow = map(fused, (_drive, _arm, arm_step, follow))
+_advance: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_loop)

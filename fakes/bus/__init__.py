@@ -1,0 +1,1 @@
+"""The half-duplex bus, its wires and its faults."""

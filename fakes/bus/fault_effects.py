@@ -1,0 +1,96 @@
+"""What faults do to packets, servos and joints."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from hil.drivers.packet import HardwareError
+from hil.fakes.bus.faults import Fault, FaultKind, Faults
+from hil.fakes.plants.plant import CanJam, Plant, PlantError
+from hil.fakes.servo.servo import Servo
+
+if TYPE_CHECKING:
+    from hil.fakes.bus.wire import Wire
+
+
+def begin(fault: Fault, servos: Sequence[Servo], plant: Plant, now: float) -> None:
+    """Do to servos and joints what the fault does; nothing for the kinds that are not about them. now: bus time [s]."""
+    for joint, servo in enumerate(servos):
+        if not fault.concerns(servo.id):
+            continue
+        match fault.kind:
+            case FaultKind.SILENT_SERVO:
+                servo.connected = False
+            case FaultKind.REBOOT:
+                servo.reboot(now, fault.size)
+            case FaultKind.OVERHEATING:
+                servo.temperature_c = servo.memory.get("Temperature Limit", 80) + fault.size
+            case FaultKind.OVERLOAD:
+                servo.fail(HardwareError.OVERLOAD)
+            case FaultKind.LOW_VOLTAGE:
+                lowest = servo.memory.get("Min Voltage Limit", 95) / 10
+                servo.dip(servo.input_voltage_v - (lowest - fault.size))
+            case FaultKind.STUCK_JOINT:
+                _jam(plant, joint, True)
+            case FaultKind.ENCODER_JUMP:
+                servo.present.jump_ticks += round(fault.size)
+
+
+def end(fault: Fault, servos: Sequence[Servo], plant: Plant) -> None:
+    """Undo it, as far as it passes by itself: a heated servo stays hot, an error stays until a reboot."""
+    for joint, servo in enumerate(servos):
+        if not fault.concerns(servo.id):
+            continue
+        match fault.kind:
+            case FaultKind.SILENT_SERVO:
+                servo.connected = True
+            case FaultKind.LOW_VOLTAGE:
+                servo.dip(0.0)
+            case FaultKind.STUCK_JOINT:
+                _jam(plant, joint, False)
+            case FaultKind.ENCODER_JUMP:
+                servo.present.jump_ticks -= round(fault.size)
+
+
+def put_with_faults(faults: Faults, wire: "Wire", servo_id: int, data: bytes, start: float, now: float) -> float:
+    """Put a reply on the wire as the lasting faults leave it; when the servo is done speaking. now: bus time [s]."""
+    late_s = 0.0
+    copies = 1
+    random = faults.random
+    before = b""
+    for fault in faults.on_replies:
+        if not faults.strikes(fault, servo_id, now):
+            continue
+        match fault.kind:
+            case FaultKind.LOST_REPLY:
+                copies = 0
+            case FaultKind.CORRUPTED_REPLY:
+                data = _flipped(data, [random.randrange(8 * len(data)) for _ in range(round(fault.size))])
+            case FaultKind.TRUNCATED_REPLY:
+                data = data[: random.randrange(1, len(data))]
+            case FaultKind.DUPLICATED_REPLY:
+                copies *= 2
+            case FaultKind.LATE_REPLY:
+                late_s += fault.size
+            case FaultKind.NOISE:
+                before = random.randbytes(round(fault.size))
+    end = start + len(data) * wire.byte_s
+    if not copies:
+        wire.occupy(end)
+        return end
+    end = wire.put(before + data, start, late_s)
+    for _ in range(copies - 1):
+        end = wire.put(data, end, late_s)
+    return end
+
+
+def _flipped(data: bytes, bits: Sequence[int]) -> bytes:
+    changed = bytearray(data)
+    for bit in bits:
+        changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def _jam(plant: Plant, joint: int, jammed: bool) -> None:
+    if not isinstance(plant, CanJam):
+        raise PlantError(f"{type(plant).__name__} has no jam(joint, jammed): a stuck joint needs it")
+    plant.jam(joint, jammed)

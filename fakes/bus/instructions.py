@@ -1,0 +1,252 @@
+"""Who acts on an instruction packet, who answers it, and in which order.
+
+Where the manual is silent:
+
+- The registers of a Sync Read are sampled when its instruction's last byte arrives, in all servos alike.
+- In a group read each servo waits for the one listed before it. Behind one that does not answer all stay silent, and a
+  fast read then breaks off in the middle (source: ROBOTIS in DynamixelSDK issue 364).
+- To a broadcast Ping the servos answer one directly after the other by rising ID.
+- Two servos with one ID that answer at once are heard as nothing; both act on what they are told.
+- The status of a write to ID or Baud Rate still comes from the old ID at the old baud, and a Factory Reset's too.
+- A servo executes what is addressed to its Secondary ID and does not answer it.
+- In a fast read a servo that refuses sends its error and zeros.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
+
+from hil.drivers.packet import (
+    BROADCAST_ID,
+    HEADER,
+    MAX_LENGTH,
+    Instruction,
+    Packet,
+    StatusError,
+    crc,
+    encode_status,
+)
+from hil.fakes.bus.sync_reads import SPAN, Reply, StateReads
+from hil.fakes.servo.backup import RESET_ALL
+from hil.fakes.servo.servo import Servo
+
+Part = tuple[int, int, int]
+"""What a group read asks of one servo: ID, address, length."""
+
+
+class Line(Protocol):
+    """What stands between the servos and the world; `hil.fakes.bus.bus.FakeBus` is one."""
+
+    @property
+    def baud(self) -> int: ...
+
+    def send(self, replies: Sequence[Reply], now: float) -> None:
+        """Put replies on the wire, each its delay after the end of the one before it; the first after `now`."""
+        ...
+
+    def measure(self, servo: Servo, address: int, length: int) -> None:
+        """Bring the registers of a stretch up to date with the servo's joint."""
+        ...
+
+    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Positions [rad], velocities [rad/s] and motor currents [A] of all joints, in the order of the servos."""
+        ...
+
+    def is_moving(self, servo: Servo) -> bool: ...
+
+    def count_collision(self) -> None: ...
+
+
+class Instructions:
+    """The servos on a line as receivers of packets. `route` must be called whenever an ID has changed."""
+
+    def __init__(self, servos: Sequence[Servo], line: Line) -> None:
+        self._servos = tuple(servos)
+        self._line = line
+        self._by_id: dict[int, tuple[Servo, ...]] = {}
+        self._shadows: dict[int, tuple[Servo, ...]] = {}
+        self._writers: dict[int, tuple[Servo, ...]] = {}
+        self._state_reads = StateReads(self._servos, line)
+        self._broadcast: dict[int, Callable[[bytes, float], None]] = {
+            Instruction.PING: self._broadcast_ping,
+            Instruction.SYNC_READ: self._sync_read,
+            Instruction.SYNC_WRITE: self._sync_write,
+            Instruction.FAST_SYNC_READ: self._fast_sync_read,
+            Instruction.BULK_READ: self._bulk_read,
+            Instruction.BULK_WRITE: self._bulk_write,
+            Instruction.FAST_BULK_READ: self._fast_bulk_read,
+        }
+        self.route()
+
+    def route(self) -> None:
+        """Find out who listens to which ID."""
+        self._by_id, self._shadows, self._writers = {}, {}, {}
+        self._state_reads.forget()
+        for servo in self._servos:
+            self._by_id[servo.id] = (*self._by_id.get(servo.id, ()), servo)
+            if servo.shadow_id is not None:
+                self._shadows[servo.shadow_id] = (*self._shadows.get(servo.shadow_id, ()), servo)
+        for listener in self._by_id.keys() | self._shadows.keys():
+            self._writers[listener] = self._by_id.get(listener, ()) + self._shadows.get(listener, ())
+
+    def receive(self, packet: Packet, now: float) -> None:
+        """Let the servos act on a packet whose last byte arrives at `now` [s]."""
+        if packet.damaged:
+            self._address(packet.id, lambda _: (StatusError.CRC, b""), now)
+            return
+        baud = self._line.baud
+        for servo in self._servos:
+            if servo.baud == baud and servo.connected and now >= servo.ready_at:
+                servo.heard_at = now  # feeds its watchdog, and says below that it heard this packet
+        if packet.id != BROADCAST_ID:
+            self._single(packet, now)
+        elif packet.instruction in self._broadcast:
+            self._broadcast[packet.instruction](packet.body, now)
+        elif packet.instruction != Instruction.FACTORY_RESET or packet.body != bytes((RESET_ALL,)):
+            for servo in self._listening(now):
+                self._execute(servo, packet.instruction, packet.body, now)
+
+    # One servo
+
+    def _single(self, packet: Packet, now: float) -> None:
+        instruction, body = packet.instruction, packet.body
+        if instruction == Instruction.STATUS:
+            return
+        if packet.id in self._shadows:
+            for servo in self._shadows[packet.id]:
+                if servo.id != packet.id and servo.heard_at == now:
+                    self._execute(servo, instruction, body, now)
+        if instruction == Instruction.READ:
+            if len(body) != 4:
+                self._address(packet.id, lambda _: (StatusError.DATA_LENGTH, b""), now, least_level=1)
+                return
+            address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
+            self._address(packet.id, lambda servo: self._read(servo, address, length), now, least_level=1)
+            return
+        least_level = 0 if instruction == Instruction.PING else 2
+        self._address(packet.id, lambda servo: self._execute(servo, instruction, body, now), now, least_level)
+
+    def _address(
+        self, servo_id: int, act: Callable[[Servo], tuple[int, bytes]], now: float, least_level: int = 2
+    ) -> None:
+        """Let the servo of this ID act, and answer if its Status Return Level is at least `least_level`."""
+        answers = []
+        for servo in self._by_id.get(servo_id, ()):
+            if servo.hears(now, self._line.baud):
+                wanted = servo.status_return_level >= least_level
+                delay_s, sender = servo.return_delay_s, servo.id
+                error, data = act(servo)
+                if wanted:
+                    answers.append((sender, error | servo.alert, data, delay_s))
+        if len(answers) == 1:
+            sender, error, data, delay_s = answers[0]
+            self._line.send([(sender, delay_s, encode_status(sender, error, data))], now)
+        elif answers:
+            self._line.count_collision()
+
+    def _execute(self, servo: Servo, instruction: int, body: bytes, now: float) -> tuple[int, bytes]:
+        return servo.execute(instruction, body, now, self._line.is_moving(servo))
+
+    def _read(self, servo: Servo, address: int, length: int) -> tuple[int, bytes]:
+        self._line.measure(servo, address, length)
+        return servo.read(address, length)
+
+    # All of them, or several
+
+    def _broadcast_ping(self, _body: bytes, now: float) -> None:
+        replies = []
+        for servo in sorted(self._listening(now), key=lambda servo: servo.id):
+            error, data = servo.execute(Instruction.PING, b"", now, False)
+            replies.append((servo.id, servo.return_delay_s, encode_status(servo.id, error | servo.alert, data)))
+        self._line.send(replies, now)
+
+    def _sync_write(self, body: bytes, now: float) -> None:
+        if len(body) < 4:
+            return
+        address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
+        writers = self._writers
+        for at in range(4, len(body) - length, length + 1):
+            for servo in writers.get(body[at], ()):
+                if servo.heard_at == now:
+                    servo.write(address, body[at + 1 : at + 1 + length])
+
+    def _bulk_write(self, body: bytes, now: float) -> None:
+        at = 0
+        while at + 5 <= len(body):
+            address, length = body[at + 1] | body[at + 2] << 8, body[at + 3] | body[at + 4] << 8
+            data = body[at + 5 : at + 5 + length]
+            if len(data) == length:
+                for servo in self._writers.get(body[at], ()):
+                    if servo.heard_at == now:
+                        servo.write(address, data)
+            at += 5 + length
+
+    def _sync_read(self, body: bytes, now: float) -> None:
+        if len(body) < 4:
+            return
+        if body.startswith(SPAN) and (replies := self._state_reads.sync_read(body, self._by_id, now)):
+            self._line.send(replies, now)
+            return
+        address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
+        self._group_read([(servo_id, address, length) for servo_id in body[4:]], now)
+
+    def _fast_sync_read(self, body: bytes, now: float) -> None:
+        if len(body) < 5:
+            return
+        if body.startswith(SPAN) and (replies := self._state_reads.fast_sync_read(body, self._by_id, now)):
+            self._line.send(replies, now)
+            return
+        address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
+        self._fast_read([(servo_id, address, length) for servo_id in body[4:]], now)
+
+    def _bulk_read(self, body: bytes, now: float) -> None:
+        self._group_read(list(_bulk_parts(body)), now)
+
+    def _fast_bulk_read(self, body: bytes, now: float) -> None:
+        self._fast_read(list(_bulk_parts(body)), now)
+
+    def _group_read(self, parts: Sequence[Part], now: float) -> None:
+        measure = self._line.measure
+        replies = []
+        for servo_id, address, length in parts:
+            servo = self._answering(servo_id, now)
+            if servo is None:
+                break
+            measure(servo, address, length)
+            error, data = servo.read(address, length)
+            replies.append((servo_id, servo.return_delay_s, encode_status(servo_id, error | servo.alert, data)))
+        if replies:
+            self._line.send(replies, now)
+
+    def _fast_read(self, parts: Sequence[Part], now: float) -> None:
+        """One packet from all servos; each appends its part and the CRC over everything up to there."""
+        size = 1 + sum(length + 4 for _, _, length in parts)
+        if not parts or size > MAX_LENGTH:
+            return
+        whole = HEADER + bytes((BROADCAST_ID,)) + size.to_bytes(2, "little") + bytes((Instruction.STATUS,))
+        replies = []
+        sent = 0
+        for servo_id, address, length in parts:
+            servo = self._answering(servo_id, now)
+            if servo is None or not servo.has_fast_reads:
+                break
+            error, data = self._read(servo, address, length)
+            whole += bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")
+            whole += crc(whole).to_bytes(2, "little")
+            replies.append((servo_id, servo.return_delay_s, whole[sent:]))
+            sent = len(whole)
+        self._line.send(replies, now)
+
+    def _answering(self, servo_id: int, now: float) -> Servo | None:
+        """The servo that answers a group read under this ID; None when there is none or more than one."""
+        servos = self._by_id.get(servo_id, ())
+        if len(servos) != 1 or servos[0].heard_at != now or servos[0].status_return_level == 0:
+            return None
+        return servos[0]
+
+    def _listening(self, now: float) -> list[Servo]:
+        return [servo for servo in self._servos if servo.hears(now, self._line.baud)]
+
+
+def _bulk_parts(body: bytes) -> Iterator[Part]:
+    for at in range(0, len(body) - 4, 5):
+        yield body[at], body[at + 1] | body[at + 2] << 8, body[at + 3] | body[at + 4] << 8

@@ -1,0 +1,1 @@
+"""Mechanisms behind the fake servos."""

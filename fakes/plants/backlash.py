@@ -1,0 +1,145 @@
+"""An arm with play in its gears: each joint is a rotor and an output shaft that touch at the flanks of a gap.
+
+The rotor (its inertia times the gear ratio squared) carries the motor's torque, all friction and the hard stops; the
+links hang on the output shafts, where the servos' encoders sit. In the gap nothing passes between the two; at a flank
+the gears are a spring and a damper that can push and never pull.
+
+The contact is stiff, so steps are short, and such an arm runs some ten times slower than one without play.
+"""
+
+from collections.abc import Sequence
+from math import ceil, cos, sin
+
+from hil.fakes.plants.arm import Arm, Drive, Link, armature
+from hil.fakes.plants.motor import Motor
+
+STEP = 50e-6  # s: short against the gears' own vibration
+
+
+class GearedArm:
+    """An arm of one or two joints with play; see `hil.fakes.plants.plant.Plant`."""
+
+    def __init__(self, arm: Arm) -> None:
+        self._rotors = [_Rotor(drive, angle) for drive, angle in zip(arm.drives, arm.start, strict=True)]
+        self._links = _Links(arm)
+        self._time = 0.0
+
+    @property
+    def joints(self) -> int:
+        return len(self._rotors)
+
+    @property
+    def position(self) -> Sequence[float]:
+        return self._links.angle
+
+    @property
+    def velocity(self) -> Sequence[float]:
+        return self._links.velocity
+
+    @property
+    def current(self) -> Sequence[float]:
+        return [rotor.motor.current for rotor in self._rotors]
+
+    @property
+    def rotor_angle(self) -> Sequence[float]:
+        """Where the rotors are, as angles of their joints [rad]."""
+        return [rotor.angle for rotor in self._rotors]
+
+    def jam(self, joint: int, jammed: bool) -> None:
+        """Hold a joint's motor fast, or let it go."""
+        self._rotors[joint].motor.jammed = jammed
+
+    def advance(self, until: float, current: Sequence[float]) -> None:
+        remaining = until - self._time
+        if remaining <= 0.0:
+            return
+        self._time = until
+        links = self._links
+        steps = ceil(remaining / STEP)
+        step = remaining / steps
+        for _ in range(steps):
+            contact = [
+                rotor.contact(angle, velocity)
+                for rotor, angle, velocity in zip(self._rotors, links.angle, links.velocity, strict=True)
+            ]
+            for rotor, command, torque in zip(self._rotors, current, contact, strict=True):
+                rotor.move(step, command, torque)
+            links.move(step, contact)
+
+
+class _Rotor:
+    """Motor and gears of one joint, as the joint sees them."""
+
+    def __init__(self, drive: Drive, angle: float) -> None:
+        self.motor = Motor(drive)
+        self.angle = angle
+        self._velocity = 0.0
+        self._inertia = armature(drive)
+        self._half_gap = 0.5 * drive.backlash
+        self._stiffness = drive.gear_stiffness
+        self._damping = drive.gear_damping
+
+    def contact(self, angle: float, velocity: float) -> float:
+        """The torque that the gears pass to an output shaft at this angle and velocity [N m]."""
+        ahead = self.angle - angle
+        if abs(ahead) <= self._half_gap:
+            return 0.0
+        depth = ahead - self._half_gap if ahead > 0.0 else ahead + self._half_gap
+        torque = self._stiffness * depth + self._damping * (self._velocity - velocity)
+        return torque if torque * depth > 0.0 else 0.0
+
+    def move(self, step: float, command: float, contact: float) -> None:
+        v = self._velocity
+        push, level, slope, self.motor.current = self.motor.push(step, command, self.angle, v)
+        impulse = self._inertia * v + step * (push - contact + slope * v)
+        dry = step * level
+        left = impulse - dry if impulse > dry else impulse + dry if impulse < -dry else 0.0
+        self._velocity = left / (self._inertia + step * (self.motor.viscous + slope))
+        self.motor.bend(step, 0.5 * (v + self._velocity))
+        self.angle += step * self._velocity
+
+
+class _Links:
+    """The links alone, moved by torques at their joints."""
+
+    def __init__(self, arm: Arm) -> None:
+        self.angle = list(arm.start)
+        self.velocity = [0.0] * len(arm.links)
+        first = arm.links[0]
+        self._first = _about_joint(first)
+        self._weight_first = first.mass * first.centre * arm.weight
+        if len(arm.links) == 2:
+            second = arm.links[1]
+            beyond = second.mass + arm.drives[1].mass
+            self._first += beyond * first.length**2
+            self._weight_first += beyond * first.length * arm.weight
+            self._second = _about_joint(second)
+            self._swing = second.mass * first.length * second.centre
+            self._weight_second = second.mass * second.centre * arm.weight
+
+    def move(self, step: float, torque: Sequence[float]) -> None:
+        acceleration = self._one(torque[0]) if len(torque) == 1 else self._two(*torque)
+        for joint, rate in enumerate(acceleration):
+            self.velocity[joint] += step * rate
+            self.angle[joint] += step * self.velocity[joint]
+
+    def _one(self, torque: float) -> tuple[float]:
+        return ((torque - self._weight_first * cos(self.angle[0])) / self._first,)
+
+    def _two(self, torque_1: float, torque_2: float) -> tuple[float, float]:
+        q1, q2 = self.angle
+        w1 = self.velocity[0]
+        w2 = w1 + self.velocity[1]
+        across, turning = self._swing * cos(q2), self._swing * sin(q2)
+        m22 = self._second
+        m12 = m22 + across
+        m11 = self._first + across + m12
+        weight_2 = self._weight_second * cos(q1 + q2)
+        b1 = torque_1 + turning * (w2 * w2 - w1 * w1) - self._weight_first * cos(q1) - weight_2
+        b2 = torque_2 - turning * w1 * w1 - weight_2
+        determinant = m11 * m22 - m12 * m12
+        return (m22 * b1 - m12 * b2) / determinant, (m11 * b2 - m12 * b1) / determinant
+
+
+def _about_joint(link: Link) -> float:
+    return link.inertia + link.mass * link.centre**2

@@ -1,0 +1,151 @@
+"""One joint's drive while a plant steps: current lag, torque, friction, stops. Plain floats, called every step.
+
+Dry friction that yields before it slides is that of Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions
+on Automatic Control 40 (1995) 419): bristles that bend with the joint and slip the more the further they are bent,
+
+    friction = stiffness bend + damping bend'        bend' = velocity (1 - stiffness bend / +-level)
+"""
+
+from math import copysign, exp, expm1, sin, sqrt, tanh
+
+from hil.fakes.plants.arm import Drive, armature
+
+LONGEST_STEP = 0.6e-3  # s: short against the arm's own motion
+SHORTEST_STEP = 1e-9  # s: less than this is rounding
+STEP_PER_WIDTH = 0.02  # s per rad/s: short against the time the arm takes to cross a smooth friction step
+STEP_PER_SWING = 0.2  # of the time in which a rotor on its bristles swings through one radian of phase
+JAM = 1e6  # N m of dry friction: more than anything here can push
+
+
+class Motor:
+    """The laws of one drive. It holds no state of the arm; only its current and its friction's bristles move in it."""
+
+    __slots__ = (
+        "_bristle_damping",
+        "_drive",
+        "_lag",
+        "_left",
+        "_level",
+        "_mean_left",
+        "_shaped",
+        "_step",
+        "_width",
+        "bristle_stiffness",
+        "bristle_torque",
+        "constants",
+        "current",
+        "jammed",
+        "longest_step",
+        "viscous",
+    )
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+        self._lag = drive.current_lag
+        self._width = drive.coulomb_width
+        self._shaped = bool(drive.ripple or drive.cogging or drive.load or drive.stops)
+        self._step = self._left = self._mean_left = self._level = 0.0
+        self._bristle_damping = drive.presliding_damping
+        self.bristle_stiffness = drive.presliding_stiffness
+        """0 for dry friction that sticks [N m/rad]."""
+        self.bristle_torque = 0.0  # N m
+        self.constants = (
+            drive.torque_constant,
+            drive.offset,
+            drive.coulomb,
+            drive.coulomb * drive.stribeck_rise,
+            1.0 / drive.stribeck_velocity,
+        )
+        """Torque constant, offset, Coulomb level, Stribeck rise, 1 / Stribeck velocity."""
+        self.viscous = drive.viscous
+        self.jammed = False
+        """True: something holds the joint fast."""
+        self.current = 0.0  # A
+        self.longest_step = min(LONGEST_STEP, STEP_PER_WIDTH * self._width) if self._width else LONGEST_STEP
+        if self.bristle_stiffness and drive.rotor_inertia:
+            swing = sqrt(armature(drive) / self.bristle_stiffness)
+            self.longest_step = min(LONGEST_STEP, STEP_PER_SWING * swing)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether lag, torque, offset and sticking Stribeck friction are all there is to it."""
+        return not (self._shaped or self._width or self.bristle_stiffness or self.jammed)
+
+    def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
+        """What the drive does during one step, its angle and velocity given at the step's middle.
+
+        Returns the mean torque without dry friction that sticks [N m], the level of that friction [N m], the
+        slope of smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
+        """
+        torque_constant, offset, level, rise, per_velocity = self.constants
+        left, mean_left = self.lag(step)
+        away = self.current - command
+        torque = torque_constant * (command + away * mean_left)
+        slope = 0.0
+        if rise:
+            ratio = velocity * per_velocity
+            level += rise * exp(-ratio * ratio)
+        if self._shaped:
+            torque, level, slope = self._shape(step, torque, level, angle, velocity)
+        torque -= offset
+        if self._width:
+            bend = tanh(velocity / self._width)
+            torque -= level * bend
+            slope += level / self._width * (1.0 - bend * bend)
+            level = 0.0
+        elif self.bristle_stiffness:
+            self._level = level
+            end = copysign(level, velocity)
+            turns = self.bristle_stiffness * abs(velocity) * step / level
+            # Its mean over a step at a constant velocity, exactly.
+            bent = end + (self.bristle_torque - end) * (-expm1(-turns) / turns if turns else 1.0)
+            give = 1.0 - copysign(bent, bent * velocity) / level
+            stiff = (0.5 * step * self.bristle_stiffness + self._bristle_damping) * give
+            torque -= bent + self._bristle_damping * give * velocity
+            slope += stiff
+            level = 0.0
+        if self.jammed:
+            level += JAM
+        return torque, level, slope, command + away * left
+
+    def bend(self, step: float, velocity: float) -> None:
+        """Move the bristles through the step last asked for, its mean velocity [rad/s] now known."""
+        if self.bristle_stiffness:
+            self.bristle_torque = self._slipped(step, velocity)
+
+    def _slipped(self, step: float, velocity: float) -> float:
+        """The bristles' torque after `step` [s] at a constant velocity, exactly [N m]."""
+        end = copysign(self._level, velocity)
+        return end + (self.bristle_torque - end) * exp(-self.bristle_stiffness * abs(velocity) * step / self._level)
+
+    def lag(self, step: float) -> tuple[float, float]:
+        """How much of a current's distance from its command is left at the end of a step, and on its average."""
+        if self._lag and step != self._step:
+            # A first-order lag under a constant command, exactly.
+            self._step = step
+            fallen = -expm1(-step / self._lag)
+            self._left = 1.0 - fallen
+            self._mean_left = fallen * self._lag / step
+        return self._left, self._mean_left
+
+    def _shape(
+        self, step: float, torque: float, level: float, angle: float, velocity: float
+    ) -> tuple[float, float, float]:
+        """Ripple, cogging, friction from load and stops, which only some drives have."""
+        drive = self._drive
+        slope = 0.0
+        if drive.ripple:
+            torque *= 1.0 + drive.ripple * sin(drive.ripple_cycles * angle)
+        if drive.load:
+            level += drive.load * abs(torque)
+        if drive.cogging:
+            # Its mean over the step: a joint that turns through whole cycles in a step feels nothing of them.
+            half = 0.5 * step * drive.cogging_cycles * velocity
+            torque += drive.cogging * sin(drive.cogging_cycles * angle) * (sin(half) / half if half else 1.0)
+        if drive.stops is not None:
+            low, high = drive.stops
+            if angle > high or angle < low:
+                beyond = angle - high if angle > high else angle - low
+                torque -= drive.stop_stiffness * beyond + drive.stop_damping * velocity
+                slope = drive.stop_damping
+        return torque, level, slope

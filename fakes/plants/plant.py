@@ -1,0 +1,150 @@
+"""What moves behind the fake servos: the one interface a plant needs to stand there, and how to find one.
+
+A plant of your own is any object with the members of `Plant`, made by a function that takes the description's
+`plant_options` as keywords:
+
+    [fake]
+    plant = "my_package.my_arm:make_plant"
+    plant_options = { payload = 0.3 }
+"""
+
+import importlib
+import math
+from collections.abc import Mapping, Sequence
+from typing import Protocol, runtime_checkable
+
+from hil.fakes.plants.arm import Arm
+from hil.fakes.plants.backlash import GearedArm
+from hil.fakes.plants.pendulum import Pendulum
+from hil.fakes.plants.two_link import TwoLink
+
+
+class PlantError(ValueError):
+    """A plant cannot be made, or gave something that is no state of an arm. The message says which and what is due."""
+
+
+class Plant(Protocol):
+    """A mechanism with one motor per joint, advanced lazily by the bus in the bus's own time.
+
+    Angles and velocities are those of the servos' output shafts: joint 1 from the horizontal, joint 2 relative to
+    link 1 (two-link arm). `current` is what really flows in each motor, after its current loop's lag.
+    """
+
+    @property
+    def joints(self) -> int: ...
+
+    @property
+    def position(self) -> Sequence[float]:
+        """Joint angles [rad]."""
+        ...
+
+    @property
+    def velocity(self) -> Sequence[float]:
+        """Joint velocities [rad/s]."""
+        ...
+
+    @property
+    def current(self) -> Sequence[float]:
+        """Motor currents [A]."""
+        ...
+
+    def advance(self, until: float, current: Sequence[float]) -> None:
+        """Move on to time `until` [s] with the commanded motor currents [A] held constant from the present time on.
+
+        Returns at once when `until` is not later than the plant's present time.
+        """
+        ...
+
+
+@runtime_checkable
+class CanJam(Protocol):
+    """A plant that can hold a joint fast, for the fault `stuck_joint`."""
+
+    def jam(self, joint: int, jammed: bool) -> None:
+        """Hold joint `joint` (from 0) fast, or let it go."""
+        ...
+
+
+def make_plant(arm: Arm) -> Plant:
+    """The plant of this arm, at rest in its starting pose at time 0."""
+    if any(drive.backlash for drive in arm.drives):
+        return GearedArm(arm)
+    return Pendulum(arm) if len(arm.links) == 1 else TwoLink(arm)
+
+
+def load_plant(name: str, options: Mapping[str, object]) -> Plant:
+    """The plant that `module:factory` makes from `options`; raises PlantError."""
+    module_name, _, factory_name = name.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module_name), factory_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise PlantError(f'plant = "{name}": {error}; write "module:factory", importable from here') from error
+    try:
+        plant = factory(**options)
+    except PlantError:
+        raise
+    except Exception as error:
+        raise PlantError(f'plant = "{name}" with {dict(options)}: {type(error).__name__}: {error}') from error
+    missing = [
+        member for member in ("joints", "position", "velocity", "current", "advance") if not hasattr(plant, member)
+    ]
+    if missing:
+        raise PlantError(
+            f'plant = "{name}": its {type(plant).__name__} lacks {", ".join(missing)} of hil.fakes.plants.plant.Plant'
+        )
+    checked = CheckedPlant(plant, name)
+    checked.check()
+    return checked
+
+
+class CheckedPlant:
+    """A plant of somebody else's, whose state is looked at after every step. Raises PlantError."""
+
+    def __init__(self, plant: Plant, name: str) -> None:
+        self._plant = plant
+        self._name = name
+        self._time = 0.0
+
+    @property
+    def joints(self) -> int:
+        return self._plant.joints
+
+    @property
+    def position(self) -> Sequence[float]:
+        return self._plant.position
+
+    @property
+    def velocity(self) -> Sequence[float]:
+        return self._plant.velocity
+
+    @property
+    def current(self) -> Sequence[float]:
+        return self._plant.current
+
+    def advance(self, until: float, current: Sequence[float]) -> None:
+        self._plant.advance(until, current)
+        self._time = until
+        self.check()
+
+    def jam(self, joint: int, jammed: bool) -> None:
+        """Pass it on; PlantError when the plant cannot."""
+        if not isinstance(self._plant, CanJam):
+            raise PlantError(f'plant "{self._name}" has no jam(joint, jammed): a stuck joint needs it')
+        self._plant.jam(joint, jammed)
+
+    def check(self) -> None:
+        """Raise PlantError unless the state is one finite number per joint, three times."""
+        for what in ("position", "velocity", "current"):
+            values = getattr(self._plant, what)
+            try:
+                shape_is_right = len(values) == self.joints
+                numbers_are_right = shape_is_right and all(math.isfinite(value) for value in values)
+            except TypeError:
+                shape_is_right = numbers_are_right = False
+            if not shape_is_right:
+                raise PlantError(
+                    f'plant "{self._name}" at {self._time:g} s: {what} is {values!r}; one number for each of '
+                    f"{self.joints} joints is needed"
+                )
+            if not numbers_are_right:
+                raise PlantError(f'plant "{self._name}" at {self._time:g} s: {what} is {values!r}, which is not finite')

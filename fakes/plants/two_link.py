@@ -1,0 +1,207 @@
+"""Two links in a plane, from masses, lengths and gears: what moves behind the fake servos.
+
+Kinetic energy, with w1 = q1' and w2 = q1' + q2' the links' own turning rates and phi1, phi2 their angles:
+
+    link 1      m1 c1^2 w1^2 / 2 + J1 w1^2 / 2
+    elbow       m_elbow l1^2 w1^2 / 2
+    link 2      m2 (l1^2 w1^2 + c2^2 w2^2 + 2 l1 c2 w1 w2 cos(phi2 - phi1)) / 2 + J2 w2^2 / 2
+    rotors      n1^2 Jr1 q1'^2 / 2 + n2^2 Jr2 q2'^2 / 2
+
+Lagrange's equations are taken in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2; added up
+they give the joints' own. The estimator writes the same arm as a regressor in base parameters; a test holds
+the two together.
+
+One step of time is symmetric and of second order: drift half a step, kick with the step's mean motor torque
+and friction at its middle, drift half a step. Dry friction acts as an impulse on each joint, at most its
+level times the step, and as much of it as brings the joint to rest: sticking is exact. A step in which a
+joint's velocity changes sign is cut at the crossing.
+"""
+
+from collections.abc import Sequence
+from math import ceil, cos, exp, sin
+
+from hil.fakes.plants.arm import Arm, Link, armature
+from hil.fakes.plants.motor import SHORTEST_STEP, Motor
+
+
+class TwoLink:
+    """A two-joint arm; see `hil.fakes.plants.plant.Plant`. `velocity` [rad/s] is the joints' at time 0."""
+
+    def __init__(self, arm: Arm, velocity: Sequence[float] = (0.0, 0.0)) -> None:
+        first, second = arm.links
+        self._motors = (Motor(arm.drives[0]), Motor(arm.drives[1]))
+        beyond = second.mass + arm.drives[1].mass
+        self._inertia_first = _about_joint(first) + beyond * first.length**2
+        self._inertia_second = _about_joint(second)
+        self._swing = second.mass * first.length * second.centre
+        self._turned_first = self._inertia_first + armature(arm.drives[0])
+        self._turned_second = self._inertia_second + armature(arm.drives[1])
+        self._weight_first = (first.mass * first.centre + beyond * first.length) * arm.weight
+        self._weight_second = second.mass * second.centre * arm.weight
+        self._longest_step = min(motor.longest_step for motor in self._motors)
+        self._time = 0.0
+        self._q1, self._q2 = arm.start
+        self._v1, self._v2 = velocity
+        self._a1 = self._a2 = 0.0  # the last step's accelerations, which carry velocities to a middle
+
+    @property
+    def joints(self) -> int:
+        return 2
+
+    @property
+    def position(self) -> tuple[float, float]:
+        return self._q1, self._q2
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        return self._v1, self._v2
+
+    @property
+    def current(self) -> tuple[float, float]:
+        return self._motors[0].current, self._motors[1].current
+
+    def jam(self, joint: int, jammed: bool) -> None:
+        """Hold a joint fast, or let it go."""
+        self._motors[joint].jammed = jammed
+
+    def advance(self, until: float, current: Sequence[float]) -> None:
+        remaining = until - self._time
+        if remaining <= 0.0:
+            return
+        self._time = until
+        self._run(remaining, remaining / ceil(remaining / self._longest_step), *current)
+
+    def _run(self, remaining: float, longest: float, i1: float, i2: float) -> None:  # noqa: PLR0915
+        """Take steps of at most `longest` [s] through `remaining` [s] under commanded currents [A].
+
+        One long loop on plain local floats, because this is where a fake arm spends its time: as a function per step it
+        takes half as long again. A step in which a joint's velocity changes sign is first taken up to there (`cut`).
+        """
+        motor_1, motor_2 = self._motors
+        plain = motor_1.is_plain and motor_2.is_plain
+        jammed = motor_1.jammed or motor_2.jammed
+        bristly = motor_1.bristle_stiffness or motor_2.bristle_stiffness
+        kt_1, offset_1, coulomb_1, rise_1, per_v1 = motor_1.constants
+        kt_2, offset_2, coulomb_2, rise_2, per_v2 = motor_2.constants
+        amp_1, amp_2 = motor_1.current, motor_2.current
+        slope_1 = slope_2 = prepared = 0.0
+        viscous_1, viscous_2 = motor_1.viscous, motor_2.viscous
+        swing, inertia_second = self._swing, self._inertia_second
+        turned_first, turned_second = self._turned_first, self._turned_second
+        weight_first, weight_second = self._weight_first, self._weight_second
+        q1, q2, v1, v2, a1, a2 = self._q1, self._q2, self._v1, self._v2, self._a1, self._a2
+        cut = rest = 0.0
+        while remaining > SHORTEST_STEP:
+            step = cut or rest or (longest if longest < remaining else remaining)
+            half = 0.5 * step
+            middle_v1 = v1 + half * a1 if v1 else 0.0
+            middle_v2 = v2 + half * a2 if v2 else 0.0
+            middle_q1 = q1 + half * v1
+            middle_q2 = q2 + half * v2
+            if plain:  # as Motor.push has it
+                if step != prepared:
+                    prepared = step
+                    left_1, mean_1 = motor_1.lag(step)
+                    left_2, mean_2 = motor_2.lag(step)
+                away_1, away_2 = amp_1 - i1, amp_2 - i2
+                ratio_1, ratio_2 = middle_v1 * per_v1, middle_v2 * per_v2
+                push_1 = kt_1 * (i1 + away_1 * mean_1) - offset_1
+                push_2 = kt_2 * (i2 + away_2 * mean_2) - offset_2
+                level_1 = coulomb_1 + rise_1 * exp(-ratio_1 * ratio_1)
+                level_2 = coulomb_2 + rise_2 * exp(-ratio_2 * ratio_2)
+                next_amp_1, next_amp_2 = i1 + away_1 * left_1, i2 + away_2 * left_2
+            else:
+                push_1, level_1, slope_1, next_amp_1 = motor_1.push(step, i1, middle_q1, middle_v1)
+                push_2, level_2, slope_2, next_amp_2 = motor_2.push(step, i2, middle_q2, middle_v2)
+
+            across = swing * cos(middle_q2)
+            turning = swing * sin(middle_q2)
+            weight_2 = weight_second * cos(middle_q1 + middle_q2)
+            w2 = middle_v1 + middle_v2
+            force_1 = push_1 + turning * (w2 * w2 - middle_v1 * middle_v1) - weight_first * cos(middle_q1) - weight_2
+            force_2 = push_2 - turning * middle_v1 * middle_v1 - weight_2
+
+            # Viscous friction at the mean of old and new velocity, smooth friction linearised about the middle:
+            # (M + D) new = (M - D) v + step (force + slope middle_v) - dry, with D = step / 2 (viscous + slope).
+            m12 = inertia_second + across
+            m11 = turned_first + across + m12
+            damp_1 = half * (viscous_1 + slope_1)
+            damp_2 = half * (viscous_2 + slope_2)
+            b1 = (m11 - damp_1) * v1 + m12 * v2 + step * (force_1 + slope_1 * middle_v1)
+            b2 = m12 * v1 + (turned_second - damp_2) * v2 + step * (force_2 + slope_2 * middle_v2)
+            m11 += damp_1
+            m22 = turned_second + damp_2
+            dry_1 = step * level_1
+            dry_2 = step * level_2
+            # First as if both joints went on sliding the way they do.
+            slid_1 = b1 - dry_1 if v1 > 0.0 else b1 + dry_1
+            slid_2 = b2 - dry_2 if v2 > 0.0 else b2 + dry_2
+            determinant = m11 * m22 - m12 * m12
+            new_1 = (m22 * slid_1 - m12 * slid_2) / determinant
+            new_2 = (m11 * slid_2 - m12 * slid_1) / determinant
+            if (new_1 * v1 <= 0.0 or new_2 * v2 <= 0.0) and (level_1 or level_2):
+                if not cut and not rest:
+                    cut = step * min(_until_zero(v1, new_1), _until_zero(v2, new_2))
+                    if SHORTEST_STEP < cut < step - SHORTEST_STEP:
+                        rest = step - cut
+                        continue
+                    cut = 0.0
+                new_1, new_2 = _sticking((m11, m12, m22), (b1, b2), (dry_1, dry_2), (new_1, new_2))
+            a1 = (new_1 - v1) / step
+            a2 = (new_2 - v2) / step
+            if jammed:  # an impulse within a tiny step says nothing of the next one's middle
+                a1 = a2 = 0.0
+            if bristly:
+                motor_1.bend(step, 0.5 * (v1 + new_1))
+                motor_2.bend(step, 0.5 * (v2 + new_2))
+            v1 = new_1
+            v2 = new_2
+            q1 = middle_q1 + half * new_1
+            q2 = middle_q2 + half * new_2
+            motor_1.current = amp_1 = next_amp_1
+            motor_2.current = amp_2 = next_amp_2
+            remaining -= step
+            if cut:
+                cut = 0.0
+            elif rest:
+                rest = 0.0
+        self._q1, self._q2, self._v1, self._v2, self._a1, self._a2 = q1, q2, v1, v2, a1, a2
+
+
+def _about_joint(link: Link) -> float:
+    return link.inertia + link.mass * link.centre**2
+
+
+def _until_zero(old: float, new: float) -> float:
+    """Part of the step after which the velocity is zero; 1 if it does not get there or starts there."""
+    return old / (old - new) if old * new < 0.0 else 1.0
+
+
+def _sticking(
+    mass: tuple[float, float, float],
+    impulse: tuple[float, float],
+    dry: tuple[float, float],
+    guess: tuple[float, float],
+) -> tuple[float, float]:
+    """New velocities [rad/s] when each joint's friction may take any impulse up to `dry` [N m s].
+
+    They minimise v'Mv/2 - impulse'v + dry'|v|, which is convex: solving for one joint at a time converges.
+    """
+    m11, m12, m22 = mass
+    v1, v2 = guess
+    for _ in range(100):
+        old_1, old_2 = v1, v2
+        v1 = _shrunk(impulse[0] - m12 * v2, dry[0]) / m11
+        v2 = _shrunk(impulse[1] - m12 * v1, dry[1]) / m22
+        if abs(v1 - old_1) + abs(v2 - old_2) < 1e-15:
+            break
+    return v1, v2
+
+
+def _shrunk(impulse: float, limit: float) -> float:
+    """What of an impulse is left after friction took up to `limit` of it."""
+    if impulse > limit:
+        return impulse - limit
+    if impulse < -limit:
+        return impulse + limit
+    return 0.0

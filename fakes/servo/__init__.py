@@ -1,0 +1,1 @@
+"""One servo's control table as a state machine."""

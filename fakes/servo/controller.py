@@ -1,0 +1,181 @@
+"""What a servo does to its motor in each operating mode: PWM and current from goals, gains and profile.
+
+Source: the block diagrams and gain units of the ROBOTIS e-Manual (pages x/<model>, Velocity PI Gain, Position PID
+Gain): P gains count 1/128, I gains 1/65536, the D gain 1/16, feedforward gains 1/4 and 1/1. The period of the control
+loop (1 ms here), what exactly the D gain multiplies and the filters between are unsure, so a move looks right and is
+not the firmware's to the tick.
+"""
+
+import math
+from dataclasses import dataclass
+
+from hil.fakes.servo.memory import Memory
+from hil.fakes.servo.registers import VELOCITY_UNIT_RPM, Model
+from hil.fakes.servo.trajectory import ACCELERATION_PER_MS, VELOCITY_TICKS_PER_MS, Trajectory, profile
+
+CURRENT_MODE = 0
+VELOCITY_MODE = 1
+POSITION_MODE = 3
+EXTENDED_POSITION_MODE = 4
+CURRENT_POSITION_MODE = 5
+PWM_MODE = 16
+
+FULL_PWM = 885
+"""Goal PWM at which the motor sees the whole supply voltage."""
+
+IN_POSITION_TICKS = 20
+"""Distance from the goal below which Moving Status says in-position. Unsure."""
+
+_TIME_BASED = 0x04  # of Drive Mode
+
+# Moving Status
+_IN_POSITION = 0x01
+_PROFILE_ONGOING = 0x02
+_FOLLOWING_ERROR = 0x08
+_RECTANGLE = 0x10
+_TRAPEZOID = 0x30
+_TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
+
+
+@dataclass(frozen=True, slots=True)
+class Goals:
+    """The registers that the controller works from, in their own units."""
+
+    mode: int
+    pwm: int
+    pwm_limit: int
+    current: int
+    velocity: int
+    position: int
+    profile_velocity: int
+    profile_acceleration: int
+    time_based: bool
+    velocity_i: int
+    velocity_p: int
+    position_d: int
+    position_i: int
+    position_p: int
+    feedforward_2: int
+    feedforward_1: int
+
+    @classmethod
+    def read(cls, mode: int, memory: Memory) -> "Goals":
+        """From a control table; 0 where the model has no such register."""
+        value = memory.get
+        return cls(
+            mode=mode,
+            pwm=value("Goal PWM"),
+            pwm_limit=value("PWM Limit"),
+            current=value("Goal Current"),
+            velocity=value("Goal Velocity"),
+            position=value("Goal Position"),
+            profile_velocity=value("Profile Velocity"),
+            profile_acceleration=value("Profile Acceleration"),
+            time_based=bool(value("Drive Mode") & _TIME_BASED),
+            velocity_i=value("Velocity I Gain"),
+            velocity_p=value("Velocity P Gain"),
+            position_d=value("Position D Gain"),
+            position_i=value("Position I Gain"),
+            position_p=value("Position P Gain"),
+            feedforward_2=value("Feedforward 2nd Gain"),
+            feedforward_1=value("Feedforward 1st Gain"),
+        )
+
+
+class Controller:
+    """The control loop of one servo, run once a millisecond while torque is on."""
+
+    def __init__(self) -> None:
+        self.goals: Goals | None = None
+        self.trajectory = Trajectory()
+        self.velocity_trajectory = 0.0
+        """Where velocity control wants to be [0.229 rev/min]."""
+        self._integral = 0.0
+        self._error_before = 0.0
+        self._goal_before: float | None = None
+        self._fastest = self._hardest = 0.0
+
+    def start(self, position_ticks: float) -> None:
+        """Torque comes on, or the mode changes: begin from a stand at the present position."""
+        self.trajectory.start(position_ticks)
+        self.velocity_trajectory = 0.0
+        self._integral = self._error_before = 0.0
+        self._goal_before = None
+
+    def motor_current(self, model: Model, supply_v: float, position_ticks: float, velocity: float) -> float:
+        """One millisecond of control: the current that the motor is to carry [A], as far as the supply allows it.
+
+        velocity: of the output shaft [rad/s], positive as the servo counts.
+        """
+        goals = self.goals
+        if goals is None:
+            return 0.0
+        back = model.back_emf_v_s * velocity
+        limit = goals.pwm_limit
+        if goals.mode == CURRENT_MODE:
+            wanted = goals.current * model.current_unit_a
+        elif goals.mode == CURRENT_POSITION_MODE:
+            wanted = self._position_control(goals, position_ticks, abs(goals.current)) * model.current_unit_a
+            limit = abs(goals.pwm)
+        else:
+            pwm = self._pwm(goals, position_ticks, velocity * _TICKS_PER_RAD_S)
+            wanted = (pwm / FULL_PWM * supply_v - back) / model.resistance_ohm
+        most = limit / FULL_PWM * supply_v
+        return max((-most - back) / model.resistance_ohm, min((most - back) / model.resistance_ohm, wanted))
+
+    def state(self, position_ticks: float) -> tuple[int, float, float]:
+        """The registers Moving Status, Velocity Trajectory and Position Trajectory, before rounding."""
+        velocity = self.trajectory.velocity / VELOCITY_TICKS_PER_MS
+        if self.goals is not None and self.goals.mode == VELOCITY_MODE:
+            velocity = self.velocity_trajectory
+        return self._moving_status(position_ticks), velocity, self.trajectory.position
+
+    def _pwm(self, goals: Goals, position_ticks: float, velocity_ticks: float) -> float:
+        if goals.mode == PWM_MODE:
+            return float(goals.pwm)
+        if goals.mode == VELOCITY_MODE:
+            return self._velocity_control(goals, velocity_ticks, abs(goals.pwm))
+        return self._position_control(goals, position_ticks, abs(goals.pwm))
+
+    def _moving_status(self, position_ticks: float) -> int:
+        """The register Moving Status. When the firmware calls a following error one is unsure."""
+        goals = self.goals
+        if goals is None or goals.mode not in (POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE):
+            return 0
+        status = _IN_POSITION if abs(goals.position - position_ticks) <= IN_POSITION_TICKS else 0
+        if self.trajectory.velocity:
+            status |= _PROFILE_ONGOING | (_TRAPEZOID if goals.profile_acceleration else _RECTANGLE)
+        if abs(self.trajectory.position - position_ticks) > 4 * IN_POSITION_TICKS:
+            status |= _FOLLOWING_ERROR
+        return status
+
+    def _velocity_control(self, goals: Goals, velocity_ticks: float, limit: float) -> float:
+        change = goals.velocity - self.velocity_trajectory
+        if goals.profile_acceleration:
+            most = goals.profile_acceleration * ACCELERATION_PER_MS
+            change = max(-most, min(most, change))
+        self.velocity_trajectory += change
+        error = self.velocity_trajectory - velocity_ticks
+        return self._limited(goals.velocity_p / 128 * error, goals.velocity_i / 65_536 * error, limit)
+
+    def _position_control(self, goals: Goals, position_ticks: float, limit: float) -> float:
+        trajectory = self.trajectory
+        if goals.position != self._goal_before:
+            self._goal_before = goals.position
+            away = goals.position - trajectory.position
+            self._fastest, self._hardest = profile(
+                away, goals.profile_velocity, goals.profile_acceleration, goals.time_based
+            )
+        trajectory.step(goals.position, self._fastest, self._hardest)
+        error = trajectory.position - position_ticks
+        slope, self._error_before = error - self._error_before, error
+        proportional = goals.position_p / 128 * error + goals.position_d / 16 * slope
+        proportional += goals.feedforward_1 / 4 * trajectory.velocity + goals.feedforward_2 * trajectory.acceleration
+        return self._limited(proportional, goals.position_i / 65_536 * error, limit)
+
+    def _limited(self, proportional: float, integrated: float, limit: float) -> float:
+        """The sum within the limit; the integral stands still while the limit holds it (anti-windup)."""
+        wanted = proportional + self._integral + integrated
+        if abs(wanted) <= limit or wanted * integrated < 0.0:
+            self._integral += integrated
+        return max(-limit, min(limit, wanted))

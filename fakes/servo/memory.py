@@ -1,0 +1,111 @@
+"""The bytes of one control table: reading and writing stretches of it, through indirect addresses too."""
+
+from collections.abc import Iterator
+
+from hil.drivers.packet import StatusError
+from hil.fakes.servo.registers import Model, Register
+
+
+class Memory:
+    """Registers as bytes. What may be written when, and what follows from it, is `hil.fakes.servo.servo`'s affair."""
+
+    def __init__(self, model: Model) -> None:
+        self.registers = model.registers
+        self.data = bytearray(max(r.address + r.size for r in model.registers.values()))
+        self._starting_at = {register.address: register for register in model.registers.values()}
+        self._defined = {a for r in model.registers.values() for a in range(r.address, r.address + r.size)}
+        self._readable: set[tuple[int, int]] = set()
+        self._blocks = model.indirect
+        self._points: dict[int, int] = {}
+        """Indirect data that stand for another address: theirs, and the other."""
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.registers
+
+    def value(self, name: str) -> int:
+        """The register's content; KeyError when the model has no such register."""
+        register = self.registers[name]
+        raw = self.data[register.address : register.address + register.size]
+        return int.from_bytes(raw, "little", signed=register.signed)
+
+    def get(self, name: str, otherwise: int = 0) -> int:
+        """The register's content, or `otherwise` when the model has no such register."""
+        return self.value(name) if name in self.registers else otherwise
+
+    def set(self, name: str, value: int) -> None:
+        """Store a value; nothing when the model has no such register."""
+        if name in self.registers:
+            self.store(self.registers[name], value)
+
+    def store(self, register: Register, value: int) -> None:
+        end = register.address + register.size
+        self.data[register.address : end] = value.to_bytes(register.size, "little", signed=register.signed)
+
+    def read(self, address: int, length: int) -> bytes | None:
+        """A stretch of the table; None when it does not begin and end in registers."""
+        if (address, length) not in self._readable:
+            if not (length > 0 and address in self._defined and address + length - 1 in self._defined):
+                return None
+            self._readable.add((address, length))  # the answer never changes
+        if self._points and self.is_indirect(address, length):
+            data, points = self.data, self._points
+            return bytes([data[points.get(at, at)] for at in range(address, address + length)])
+        return bytes(self.data[address : address + length])
+
+    def is_indirect(self, address: int, length: int) -> bool:
+        """Whether the stretch covers data that stand for another address."""
+        return any(at in self._points for at in range(address, address + length))
+
+    def follow_indirect_addresses(self) -> None:
+        """Take note of where the indirect addresses point; to be called when one was written."""
+        self._points.clear()
+        for first_address, first_data, count in self._blocks:
+            for index in range(count):
+                at = first_address + 2 * index
+                target = self.data[at] | self.data[at + 1] << 8
+                # One that points at indirect data, its own from the factory, is plain memory.
+                if target != first_data + index and target in self._defined and not self._is_indirect_data(target):
+                    self._points[first_data + index] = target
+
+    def split(self, address: int, data: bytes) -> tuple[list[tuple[Register, int]], int]:
+        """The registers that a write covers with their values, and the error if it does not fit them."""
+        if not (self._points and self.is_indirect(address, len(data))):
+            return self._split_stretch(address, data)
+        writes: list[tuple[Register, int]] = []
+        for start, stretch in self._stretches(address, data):
+            part, error = self._split_stretch(start, stretch)
+            if error:
+                return writes, error
+            writes += part
+        return writes, StatusError.NONE
+
+    def _is_indirect_data(self, address: int) -> bool:
+        return any(first <= address < first + count for _, first, count in self._blocks)
+
+    def _stretches(self, address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """What a write through indirect data writes really: stretches of successive addresses."""
+        start = end = -1
+        stretch = b""
+        for offset, byte in enumerate(data):
+            at = self._points.get(address + offset, address + offset)
+            if at != end:
+                if stretch:
+                    yield start, stretch
+                start, stretch = at, b""
+            stretch += bytes((byte,))
+            end = at + 1
+        yield start, stretch
+
+    def _split_stretch(self, address: int, data: bytes) -> tuple[list[tuple[Register, int]], int]:
+        writes: list[tuple[Register, int]] = []
+        at, end = address, address + len(data)
+        while at < end:
+            register = self._starting_at.get(at)
+            if register is None:
+                return writes, StatusError.DATA_LENGTH if at in self._defined else StatusError.ACCESS
+            if at + register.size > end:
+                return writes, StatusError.DATA_LENGTH
+            raw = data[at - address : at - address + register.size]
+            writes.append((register, int.from_bytes(raw, "little", signed=register.signed)))
+            at += register.size
+        return writes, StatusError.NONE

@@ -1,0 +1,164 @@
+"""What a servo measures of its joint and puts into its present registers, in ticks."""
+
+import math
+from collections.abc import Callable
+from random import Random
+from struct import Struct
+
+from hil.drivers.packet import StatusError
+from hil.fakes.servo.memory import Memory
+from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
+
+PRESENT_START = 120
+PRESENT_END = 147
+"""First address of the present registers, and the first behind them."""
+
+STATE_START = 126
+STATE_END = 136
+"""The same of Present Current, Velocity and Position, which a control cycle reads."""
+
+_TICKS_PER_RAD = TICKS_PER_TURN / math.tau
+_TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
+_REALTIME_TICK_WRAP = 32_768
+_REVERSE = 0x01  # of Drive Mode
+_CLEAR_TURNS = b"\x01DXL\x22"
+
+# Realtime Tick, Moving, Moving Status, Present PWM; Present Current (or Load), Velocity, Position; the trajectories.
+_BEFORE = Struct("<HBBh")
+_STATE = Struct("<hii")
+_TRAJECTORIES = Struct("<ii")
+
+Share = Callable[[float, float], float]
+
+
+class Present:
+    """The encoder, the current sensor and the clock of one servo."""
+
+    def __init__(
+        self,
+        memory: Memory,
+        model: Model,
+        zero_ticks: int,
+        direction: int,
+        clock_rate: float,
+        current_noise_a: float,
+        noise: Random | None,
+    ) -> None:
+        self.zero_ticks = zero_ticks
+        self.direction = direction
+        self.sign = direction
+        """+1 or -1: the servo's sense of rotation as it reports it, against the joint's."""
+        self.jump_ticks = 0
+        """By how much the encoder is wrong."""
+        self._memory = memory
+        self._model = model
+        self._clock_rate = clock_rate
+        self._noise_a = current_noise_a
+        self._noise = noise
+        self._unit = model.current_unit_a
+        self._imperfect = noise is not None or model.senses_supply
+        self._booted_at = 0.0
+        self._turn_ticks = 0
+        self._shift = 0
+        self._reversed = False
+        self._moving_threshold = 0
+        self._share: Share = lambda current, velocity: 0.0
+        registers = model.registers
+        self._is_x_series = "Present Position" in registers and registers["Present Position"].address == 132
+
+    def derive(self, share: Share) -> None:
+        """Take over what registers say; share: of time in which the bridge is on for a current and a velocity."""
+        self._reversed = bool(self._memory.get("Drive Mode") & _REVERSE)
+        self.sign = -self.direction if self._reversed else self.direction
+        self._moving_threshold = self._memory.get("Moving Threshold")
+        self._share = share
+        self._shift_changed()
+
+    def power_up(self, now: float, position: float) -> None:
+        """Count time and turns from here."""
+        self._booted_at = now
+        self._forget_turns(position)
+
+    def clear(self, body: bytes, moving: bool, position: float) -> int:
+        """The instruction Clear: forget the turns; the error number. Errors but Result Fail are unsure."""
+        if len(body) != len(_CLEAR_TURNS):
+            return StatusError.DATA_LENGTH
+        if body != _CLEAR_TURNS:
+            return StatusError.DATA_RANGE
+        if moving:
+            return StatusError.RESULT_FAIL
+        self._forget_turns(position)
+        return StatusError.NONE
+
+    def ticks(self, position: float) -> float:
+        """Present Position at a joint angle [rad], before rounding."""
+        ticks = self.zero_ticks + self.direction * position * _TICKS_PER_RAD
+        return (TICKS_PER_TURN - ticks if self._reversed else ticks) + self._shift
+
+    def velocity_ticks(self, velocity: float) -> float:
+        """Present Velocity at a joint velocity [rad/s], before rounding."""
+        return self.sign * velocity * _TICKS_PER_RAD_S
+
+    def moves(self, velocity: float) -> bool:
+        """Whether Moving is 1 at a joint velocity [rad/s]."""
+        return abs(round(self.velocity_ticks(velocity))) > self._moving_threshold
+
+    def state(self, position: float, velocity: float, current: float) -> bytes:
+        """Registers 126 to 135 of a joint: angle [rad], velocity [rad/s], motor current [A]."""
+        sign = self.sign
+        unit = self._unit
+        ticks = 0
+        if unit:
+            if self._imperfect:
+                current = self._sensed(current, velocity)
+            ticks = round(sign * current / unit)
+            if ticks > 32_767 or ticks < -32_768:
+                ticks = -32_768 if ticks < 0 else 32_767
+        encoder = round(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
+        if self._reversed:
+            encoder = TICKS_PER_TURN - encoder
+        return _STATE.pack(ticks, round(sign * velocity * _TICKS_PER_RAD_S), encoder + self._shift + self.jump_ticks)
+
+    def measure(self, address: int, end: int, now: float, position: float, velocity: float, current: float) -> None:
+        """Bring the present registers between two addresses up to date with the joint, at `now` [s]."""
+        if not self._is_x_series:
+            self._measure_other(now, position)
+            return
+        data = self._memory.data
+        data[STATE_START:STATE_END] = self.state(position, velocity, current)
+        if address < STATE_START or end > STATE_END:
+            tick = int((now - self._booted_at) * self._clock_rate * 1000) % _REALTIME_TICK_WRAP
+            pwm = round(885 * self._share(self.sign * current, self.sign * velocity))
+            _BEFORE.pack_into(data, PRESENT_START, tick, self.moves(velocity), data[123], pwm)
+
+    def tell_trajectory(self, status: int, velocity_ticks: float, position_ticks: float) -> None:
+        """Moving Status and the two trajectory registers."""
+        data = self._memory.data
+        data[123] = status
+        _TRAJECTORIES.pack_into(data, STATE_END, round(velocity_ticks), round(position_ticks))
+
+    def _sensed(self, current: float, velocity: float) -> float:
+        """What the current sensor makes of the motor's current [A]."""
+        if self._noise is not None:
+            current += self._noise.gauss(0.0, self._noise_a)
+        if self._model.senses_supply:
+            current *= abs(self._share(current, velocity))
+        return current
+
+    def _measure_other(self, now: float, position: float) -> None:
+        """A model of another series: its position, in ticks of an X-series encoder, if it has the register."""
+        register = self._model.registers.get("Present Position")
+        if register is not None and register.size == 4:
+            self._memory.store(register, round(self.ticks(position)))
+        tick = int((now - self._booted_at) * self._clock_rate * 1000) % _REALTIME_TICK_WRAP
+        self._memory.set("Realtime Tick", tick)
+
+    def _forget_turns(self, position: float) -> None:
+        self._turn_ticks = 0
+        self._shift_changed()
+        raw = round(self.ticks(position)) - self._memory.get("Homing Offset")
+        self._turn_ticks = -(raw // TICKS_PER_TURN) * TICKS_PER_TURN
+        self._shift_changed()
+
+    def _shift_changed(self) -> None:
+        self._shift = self._turn_ticks + self._memory.get("Homing Offset")

@@ -1,0 +1,172 @@
+"""Control tables of the fake servos: what each register is, where it lies, what may be written to it.
+
+Addresses, sizes and signs come from `hil.drivers.control_table`; area, access, factory values and ranges from
+`hil.fakes.servo.model_facts`. Indirect addresses and data, Startup Configuration and Backup Ready, which the SDK's
+tables leave out, are added here from the e-Manual (pages x/<model>). On the 330 series the indirect data begin at 208,
+as that manual and the SDK's file for firmware 52 say; the SDK's file for older firmware says 224: unsure.
+
+A model outside the X series answers with what its table in the SDK says: its registers hold what is written to them,
+within their size, and its motor does not move.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+
+from hil.drivers.control_table import load_control_table, model_names
+from hil.fakes.servo.model_facts import FACTS, NEVER, STANDS_FOR, X_SERIES, ModelFacts, RegisterFacts
+
+BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
+"""Baud by the value of the register Baud Rate. The 330 models end at 4 M."""
+
+TICKS_PER_TURN = 4096
+VELOCITY_UNIT_RPM = 0.229
+
+_ADDED = (("Startup Configuration", 60, 1), ("Backup Ready", 147, 1))
+_NOT_WRITABLE = ("Present", "Model", "Firmware", "Moving Status", "Hardware Error", "Realtime", "Registered")
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """One register: where it lies, who may write it, and within which range (inclusive, in its own units)."""
+
+    name: str
+    address: int
+    size: int
+    signed: bool
+    eeprom: bool
+    writable: bool
+    initial: int
+    minimum: int
+    maximum: int
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """One servo model: its control table by name, and what the table does not say."""
+
+    name: str
+    number: int
+    current_unit_a: float
+    """Ampere per tick of Goal Current and Present Current; 0 where the model senses no current."""
+    operating_modes: frozenset[int]
+    """Empty where nothing is known of the motor: it then never moves."""
+    fast_read_firmware: int
+    """First firmware that knows Fast Sync Read, Fast Bulk Read and Control Table Backup."""
+    nominal_voltage_v: float
+    resistance_ohm: float
+    back_emf_v_s: float
+    """Voltage per velocity of the output shaft [V s/rad]."""
+    senses_supply: bool
+    indirect: tuple[tuple[int, int, int], ...]
+    """Blocks of indirect addressing: first address register, first data register, how many."""
+    registers: Mapping[str, Register]
+
+
+MODEL_NAMES = tuple(FACTS)
+"""Servo models whose factory values and ranges are known."""
+
+
+def all_model_names() -> tuple[str, ...]:
+    """Every model that a fake servo can be: those of `MODEL_NAMES` first, then the others of the SDK's tables."""
+    return (*MODEL_NAMES, *sorted(name for name in model_names().values() if name not in FACTS))
+
+
+@cache
+def load_model(name: str) -> Model:
+    """The control table of one model, e.g. "XM430-W350".
+
+    Raises KeyError when no table describes the model; `all_model_names` lists those that are.
+    """
+    if name not in model_names().values():
+        raise KeyError(name)
+    facts = FACTS.get(STANDS_FOR.get(name, name))
+    return _x_series(name, facts) if facts is not None else _unknown(name)
+
+
+def _x_series(name: str, facts: ModelFacts) -> Model:
+    table = {**X_SERIES, **facts.differs}
+    addresses = load_control_table(name)
+    registers = [
+        _register(entry.name, entry.address, entry.size, entry.signed, table.get(entry.name, RegisterFacts()))
+        for entry in addresses.registers.values()
+        if not entry.name.startswith("Indirect")
+    ]
+    known = {register.name for register in registers}
+    registers += [_register(*added, False, table[added[0]]) for added in _ADDED if added[0] not in known]
+    registers += _indirect_registers(facts.indirect)
+    return Model(
+        name=name,
+        number=addresses.number,
+        current_unit_a=facts.current_unit_a,
+        operating_modes=facts.operating_modes,
+        fast_read_firmware=facts.fast_read_firmware,
+        nominal_voltage_v=facts.nominal_voltage_v,
+        resistance_ohm=facts.resistance_ohm,
+        back_emf_v_s=facts.back_emf_v_s,
+        senses_supply=facts.senses_supply,
+        indirect=facts.indirect,
+        registers={register.name: register for register in sorted(registers, key=lambda r: r.address)},
+    )
+
+
+def _indirect_registers(blocks: tuple[tuple[int, int, int], ...]) -> Iterator[Register]:
+    last = max(data + count - 1 for _, data, count in blocks)
+    number = 0
+    for first_address, first_data, count in blocks:
+        for index in range(count):
+            number += 1
+            data = first_data + index
+            points = RegisterFacts(data, (64, last))  # at its own data register, until it is set
+            yield _register(f"Indirect Address {number}", first_address + 2 * index, 2, False, points)
+            yield _register(f"Indirect Data {number}", data, 1, False, RegisterFacts())
+
+
+def _unknown(name: str) -> Model:
+    """A model of which only addresses and sizes are known."""
+    addresses = load_control_table(name)
+    torque = addresses.registers.get("Torque Enable")
+    ram = torque.address if torque is not None else 64
+    taken: set[int] = set()
+    registers = {}
+    for entry in addresses.registers.values():
+        span = set(range(entry.address, entry.address + entry.size))
+        if span & taken:
+            continue  # the SDK's second name for the same bytes
+        taken |= span
+        facts = RegisterFacts(
+            initial={"ID": 1, "Baud Rate": 1, "Status Return Level": 2}.get(entry.name, 0),
+            limits=(0, 252) if entry.name == "ID" else None,
+            writable=not entry.name.startswith(_NOT_WRITABLE),
+        )
+        registers[entry.name] = _register(entry.name, entry.address, entry.size, entry.signed, facts, ram)
+    return Model(
+        name=name,
+        number=addresses.number,
+        current_unit_a=0.0,
+        operating_modes=frozenset(),
+        fast_read_firmware=NEVER,
+        nominal_voltage_v=12.0,
+        resistance_ohm=1.0,
+        back_emf_v_s=1.0,
+        senses_supply=False,
+        indirect=(),
+        registers=registers,
+    )
+
+
+def _register(name: str, address: int, size: int, signed: bool, facts: RegisterFacts, ram: int = 64) -> Register:
+    bits = 8 * size
+    everything = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    minimum, maximum = facts.limits or everything
+    return Register(
+        name=name,
+        address=address,
+        size=size,
+        signed=signed,
+        eeprom=address < ram,
+        writable=facts.writable,
+        initial=facts.initial,
+        minimum=minimum,
+        maximum=maximum,
+    )

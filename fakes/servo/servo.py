@@ -1,0 +1,448 @@
+"""One fake servo: a control table as a state machine. It knows no bus and no plant; `hil.fakes.bus.bus` gives it both.
+
+What it does is written in the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent this
+module decides as follows, choosing what asks more of a client:
+
+- A write that covers several registers is checked as a whole; if one refuses, none is written.
+- A write must begin and end on register boundaries: in the middle of a register it is a Data Length error, at an
+  undefined address an Access error. A read may begin inside a register; undefined bytes between two registers read 0,
+  and a read that begins or ends at an undefined address is an Access error.
+- A goal beyond its limit register is refused with Data Limit (some firmware may clamp instead).
+- When the Bus Watchdog trips, Goal Current, Goal PWM and Goal Velocity become 0, Goal Position becomes Present
+  Position, and torque stays enabled. While tripped, only 0 may be written to it.
+- After a shutdown, a write of 1 to Torque Enable is answered without an error number but leaves torque off.
+- At power-up, as after a change of Operating Mode, Goal Current and Goal PWM are at their limits: a client that enables
+  torque in current mode without writing a goal first gets full current. Goal Velocity is 0.
+- When torque comes on, Goal Position becomes Present Position.
+- Reverse mode (Drive Mode bit 0) mirrors Present Position about half a turn.
+
+A model without a current sensor (XL430-W250) has no current mode and reads a Present Load of 0.
+"""
+
+from collections.abc import Callable, Mapping
+from random import Random
+
+from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
+from hil.fakes.servo.backup import Backup, factory_reset
+from hil.fakes.servo.controller import CURRENT_MODE, Controller, Goals
+from hil.fakes.servo.health import Health, Overload, Thermal
+from hil.fakes.servo.memory import Memory
+from hil.fakes.servo.present import Present
+from hil.fakes.servo.registers import BAUD_RATES, Model, Register
+from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, WATCHDOG_TRIPPED, refusal
+
+BOOT_S = 0.25
+"""How long a servo is deaf after Reboot [s]. Unsure: the manual gives no figure; clients in use wait 0.3 to 1 s."""
+
+WATCHDOG_UNIT_S = 0.020
+
+_NO_SHADOW_ID = 253
+_GOAL_CURRENT = 102
+
+_TORQUE_ON_BY_GOAL_UPDATE = 0x08  # of Drive Mode
+
+# Startup Configuration
+_TORQUE_ON_AT_BOOT = 0x01
+_RESTORE_AT_BOOT = 0x02
+
+
+class Servo:
+    """A servo on its own: registers, what may be done to them, and what the motor is told to do.
+
+    Times are seconds on the bus's clock. `direction` is -1 where the servo turns against its joint; `zero_ticks` is the
+    Present Position (Homing Offset 0) at which the joint's angle is 0. `current_noise_a` is the standard deviation of
+    Present Current [A], `clock_error_ppm` how much too fast its own clock runs, `voltage_limited` whether the supply
+    limits the current in current mode too. `seed` is of the noise.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        servo_id: int,
+        *,
+        zero_ticks: int = 0,
+        direction: int = 1,
+        firmware: int = 48,
+        baud: int = 1_000_000,
+        return_delay_us: int = 0,
+        input_voltage_v: float | None = None,
+        temperature_c: float = 35.0,
+        registers: Mapping[str, int] | None = None,
+        current_noise_a: float = 0.0,
+        clock_error_ppm: float = 0.0,
+        voltage_limited: bool = False,
+        thermal: Thermal | None = None,
+        overload: Overload | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.model = model
+        self.firmware = firmware
+        self.has_fast_reads = firmware >= model.fast_read_firmware
+        """Whether it knows Fast Sync Read, Fast Bulk Read and Control Table Backup."""
+        self.connected = True
+        """False: its bus cable is out. It hears nothing and says nothing; its motor does as last told."""
+        self.heard_at = 0.0
+        """When the last instruction packet reached it [s]; the Bus Watchdog counts from here."""
+        self.ready_at = 0.0
+        """When it has booted [s]; deaf before."""
+        self.memory = Memory(model)
+        noise = Random(f"current {seed} {servo_id}") if current_noise_a else None
+        self.present = Present(
+            self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a, noise
+        )
+        self.controller = Controller()
+        self.health = Health(model.resistance_ohm, temperature_c, thermal, overload)
+        self.motor_current_a = 0.0
+        """Current that the motor is told to carry, in the joint's direction [A]."""
+        self._voltage_limited = voltage_limited
+        self._input_voltage_v = model.nominal_voltage_v if input_voltage_v is None else input_voltage_v
+        self._sag_v = 0.0
+        self._dip_v = 0.0
+        self._set_baud = baud
+        self._registered: bytes | None = None
+        self._backup = Backup()
+        self._angle: Callable[[], float] = lambda: 0.0
+        self.changed: Callable[[], None] = lambda: None
+        """Called after any change to what the bus has to know of it: ID, baud, need of ticks."""
+        self._after: dict[str, Callable[[], None]] = {
+            "Torque Enable": self._torque_enable_written,
+            "Operating Mode": self._operating_mode_written,
+            "Max Voltage Limit": self._check_health,
+            "Min Voltage Limit": self._check_health,
+            "Temperature Limit": self._check_health,
+            "Shutdown": self._shut_down_if_masked,
+        }
+        eeprom = {
+            "Model Number": model.number,
+            "Firmware Version": firmware,
+            "ID": servo_id,
+            "Baud Rate": BAUD_RATES.index(baud),
+            "Return Delay Time": return_delay_us // 2,
+        } | dict(registers or {})
+        for register in model.registers.values():
+            self.memory.store(register, eeprom.get(register.name, register.initial))
+        self._reset_goals()
+        self._derive()
+
+    # What the bus does with it
+
+    def power_up(self, now: float, angle: Callable[[], float], boot_s: float = 0.0) -> None:
+        """Start afresh at time `now` [s]; deaf for `boot_s`. `angle` tells the joint's position [rad] at any time.
+
+        The RAM area takes its initial values (or the backup's, by Startup Configuration), torque is off, errors are
+        gone, and the count of turns is lost: Present Position starts within one turn (before Homing Offset).
+        """
+        memory = self.memory
+        for register in memory.registers.values():
+            if not register.eeprom:
+                memory.store(register, register.initial)
+        startup = memory.get("Startup Configuration")
+        self._backup.mark(memory)
+        if startup & _RESTORE_AT_BOOT:
+            self._backup.restore(memory, eeprom=False)
+        memory.follow_indirect_addresses()
+        self._registered = None
+        self._angle = angle
+        self.ready_at = now + boot_s
+        self.heard_at = now
+        self.health.rest()
+        self._derive()
+        self.present.power_up(now, angle())
+        self._reset_goals()
+        memory.set("Torque Enable", startup & _TORQUE_ON_AT_BOOT)
+        self._check_health()
+        self._derive()
+        self.controller.start(self.present.ticks(angle()))
+
+    def reboot(self, now: float, boot_s: float = BOOT_S) -> None:
+        """Switch it off and on again, by instruction or because its supply broke down."""
+        self.power_up(now, self._angle, boot_s)
+
+    def hears(self, now: float, baud: int) -> bool:
+        """Whether a packet at this baud that ends at `now` [s] is understood."""
+        return self.baud == baud and self.connected and now >= self.ready_at
+
+    def trip_watchdog(self) -> None:
+        """The Bus Watchdog's time is over: stop the motor and refuse goals until 0 is written to the register."""
+        memory = self.memory
+        memory.set("Bus Watchdog", WATCHDOG_TRIPPED)
+        for name in ("Goal Current", "Goal PWM", "Goal Velocity"):
+            memory.set(name, 0)
+        self._hold_position()
+        self._derive()
+
+    def fail(self, error: HardwareError) -> None:
+        """Set bits of Hardware Error Status; those in the Shutdown mask turn torque off. Only Reboot clears them."""
+        self.memory.set("Hardware Error Status", self.memory.get("Hardware Error Status") | error)
+        self._shut_down_if_masked()
+        self._derive()
+
+    def tick(self, step_s: float, position: float, velocity: float, current: float) -> None:
+        """One period of the servo's own loop ends: warm up, and control the motor. The joint's state in SI units."""
+        if self.health.changes:
+            if self.health.step(step_s, current) and not self.hardware_error & HardwareError.OVERLOAD:
+                self.fail(HardwareError.OVERLOAD)
+            if round(self.health.temperature_c) != self.memory.get("Present Temperature"):
+                self._check_health()
+                self._derive()
+        if not self._torque:
+            return
+        if self._mode != CURRENT_MODE or self._voltage_limited:
+            ticks = self.present.ticks(position)
+            wanted = self.controller.motor_current(self.model, self.supply_v, ticks, self.present.sign * velocity)
+            self.motor_current_a = self.present.sign * wanted
+            self.present.tell_trajectory(*self.controller.state(ticks))
+
+    # What a test asks of it
+
+    def value(self, name: str) -> int:
+        """The register's present content; KeyError when the model has no such register."""
+        return self.memory.value(name)
+
+    @property
+    def direction(self) -> int:
+        return self.present.direction
+
+    @property
+    def torque_enabled(self) -> bool:
+        return self.memory.get("Torque Enable") == 1
+
+    @property
+    def operating_mode(self) -> int:
+        return self.memory.get("Operating Mode")
+
+    @property
+    def goal_current_ticks(self) -> int:
+        return self.memory.value("Goal Current")
+
+    @property
+    def watchdog_tripped(self) -> bool:
+        return self.memory.get("Bus Watchdog") == WATCHDOG_TRIPPED
+
+    @property
+    def hardware_error(self) -> HardwareError:
+        return HardwareError(self.memory.get("Hardware Error Status"))
+
+    @property
+    def supply_v(self) -> float:
+        """The voltage at the servo's plug [V]."""
+        return max(0.0, self._input_voltage_v - self._sag_v - self._dip_v)
+
+    @property
+    def input_voltage_v(self) -> float:
+        """The supply's voltage without load [V]."""
+        return self._input_voltage_v
+
+    @input_voltage_v.setter
+    def input_voltage_v(self, volt: float) -> None:
+        self._input_voltage_v = volt
+        self._check_health()
+        self._derive()
+
+    @property
+    def sag_v(self) -> float:
+        """What the load takes off the supply's voltage [V]."""
+        return self._sag_v
+
+    @sag_v.setter
+    def sag_v(self, volt: float) -> None:
+        self._sag_v = volt
+        if round(10 * self.supply_v) != self.memory.get("Present Input Voltage"):
+            self._check_health()
+            self._derive()
+
+    def dip(self, volt: float) -> None:
+        """Take so much off the supply's voltage [V]; 0 ends it."""
+        self._dip_v = volt
+        self._check_health()
+        self._derive()
+
+    @property
+    def temperature_c(self) -> float:
+        return self.health.temperature_c
+
+    @temperature_c.setter
+    def temperature_c(self, celsius: float) -> None:
+        self.health.temperature_c = celsius
+        self._check_health()
+        self._derive()
+
+    # Instructions
+
+    def execute(self, instruction: int, body: bytes, now: float, moving: bool) -> tuple[int, bytes]:
+        """Act on an instruction addressed to this servo; the error number (Alert bit aside) and the data of its status.
+
+        Read is not among them: the bus answers it with `read`, after measuring.
+        """
+        if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
+            return StatusError.DATA_LENGTH, b""
+        data = b""
+        error: int = StatusError.NONE
+        match instruction:
+            case Instruction.PING:
+                data = self.model.number.to_bytes(2, "little") + bytes((self.firmware,))
+            case Instruction.WRITE:
+                error = self.write(body[0] | body[1] << 8, body[2:])
+            case Instruction.REG_WRITE:
+                error = self._register_write(body)
+            case Instruction.ACTION:
+                error = self._act()
+            case Instruction.REBOOT:
+                self.reboot(now)
+            case Instruction.FACTORY_RESET:
+                error = factory_reset(self.memory, body)
+                if not error:
+                    self.reboot(now)
+            case Instruction.CLEAR:
+                error = self.present.clear(body, moving, self._angle())
+            case Instruction.CONTROL_TABLE_BACKUP if self.has_fast_reads:
+                error = self._backup.execute(self.memory, body)
+                self._derive()
+            case _:
+                error = StatusError.INSTRUCTION
+        return error, data
+
+    def read(self, address: int, length: int) -> tuple[int, bytes]:
+        """Error number and bytes of a stretch of the control table."""
+        data = self.memory.read(address, length)
+        return (StatusError.NONE, data) if data is not None else (StatusError.ACCESS, b"")
+
+    def write(self, address: int, data: bytes) -> int:
+        """Write a stretch of the control table; the error number."""
+        if address == _GOAL_CURRENT and len(data) == 2 and self._takes_goal_current:
+            return self._write_goal_current(data)
+        writes, error = self.memory.split(address, data)
+        for register, value in writes:
+            error = error or refusal(self.memory, self.model, register, value)
+        if error:
+            return error
+        for register, value in writes:
+            self._write(register, value)
+        self._derive()
+        return StatusError.NONE
+
+    def _write(self, register: Register, value: int) -> None:
+        self.memory.store(register, value)
+        name = register.name
+        if name in self._after:
+            self._after[name]()
+        elif name.startswith("Indirect Address"):
+            self.memory.follow_indirect_addresses()
+        if name in GOALS and self.memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE:
+            self.memory.set("Torque Enable", 1)
+            self._shut_down_if_masked()
+
+    def _write_goal_current(self, data: bytes) -> int:
+        """The write that a control cycle makes, with the same outcome as the long way round."""
+        ticks = int.from_bytes(data, "little", signed=True)
+        limit = self._current_limit
+        if ticks > limit or ticks < -limit:
+            return StatusError.DATA_LIMIT
+        self.memory.data[_GOAL_CURRENT : _GOAL_CURRENT + 2] = data
+        if self._driven:
+            self.motor_current_a = ticks * self._current_per_tick
+        return StatusError.NONE
+
+    def _register_write(self, body: bytes) -> int:
+        writes, error = self.memory.split(body[0] | body[1] << 8, body[2:])
+        for register, value in writes:
+            error = error or refusal(self.memory, self.model, register, value)
+        if not error:
+            self._registered = body
+            self.memory.set("Registered Instruction", 1)
+        return error
+
+    def _act(self) -> int:
+        body, self._registered = self._registered, None
+        if body is None:
+            return StatusError.INSTRUCTION
+        self.memory.set("Registered Instruction", 0)
+        return self.write(body[0] | body[1] << 8, body[2:])
+
+    # What follows from a write
+
+    def _torque_enable_written(self) -> None:
+        self._shut_down_if_masked()
+        if self.torque_enabled and not self._torque:
+            self._hold_position()
+
+    def _operating_mode_written(self) -> None:
+        self._reset_goals()
+        for name in GAINS:
+            if name in self.memory:
+                self.memory.set(name, self.memory.registers[name].initial)
+
+    def _reset_goals(self) -> None:
+        for goal, limit in LIMIT_OF_GOAL.items():
+            self.memory.set(goal, 0 if goal == "Goal Velocity" else self.memory.get(limit))
+        self._hold_position()
+
+    def _hold_position(self) -> None:
+        """The goal is where the joint is."""
+        ticks = self.present.ticks(self._angle())
+        if self.model.operating_modes:
+            self.memory.set("Goal Position", round(ticks))
+        self.controller.start(ticks)
+
+    def _check_health(self) -> None:
+        """Compare supply and temperature with their limits; what is found stays in Hardware Error Status."""
+        memory = self.memory
+        decivolt, celsius = max(0, round(10 * self.supply_v)), max(0, min(255, round(self.temperature_c)))
+        memory.set("Present Input Voltage", decivolt)
+        memory.set("Present Temperature", celsius)
+        if not self.model.operating_modes:
+            return  # nothing is known of its limits
+        error = memory.value("Hardware Error Status")
+        if not memory.value("Min Voltage Limit") <= decivolt <= memory.value("Max Voltage Limit"):
+            error |= HardwareError.INPUT_VOLTAGE
+        if celsius > memory.value("Temperature Limit"):
+            error |= HardwareError.OVERHEATING
+        memory.set("Hardware Error Status", error)
+        self._shut_down_if_masked()
+
+    def _shut_down_if_masked(self) -> None:
+        if self.memory.get("Hardware Error Status") & self.memory.get("Shutdown"):
+            self.memory.set("Torque Enable", 0)
+
+    def _derive(self) -> None:
+        """Work out once, after any change, what every packet asks for."""
+        memory = self.memory
+        self.id = memory.get("ID")
+        shadow = memory.get("Secondary(Shadow) ID", _NO_SHADOW_ID)
+        self.shadow_id = shadow if shadow < _NO_SHADOW_ID else None
+        """A second ID whose instructions it executes and does not answer; None when it has none."""
+        baud = memory.get("Baud Rate", BAUD_RATES.index(self._set_baud))
+        self.baud = BAUD_RATES[baud] if baud < len(BAUD_RATES) else self._set_baud
+        self.return_delay_s = 2e-6 * memory.get("Return Delay Time")
+        self.status_return_level = memory.get("Status Return Level", 2)
+        self.alert = ALERT if memory.get("Hardware Error Status") else 0
+        watchdog = memory.get("Bus Watchdog")
+        self._torque = self.torque_enabled
+        counting = self._torque and watchdog != WATCHDOG_TRIPPED
+        self.watchdog_s = watchdog * WATCHDOG_UNIT_S if counting else 0.0
+        """Silence after which the watchdog trips [s]; 0 when it does not count."""
+
+        self.present.derive(self.supply_share)
+        self._mode = self.operating_mode if self.model.operating_modes else -1
+        self._driven = self._torque and self._mode == CURRENT_MODE
+        self._current_per_tick = self.present.sign * self.model.current_unit_a
+        moves = self._torque and bool(self.model.operating_modes)
+        self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._voltage_limited))
+        """Whether time alone changes what it does, so that the bus must call `tick`."""
+
+        if self._driven:
+            self.motor_current_a = self.goal_current_ticks * self._current_per_tick
+        elif not moves:
+            self.motor_current_a = 0.0
+        self._current_limit: int = memory.get("Current Limit") if "Goal Current" in memory else -1
+        by_goal = memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
+        known = bool(self.model.operating_modes)
+        self._takes_goal_current = known and self._current_limit >= 0 and not by_goal and watchdog != WATCHDOG_TRIPPED
+        if self.needs_ticks:
+            self.controller.goals = Goals.read(self._mode, memory)
+        self.changed()
+
+    def supply_share(self, current: float, velocity: float = 0.0) -> float:
+        """The share of time in which the bridge is on for this current [A] at this velocity [rad/s], signed."""
+        volt = self.model.resistance_ohm * current + self.model.back_emf_v_s * velocity
+        return max(-1.0, min(1.0, volt / self.supply_v)) if self._torque and self.supply_v > 0.0 else 0.0

@@ -1,0 +1,51 @@
+"""Which registers hang together, and why a servo refuses a write to one of them."""
+
+from hil.drivers.packet import StatusError
+from hil.fakes.servo.controller import POSITION_MODE
+from hil.fakes.servo.memory import Memory
+from hil.fakes.servo.registers import TICKS_PER_TURN, Model, Register
+
+GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
+
+LIMIT_OF_GOAL = {"Goal PWM": "PWM Limit", "Goal Current": "Current Limit", "Goal Velocity": "Velocity Limit"}
+
+GAINS = (
+    "Velocity I Gain",
+    "Velocity P Gain",
+    "Position D Gain",
+    "Position I Gain",
+    "Position P Gain",
+    "Feedforward 2nd Gain",
+    "Feedforward 1st Gain",
+)
+
+WATCHDOG_TRIPPED = 0xFF
+
+_MULTI_TURN_LIMIT_TICKS = 256 * TICKS_PER_TURN
+
+
+def refusal(memory: Memory, model: Model, register: Register, value: int) -> int:
+    """Why this value may not be written to this register now; 0 when it may."""
+    name = register.name
+    if not register.writable or (register.eeprom and memory.get("Torque Enable")):
+        return StatusError.ACCESS
+    in_range = register.minimum <= value <= register.maximum
+    known = bool(model.operating_modes)
+    if name == "Operating Mode" and known:
+        in_range = value in model.operating_modes
+    watchdog_tripped = memory.get("Bus Watchdog") == WATCHDOG_TRIPPED
+    if watchdog_tripped and (name in GOALS or (name == "Bus Watchdog" and value != 0)):
+        in_range = False
+    if not in_range:
+        return StatusError.DATA_RANGE
+    return StatusError.NONE if not known or _within_limit(memory, name, value) else StatusError.DATA_LIMIT
+
+
+def _within_limit(memory: Memory, name: str, value: int) -> bool:
+    if name in LIMIT_OF_GOAL:
+        return abs(value) <= memory.value(LIMIT_OF_GOAL[name])
+    if name != "Goal Position":
+        return True
+    if memory.get("Operating Mode") == POSITION_MODE:
+        return memory.value("Min Position Limit") <= value <= memory.value("Max Position Limit")
+    return abs(value) < _MULTI_TURN_LIMIT_TICKS

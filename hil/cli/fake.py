@@ -1,0 +1,98 @@
+"""`hil fake`: a fake arm on a pseudo terminal until somebody ends it, or what a file's fake arm is made of."""
+
+import signal
+import sys
+from pathlib import Path
+
+from hil.errors import ConfigError
+from hil.fakes.bus.faults import FAULTS, parse_fault
+from hil.fakes.description import DescriptionError, FakeArm, load_fake
+from hil.fakes.plants.plant import PlantError
+from hil.fakes.pty_server import Counts, LinkError, PtyServer
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def describe_fake(config: Path, faults: list[str], seed: int | None) -> None:
+    """Print what the file's [fake] table describes; raises ConfigError when it is wrong."""
+    fake = _load(config, faults, seed)
+    for servo in fake.servos:
+        print(f"ID {servo.id}: {servo.model}, firmware {servo.firmware}, {servo.baud} baud")
+    print(f"plant: {fake.plant or f'arm of {len(fake.servos)} joint(s)'}; seed {fake.seed}")
+    for fault in fake.faults:
+        print(f"fault: {fault.kind} at {fault.at:g} s for {fault.duration:g} s, probability {fault.probability:g}")
+    print(f"\nServe it to any program: hil fake {config} --pty")
+    print(f'From Python with pyserial: fakes.register(), then serial_for_url("fake://{config}")')
+
+
+def list_faults() -> None:
+    """Print every kind of fault and what it does."""
+    for kind, facts in FAULTS.items():
+        amount = f"; amount: {facts.amount}, {facts.default:g} unless given" if facts.amount else ""
+        print(f"{kind:22s} {facts.does}{amount}")
+
+
+def serve_fake(config: Path, link: Path | None, faults: list[str], seed: int | None, quiet: bool) -> None:
+    """Serve the file's fake arm on a pseudo terminal until Ctrl-C, SIGTERM or SIGHUP; raises ConfigError.
+
+    The terminal's path is the only thing on standard output; the status line goes to standard error.
+    """
+    fake = _load(config, faults, seed)
+    try:
+        server = PtyServer(fake, link)
+    except (LinkError, PlantError) as error:
+        raise ConfigError(str(error)) from error
+    with server:
+        former = {number: signal.signal(number, lambda *_: server.stop()) for number in _SIGNALS}
+        try:
+            print(link or server.path, flush=True)
+            status = _Status(sys.stderr.isatty())
+            server.serve(None if quiet else status.show, watch_every_s=0.5 if sys.stderr.isatty() else 10.0)
+            if not quiet:
+                status.end(server.counts)
+        except PlantError as error:
+            raise ConfigError(str(error)) from error
+        finally:
+            for number, handler in former.items():
+                signal.signal(number, handler)
+
+
+class _Status:
+    """One line about the server, written over itself on a terminal."""
+
+    def __init__(self, on_terminal: bool) -> None:
+        self._on_terminal = on_terminal
+        self._packets = 0
+
+    def show(self, counts: Counts) -> None:
+        seconds = 0.5 if self._on_terminal else 10.0
+        rate = (counts.packets - self._packets) / seconds
+        self._packets = counts.packets
+        text = f"{rate:7.0f} packets/s, {_totals(counts)}"
+        print(f"\r\x1b[K{text}" if self._on_terminal else text, end="" if self._on_terminal else "\n", file=sys.stderr)
+        sys.stderr.flush()
+
+    def end(self, counts: Counts) -> None:
+        print(f"{chr(10) if self._on_terminal else ''}{counts.packets} packets, {_totals(counts)}", file=sys.stderr)
+
+
+def _totals(counts: Counts) -> str:
+    return (
+        f"{counts.damaged} damaged, {counts.collisions} collisions, {counts.faults} faults, "
+        f"{counts.overruns} late by more than 1 ms (worst {1e3 * counts.late_max_s:.1f} ms)"
+    )
+
+
+def _load(config: Path, faults: list[str], seed: int | None) -> FakeArm:
+    try:
+        fake = load_fake(config)
+        added = tuple(parse_fault(text) for text in faults)
+    except (DescriptionError, ValueError) as error:
+        raise ConfigError(str(error)) from error
+    ids = [servo.id for servo in fake.servos]
+    for text, fault in zip(faults, added, strict=True):
+        if fault.servo is not None and fault.servo not in ids:
+            raise ConfigError(f'fault "{text}": servo = {fault.servo}: the IDs in {config} are {ids}')
+    return fake.model_copy(
+        update={"faults": fake.faults + added, "seed": fake.seed if seed is None else seed},
+    )

@@ -1,0 +1,54 @@
+"""`hil init`: from servos on a bus to a TOML file for them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def init(
+    port: Annotated[str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, or a TOML file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")] = Path("my_arm.toml"),
+    baud: Annotated[
+        list[int] | None, typer.Option("--baud", help="Ask only at this baud; may be given more than once.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: take what an empty answer means.")] = False,
+) -> None:
+    """Scan the bus, ask what it cannot tell, write a commented TOML file. Nothing is written to the servos."""
+    from hil.config.schema import parse_config, port_url
+    from hil.drivers.port import open_port
+    from hil.drivers.servo_model import BAUD_RATES
+    from hil.errors import ConfigError
+    from hil.export.source import write_text
+    from hil.setup.config_template import arm_toml
+    from hil.setup.interview import interview
+    from hil.setup.scan import scan
+
+    if out.exists():
+        raise ConfigError(f"{out} is there already: name another file with --out, or remove it.")
+    url = port_url(port)
+    bauds = tuple(baud or BAUD_RATES)
+    opened = open_port(url, bauds[0])
+    try:
+        typer.echo("Asking who is on the bus ...", err=True)
+        heard = list(scan(opened, bauds))
+        answers = interview(opened, url, heard, _default if yes else _prompt, _say)
+    finally:
+        opened.close()
+    text = arm_toml(answers)
+    parse_config(text, out)  # what is written can be run
+    write_text(out, text)
+    print(f"{out} is written. Read it, then:\n  hil check {out}\n  hil identify {out}")
+
+
+def _prompt(question: str, usual: str) -> str:
+    answer: str = typer.prompt(question, default=usual, show_default=bool(usual), err=True)
+    return answer.strip()
+
+
+def _default(_question: str, usual: str) -> str:
+    return usual
+
+
+def _say(text: str) -> None:
+    typer.echo(text, err=True)

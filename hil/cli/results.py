@@ -1,0 +1,60 @@
+"""The subcommands about a finished run: its report, its exports.
+
+The modules that do the work are imported inside the commands, as in hil.cli.app.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")]
+
+
+def report(
+    run: RunPath,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default RUN/report.html.")] = None,
+    png: Annotated[Path | None, typer.Option("--png", metavar="DIR", help="Save the pictures there as PNG.")] = None,
+    svg: Annotated[Path | None, typer.Option("--svg", metavar="DIR", help="Save the pictures there as SVG.")] = None,
+) -> None:
+    """Write a run as one HTML page that needs no network: verdict, parameters, pictures."""
+    from hil.report.pictures import save_pictures
+    from hil.report.run_data import RunData
+
+    print(write_report(run, out))
+    data = RunData.load(run)
+    for kind, folder in (("png", png), ("svg", svg)):
+        if folder is not None:
+            print(f"{len(save_pictures(data, folder, kind))} pictures in {folder}")
+
+
+def export(
+    run: RunPath,
+    formats: Annotated[
+        list[str], typer.Option("--format", metavar="FORMAT", help="urdf, mjcf, toml, json, csv, parquet, mcap or mat.")
+    ],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The file; default within RUN.")] = None,
+    link_length: Annotated[
+        float | None, typer.Option(min=1e-3, metavar="METRES", help="Of link 1; needed for a horizontal arm only.")
+    ] = None,
+) -> None:
+    """Write the identified arm or its recording for other tools; says what a format has no place for."""
+    from hil.export.formats import export
+
+    if out is not None and len(formats) > 1:
+        raise typer.BadParameter("--out names one file: give one --format with it.")
+    for name in formats:
+        written = export(run, name, out, link_length)
+        print(f"{written.path}")
+        for missing in written.left_out:
+            print(f"  {name.upper()} has no place for {missing}")
+
+
+def write_report(run: Path, out: Path | None = None) -> Path:
+    """Write the report of a run, into its folder unless told; where it is."""
+    from hil.report import page
+    from hil.report.run_data import RunData
+
+    path = out or run / page.FILE_NAME
+    page.write_report(RunData.load(run), path)
+    return path

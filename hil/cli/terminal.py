@@ -1,0 +1,67 @@
+"""What a person sees while the arm moves: a progress bar with each joint's position and current. Quiet when asked."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from hil.cli.live_view import LiveView
+from hil.config.schema import Config
+from hil.experiment.stream import Progress as StreamProgress
+from hil.experiment.stream import Watch
+from hil.runs.recording import Phase
+
+_PHASES = {
+    Phase.REST: "resting",
+    Phase.RAMP_IN: "ramping in",
+    Phase.PERIODIC: "exciting",
+    Phase.RAMP_OUT: "ramping out",
+    Phase.COMING_TO_REST: "coming to rest",
+    Phase.BRAKING: "braking",
+}
+
+
+class Terminal:
+    """Messages on standard error, so that standard output holds results only."""
+
+    def __init__(self, quiet: bool) -> None:
+        self.console = Console(stderr=True, quiet=quiet, highlight=False)
+
+    def say(self, text: str) -> None:
+        self.console.print(text, markup=False)
+
+    @contextmanager
+    def busy(self, text: str) -> Iterator[None]:
+        """A spinner beside `text` while the block runs."""
+        with self.console.status(f"{text} ..."):
+            yield
+
+    @contextmanager
+    def streaming(self, config: Config) -> Iterator[Watch]:
+        """A live view of the stream; gives the function to call with each progress."""
+        if not self.console.is_terminal or self.console.quiet:
+            yield lambda _: None
+            return
+        bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            TextColumn("{task.completed:.0f} of about {task.total:.0f} s of arm time,"),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            console=self.console,
+        )
+        task = bar.add_task("", total=1.0)
+        rate = config.experiment.rate
+        view = LiveView(config, self.console.width)
+
+        with Live(bar, console=self.console, refresh_per_second=10) as live:
+
+            def watch(progress: StreamProgress) -> None:
+                total = max(progress.expected, progress.taken) / rate
+                description = f"{progress.role.replace('_', ' ')}: {_PHASES[progress.phase]}"
+                bar.update(task, completed=progress.taken / rate, total=total, description=description)
+                live.update(Group(bar, view.draw(progress)))
+
+            yield watch

@@ -1,0 +1,21 @@
+"""Configurations that come with hil: `hil identify fake_two_link` works without a checkout."""
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parents[1]
+_INSTALLED = _PACKAGE / "configs"
+_CHECKOUT = _PACKAGE.parent / "configs"
+
+
+def bundled_configs() -> dict[str, Path]:
+    """The bundled TOML files by name."""
+    folder = _INSTALLED if _INSTALLED.is_dir() else _CHECKOUT
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def find_config(path: Path) -> Path:
+    """The file that a person means: `path` itself, or where it is a bare name and no file, the bundled one."""
+    is_name = path.name == str(path) and path.suffix == ""
+    if not is_name or path.exists():
+        return path
+    return bundled_configs().get(path.name, path)

@@ -1,0 +1,394 @@
+"""One TOML file describes the arm, its limits and its experiment; here it is read and checked.
+
+`load_config` returns a frozen `Config` or raises ConfigError, which names file, key, value and what is allowed.
+"""
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
+
+from hil import fakes
+from hil.config.bundled import find_config
+from hil.config.known_quantities import KnownConfig
+from hil.drivers.bus import BusConfig
+from hil.drivers.joint import Joint
+from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
+from hil.errors import ConfigError
+from hil.fakes.description import FakeArm
+from hil.fakes.table_errors import describe
+
+FAKE_URL = "fake://"
+
+SLOW_INTERVAL_S = 0.25
+"""From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class PortConfig(_Table):
+    """`[port]`: where the servos are."""
+
+    url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
+    baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
+    one_write: bool = Field(True, description="commands and request in one write; false where hil check says so")
+    fast_sync_read: bool = Field(True, description="read with Fast Sync Read where every servo's firmware has it")
+
+
+class JointConfig(_Table):
+    """`[[joints]]`: one joint, from the base outwards."""
+
+    name: str = Field(min_length=1, max_length=20)
+    id: int = Field(ge=0, le=252)
+    model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
+    direction: Literal[-1, 1] = 1
+    zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
+    mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
+    torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
+    torque_constant_std: float = Field(0.0, ge=0, description="N m/A")
+    torque_per_volt: PositiveFloat | None = Field(None, le=100, description="N m/V at the output shaft, pwm mode only")
+    torque_per_volt_std: float = Field(0.0, ge=0, description="N m/V")
+    position_limit: Range = Field(description="rad")
+    velocity_limit: PositiveFloat = Field(description="rad/s")
+    current_limit: PositiveFloat | None = Field(None, le=30, description="A")
+    voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.position_limit
+        if low >= high:
+            raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
+        return self
+
+    @model_validator(mode="after")
+    def _driven(self) -> Self:
+        pwm = self.drive_mode is Mode.PWM
+        if not pwm and servo_model(self.model).current_unit is None:
+            raise ValueError(f'mode = "current": a {self.model} has no current mode; use "pwm"')
+        values = (self.torque_constant, self.current_limit), (self.torque_per_volt, self.voltage_limit)
+        names = ("torque_constant", "current_limit"), ("torque_per_volt", "voltage_limit")
+        mode = self.drive_mode.name.lower()
+        for name, value in zip(names[pwm], values[pwm], strict=True):
+            if value is None:
+                raise ValueError(f"{name} is missing; {mode} mode needs it")
+        for name, value in zip(names[not pwm], values[not pwm], strict=True):
+            if value is not None:
+                raise ValueError(f"{name} = {value:g}: it means nothing in {mode} mode; {' and '.join(names[pwm])} do")
+        return self
+
+    @property
+    def drive_mode(self) -> Mode:
+        if self.mode is None:
+            return servo_model(self.model).default_mode
+        return Mode[self.mode.upper()]
+
+    @property
+    def torque_per_goal(self) -> float:
+        """N m per A, or per V in pwm mode."""
+        value = self.torque_per_volt if self.drive_mode is Mode.PWM else self.torque_constant
+        assert value is not None  # checked above
+        return value
+
+    @property
+    def torque_per_goal_std(self) -> float:
+        return self.torque_per_volt_std if self.drive_mode is Mode.PWM else self.torque_constant_std
+
+    @property
+    def goal_limit(self) -> float:
+        """A, or V in pwm mode."""
+        value = self.voltage_limit if self.drive_mode is Mode.PWM else self.current_limit
+        assert value is not None  # checked above
+        return value
+
+    @property
+    def joint(self) -> Joint:
+        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks, self.drive_mode)
+
+
+class PriorConfig(_Table):
+    """`[arm.prior]`: best guesses before any identification; one value per joint. What is left out is guessed roughly
+    from link lengths and servo models (hil.dry_run.prior), with `rough_spread` in place of `spread`.
+    """
+
+    spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
+    rough_spread: PositiveFloat = Field(0.5, le=1, description="of each value guessed from length and model")
+    link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
+    link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
+    link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
+    servo_mass: list[PositiveFloat] | None = Field(None, description="kg")
+    armature: list[PositiveFloat] | None = Field(None, description="kg m^2: rotor inertia times gear ratio squared")
+    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad; in pwm mode back-EMF included")
+    coulomb: list[PositiveFloat] | None = Field(None, description="N m")
+
+
+class ArmConfig(_Table):
+    """`[arm]`: what is known of the mechanism."""
+
+    gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
+    rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
+    rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+    link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
+    prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
+
+
+class ExperimentConfig(_Table):
+    """`[experiment]`: the excitation and how it is streamed."""
+
+    rate: float = Field(ge=20, le=4000, description="samples per second")
+    period: float = Field(gt=0, le=1000, description="s")
+    band: Range | None = Field(None, description="Hz: lines shared out between the joints in turn")
+    lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
+    detection: bool = Field(False, description="drive odd lines only, not all: what is left out shows the distortion")
+    peak_torque: list[PositiveFloat] | None = Field(None, description="N m per joint; with pilot, found by dry runs")
+    pilot: bool = Field(False, description="find peak_torque by a small pilot run first, then raise it to the limits")
+    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" designs on the pilot\'s model')
+    ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
+    rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
+    settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
+    max_settling_periods: int = Field(5, ge=1, le=100)
+    periods: int = Field(1, ge=1, le=1000, description="settled periods used")
+    held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")
+    seed: int = Field(1, ge=0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        samples = self.rate * self.period
+        if abs(samples - round(samples)) > 1e-9 * samples:
+            raise ValueError(f"rate * period = {samples:g}: must be a whole number of samples")
+        if (self.band is None) == (self.lines is None):
+            raise ValueError("give either band or lines")
+        if self.detection and self.band is None:
+            raise ValueError("detection chooses lines from a band; with lines, leave the ones out that shall detect")
+        if self.band is not None:
+            low, high = self.band
+            if not 0 < low < high < self.rate / 4:
+                raise ValueError(f"band = [{low}, {high}]: must be 0 < low < high < rate / 4 = {self.rate / 4:g} Hz")
+        for lines in self.lines or []:
+            if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
+                raise ValueError(f"lines: each list needs different harmonics from 1 to {samples // 4:g}")
+        return self
+
+    @property
+    def samples(self) -> int:
+        """Samples in a period."""
+        return round(self.rate * self.period)
+
+
+class ModelConfig(_Table):
+    """`[model]`: what the estimator may explain the motion with."""
+
+    friction: Literal["auto", "coulomb", "stribeck", "stribeck_load"] = Field(
+        "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
+    )
+    drive: Literal["delay", "lag", "delay_lag"] = "lag"
+    presliding: bool = Field(False, description="dry friction that yields like a spring before it slides")
+    asymmetry: bool = Field(False, description="viscous friction that differs with direction")
+    ripple: bool = Field(False, description="torque ripple over the joint's angle")
+    zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
+    torque_scale: bool = Field(
+        False, description="the ratio of the joints' torque constants; one of them has to be believed"
+    )
+
+    @property
+    def fixed_friction(self) -> Literal["coulomb", "stribeck", "stribeck_load"]:
+        """What fits that make no choice take: "stribeck" where the file says "auto"."""
+        return "stribeck" if self.friction == "auto" else self.friction
+
+    @model_validator(mode="after")
+    def _auto_has_no_terms(self) -> Self:
+        if self.friction == "auto" and (self.presliding or self.asymmetry or self.ripple or self.zeros):
+            raise ValueError(
+                'friction = "auto" chooses presliding, asymmetry and ripple itself and leaves zeros out: give none'
+            )
+        return self
+
+
+class SafetyConfig(_Table):
+    """`[safety]`: what stops the arm, beside the joints' own limits, and how."""
+
+    watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
+    allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
+    write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
+    max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")
+    max_late: int = Field(20, ge=1, le=1000, description="deadlines in a row that may be missed")
+    rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
+    rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
+    slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
+    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
+    min_voltage: float = Field(0.0, ge=0, description="V; the servos' own limits hold beside it")
+    max_voltage: PositiveFloat = Field(30.0, description="V")
+    follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
+    follow_share: PositiveFloat = Field(0.3, le=1, description="of current_limit, by how much it may differ for longer")
+    stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
+    damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
+    limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
+
+    @field_validator("watchdog")
+    @classmethod
+    def _in_whole_steps(cls, seconds: float) -> float:
+        steps = seconds / WATCHDOG_UNIT
+        if abs(steps - round(steps)) > 1e-6:
+            raise ValueError(f"the servos count in steps of {WATCHDOG_UNIT:g} s, so a multiple of it")
+        return seconds
+
+
+class StabiliserConfig(_Table):
+    """`[stabiliser]`: a spring and a damper in software around arm.rest_pose, for arms that have no stable rest."""
+
+    stiffness: list[float] = Field(description="N m/rad per joint")
+    damping: list[float] = Field(description="N m s/rad per joint")
+
+    @model_validator(mode="after")
+    def _not_negative(self) -> Self:
+        if min(*self.stiffness, *self.damping) < 0:
+            raise ValueError("stiffness and damping must be at least 0: less would drive the arm away from its pose")
+        return self
+
+
+class Config(_Table):
+    """The whole file. `path` is where it was read from."""
+
+    path: Path = Field(exclude=True)
+    port: PortConfig
+    joints: list[JointConfig] = Field(min_length=1, max_length=2)
+    arm: ArmConfig
+    experiment: ExperimentConfig
+    model: ModelConfig = ModelConfig()
+    safety: SafetyConfig = SafetyConfig()
+    stabiliser: StabiliserConfig | None = None
+    known: KnownConfig | None = None
+    columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
+    fake: FakeArm | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        count = len(self.joints)
+        _same_length("arm.rest_pose", self.arm.rest_pose, count)
+        for key, values in self._per_joint():
+            _same_length(key, values, count)
+        if self.experiment.lines is not None:
+            _same_length("experiment.lines", self.experiment.lines, count)
+            excited = [line for lines in self.experiment.lines for line in lines]
+            if len(set(excited)) != len(excited):
+                raise ValueError("experiment.lines: two joints share a line; each joint needs its own")
+        for key in ("id", "name"):
+            values = [getattr(joint, key) for joint in self.joints]
+            if len(set(values)) != count:
+                raise ValueError(f"joints: two joints have the same {key} {values[0]!r}")
+        for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
+            _check_rest_pose(joint, rest)
+        if self.experiment.peak_torque is not None:
+            for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
+                _check_peak_torque(joint, peak)
+        self._check_pilot()
+        if self.model.torque_scale and count != 2:
+            raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
+        if len({joint.drive_mode for joint in self.joints}) != 1:
+            raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
+        if self.port.url == FAKE_URL and self.fake is None:
+            raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
+        return self
+
+    def _per_joint(self) -> list[tuple[str, list[float]]]:
+        """Every list that needs one entry per joint, by its key."""
+        lists = {"experiment.peak_torque": self.experiment.peak_torque, "arm.link_lengths": self.arm.link_lengths}
+        if self.stabiliser is not None:
+            lists |= {"stabiliser.stiffness": self.stabiliser.stiffness, "stabiliser.damping": self.stabiliser.damping}
+        if self.arm.prior is not None:
+            guessed = self.arm.prior.model_dump(exclude={"spread", "rough_spread"})
+            lists |= {f"arm.prior.{key}": value for key, value in guessed.items()}
+        return [(key, value) for key, value in lists.items() if value is not None]
+
+    def _check_pilot(self) -> None:
+        experiment = self.experiment
+        if experiment.pilot and self.arm.link_lengths is None:
+            raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
+        if experiment.peak_torque is None and self.arm.link_lengths is None:
+            raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
+        if experiment.design == "optimal" and not experiment.pilot:
+            raise ValueError('experiment.design = "optimal" needs pilot = true: it designs on the pilot\'s model')
+
+    @property
+    def url(self) -> str:
+        """The port's URL, with "fake://" completed by the file that describes the fake arm."""
+        return f"{FAKE_URL}{self.path.resolve()}" if self.port.url == FAKE_URL else self.port.url
+
+    @property
+    def bus(self) -> BusConfig:
+        """What the driver needs to know."""
+        return BusConfig(
+            self.url,
+            self.port.baud,
+            tuple(joint.joint for joint in self.joints),
+            one_write=self.port.one_write,
+            fast_sync_read=self.port.fast_sync_read,
+            slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
+            watchdog_required=not self.safety.allow_no_watchdog,
+        )
+
+    @property
+    def is_fake(self) -> bool:
+        return self.port.url.startswith(FAKE_URL)
+
+
+def load_config(path: Path) -> Config:
+    """Read and check a TOML file, or the bundled one of that bare name; raises ConfigError."""
+    path = find_config(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise ConfigError(f"{path}: cannot be read: {reason}.") from error
+    return parse_config(text, path)
+
+
+def parse_config(text: str, path: Path) -> Config:
+    """Check the text of a TOML file read from `path`; raises ConfigError."""
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}.") from error
+    if "path" in values:
+        raise ConfigError(f"{path}: path is not a known key.")
+    try:
+        return Config(path=path, **values)
+    except ValidationError as error:
+        raise ConfigError(describe(error, path, Config)) from error
+
+
+def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
+    if len(values) != count:
+        raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each of [[joints]]")
+
+
+def _check_rest_pose(joint: JointConfig, rest: float) -> None:
+    low, high = joint.position_limit
+    if not low < rest < high:
+        raise ValueError(
+            f"arm.rest_pose: {rest:g} rad for joint {joint.name!r} is outside its position_limit [{low:g}, {high:g}]"
+        )
+
+
+def _check_peak_torque(joint: JointConfig, peak: float) -> None:
+    most = joint.goal_limit * joint.torque_per_goal
+    product = "voltage_limit * torque_per_volt" if joint.drive_mode is Mode.PWM else "current_limit * torque_constant"
+    if peak > most * (1 + 1e-9):
+        raise ValueError(
+            f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than "
+            f"{product} = {math.floor(most * 1000) / 1000:g} N m"
+        )
+
+
+def port_url(port: str) -> str:
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
+    fakes.register()
+    if port.endswith(".toml") and "://" not in port:
+        return load_config(Path(port)).url
+    return port

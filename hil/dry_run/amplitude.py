@@ -1,0 +1,132 @@
+"""The largest torque whose chance of touching a limit is small enough, per joint, by dry runs."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.dry_run.ensemble import Ensemble
+from hil.dry_run.prediction import GUARDED, Prediction, predict
+from hil.errors import NoSafeTorque
+from hil.plan.plan import Plan, make_plan, scaled
+
+Array = NDArray[np.float64]
+
+SEARCH_ARMS = 48
+"""Arms during the search; the result is checked on all of them."""
+
+PRIOR_ROOM = 0.9
+"""Of the limits, while nothing was identified: a wide prior's tail is longer than the simulated arms show."""
+
+_ROUNDS = 14
+_CLOSE = 0.94
+"""Of the limits, at the wanted chance: where the search is content."""
+
+_LARGEST_STEP = 2.0
+_BACK_OFF = 0.93
+_TORQUE_SHARE = 0.97
+"""Of current_limit: a clamped wave is no longer the one that was designed."""
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """A safe amplitude: the plan, its peak torque (joints,) [N m], and what the dry run foresees of it."""
+
+    plan: Plan
+    peak_torque: Array
+    prediction: Prediction
+
+
+def largest_amplitude(config: Config, ensemble: Ensemble, share: float = 1.0, plan: Plan | None = None) -> Amplitude:
+    """Scale each joint's torque until its peaks reach `share` of the limits but for safety.limit_chance of the arms.
+
+    plan: its waves are scaled; by default low-crest multisines. Raises NoSafeTorque when not even a small torque is
+    safe.
+    """
+    if ensemble.source == "prior":
+        share *= PRIOR_ROOM
+    torque = _most_torque(config) / 8
+    base = with_peaks(config, torque) if plan is None else plan
+    torque = base.segments[0].peak_torque
+    found = _search(config, base, torque, ensemble.first(SEARCH_ARMS), share)
+    for _ in range(_ROUNDS):
+        plan = scaled(config, base, found)
+        prediction = predict(config, plan, ensemble)
+        if _chance(prediction, share) <= config.safety.limit_chance:
+            return Amplitude(plan, found, prediction)
+        found = found * _BACK_OFF
+    raise NoSafeTorque(
+        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, say more "
+        "in [arm.prior], or raise safety.limit_chance."
+    )
+
+
+def with_peaks(config: Config, peak_torque: Array) -> Plan:
+    """The configuration's plan with these peaks [N m]."""
+    experiment = config.experiment.model_copy(update={"peak_torque": peak_torque.tolist()})
+    return make_plan(config.model_copy(update={"experiment": experiment}))
+
+
+def _search(config: Config, base: Plan, torque: Array, ensemble: Ensemble, share: float) -> Array:
+    """Joint by joint towards the limits; the joints pull at each other, so it takes some rounds."""
+    most = _most_torque(config)
+    first = base.first_segment() if ensemble.source == "prior" else base
+
+    def reached_with(tried: Array) -> Array:
+        return _reached(config, predict(config, scaled(config, first, tried), ensemble), share)
+
+    best, used = 0.25 * torque, 0.0
+    torque = np.minimum(torque, most)
+    step = 1.0
+    for _ in range(_ROUNDS):
+        reached = reached_with(torque)
+        if reached.max() <= 1.0 and reached.min() > used:
+            best, used = torque, float(reached.min())
+        if reached.max() <= 1.0 and ((reached >= _CLOSE) | (torque >= 0.999 * most)).all():
+            break
+        wanted = np.where(reached > 1.0, 0.97, 0.99) / np.clip(reached, 1e-3, 1e3)
+        torque = np.minimum(torque * np.clip(wanted**step, 1 / _LARGEST_STEP, _LARGEST_STEP), most)
+        step = max(0.4, 0.85 * step)
+    return _polished(reached_with, best, most)
+
+
+def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array) -> Array:
+    """Raise the joint that uses least of its limits, a little at a time, while all stay within."""
+    reached = reached_with(torque)
+    blocked = np.zeros(torque.size, dtype=bool)
+    for _ in range(_ROUNDS):
+        blocked |= (reached >= _CLOSE) | (torque >= 0.999 * most)
+        if blocked.all():
+            break
+        joint = int(np.argmin(np.where(blocked, np.inf, reached)))
+        tried = torque.copy()
+        tried[joint] = min(1.06 * tried[joint], most[joint])
+        there = reached_with(tried)
+        if there.max() <= 1.0:
+            torque, reached = tried, there
+        else:
+            blocked[joint] = True
+    return torque
+
+
+def _reached(config: Config, prediction: Prediction, share: float) -> Array:
+    """How much of `share` of its limits each joint uses (joints,), at the wanted chance and in the worst arm."""
+    deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
+    foreseen = prediction.share_at(deviations)[:GUARDED].max(axis=0)
+    counted = prediction.shares[:, :GUARDED].max(axis=(0, 1))
+    return np.asarray(np.maximum(foreseen, counted) / share)
+
+
+def _chance(prediction: Prediction, share: float) -> float:
+    """Chance that an arm passes `share` of a limit: counted, and for whole limits also by the tail."""
+    counted = float(np.mean((prediction.shares[:, :GUARDED] >= share).any(axis=(1, 2))))
+    return max(counted, prediction.stop_chance)
+
+
+def _most_torque(config: Config) -> Array:
+    """What the current limits and the slew allow (joints,) [N m]."""
+    limits = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
+    return np.asarray(_TORQUE_SHARE * limits)

@@ -1,0 +1,114 @@
+"""Arms that could be the one on the bench: drawn from a prior, or from a former result with its covariance."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.dry_run.prior import base_draws
+from hil.errors import RunFolderError
+from hil.estimation.result import QUANTISATION_FLOOR_TICKS
+from hil.estimator.models.parameters import Physics
+
+Array = NDArray[np.float64]
+
+MODEL_SPREAD = 0.005
+"""Relative, on every parameter of a result: what a model leaves out and its covariance cannot know. Multiplied by how
+many times farther than it was identified the model is to be trusted.
+"""
+
+_LEAST_SHARE = 0.05  # of its value, below which no draw of a positive parameter may fall
+_LEAST_WIDTH = 0.01  # rad/s of friction's step: narrower ones move the arm alike and take longer to simulate
+_MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2)
+_EITHER_SIGN = ("offset", "gravity", "delay", "coupling")
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Arms to simulate.
+
+    torque_scale: what a commanded torque really is, (arms, joints): the torque constant is a guess too. A result's
+    parameters are in units of the commanded torque, so there it is 1.
+    """
+
+    physics: tuple[Physics, ...]
+    torque_scale: Array
+    source: str
+
+    @property
+    def size(self) -> int:
+        return len(self.physics)
+
+    def first(self, count: int) -> "Ensemble":
+        """A smaller one."""
+        return Ensemble(self.physics[:count], self.torque_scale[:count], self.source)
+
+
+def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
+    """From link lengths and `[arm.prior]`. Raises ConfigError."""
+    base = base_draws(config, count, seed)
+    lag = 1e-3
+    physics = tuple(
+        Physics.of({name: float(values[arm]) for name, values in base.items()} | {"lag": lag}) for arm in range(count)
+    )
+    random = np.random.default_rng((seed, 6))
+    spread = np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
+    scale = np.exp(np.sqrt(np.log1p(spread**2)) * random.standard_normal((count, len(config.joints))))
+    return Ensemble(physics, scale, "prior")
+
+
+def result_ensemble(result: dict[str, Any], count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
+    """From a result.json, its covariance widened by what the residual says the model lacks. Raises RunFolderError.
+
+    farther: range of motion that will be simulated over the range that the result was identified on.
+    """
+    try:
+        names = list(result["covariance"]["names"])
+        covariance = np.array(result["covariance"]["matrix"], dtype=float)
+        known = {**result["parameters"], **result["extra"]}
+        value = np.array([known[name]["value"] for name in names])
+        ticks = max(result["fit"]["residual_rms_ticks"])
+        joints = int(result["joints"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunFolderError(
+            f"The result holds no parameters with covariance ({error!r}); estimate it anew."
+        ) from error
+    covariance = np.where(np.isfinite(covariance), covariance, 0.0)
+    # A residual beyond rounding is model error, which shifts parameters by more than their covariance says.
+    widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2
+    extra = np.diag((MODEL_SPREAD * max(1.0, farther) * value) ** 2)
+    random = np.random.default_rng((seed, 7))
+    drawn = _draws(random, value, widened + extra, count)
+    physics = tuple(Physics.of(_physical(dict(zip(names, row.tolist(), strict=True)), known)) for row in drawn)
+    return Ensemble(physics, np.ones((count, joints)), "result")
+
+
+def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
+    """Normal draws (count, parameters), in units of each standard deviation: parameters differ by powers of ten."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    correlation = covariance / np.outer(scale, scale)
+    size, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))
+    spread = axes * np.sqrt(np.maximum(size, 0.0))
+    drawn: Array = mean + scale * (random.standard_normal((count, mean.size)) @ spread.T)
+    return drawn
+
+
+def nominal(result: dict[str, Any]) -> Physics:
+    """The arm that a result describes."""
+    known = {**result["parameters"], **result["extra"]}
+    return Physics.of({name: entry["value"] for name, entry in known.items()})
+
+
+def _physical(drawn: dict[str, float], known: dict[str, Any]) -> dict[str, float]:
+    """A draw moved into the range of real arms."""
+    for name, value in drawn.items():
+        if not name.startswith(_EITHER_SIGN):
+            centre = abs(known[name]["value"])
+            least = _LEAST_WIDTH if name.startswith("coulomb_width") else 1e-9
+            drawn[name] = max(value, _LEAST_SHARE * centre, least)
+    if "coupling" in drawn:
+        most = _MOST_COUPLING * float(np.sqrt(drawn["inertia_1"] * drawn["inertia_2"]))
+        drawn["coupling"] = min(max(drawn["coupling"], -most), most)
+    return drawn

@@ -1,0 +1,210 @@
+"""The experiment simulated on an ensemble of arms: what will be reached, against each limit.
+
+Every arm of the ensemble gets the very goal currents of the plan, rounded to the servos' ticks, ramps included, through
+lag and stabiliser, for as many periods as it takes to settle. Peaks are compared as shares of the way to their limit;
+an arm with any share of 1 or more is one that the guard would have stopped.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from math import erfc, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+from hil.dry_run.ensemble import Ensemble
+from hil.dry_run.rollout import Commands, commands_of, simulate_experiment
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.closed_loop import Feedback
+from hil.plan.plan import Plan
+from hil.plan.stabiliser import feedback_of
+
+Array = NDArray[np.float64]
+
+QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
+UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
+GUARDED = 3
+"""The first so many have a limit at which the guard stops; a current is clamped, torque and power follow."""
+
+QUANTILE = 0.99
+_LEAST_SPREAD = 2e-3
+_THREADS = 2
+_SHOWN_ARMS = 30
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """What one arm reached: extreme values (quantities, joints), periods until settled (0: not within those
+    simulated), and, where kept, positions over time (joints, samples) [rad].
+    """
+
+    values: Array
+    settled_after: int
+    position: Array | None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a dry run foresees.
+
+    values: extreme values of every arm (arms, quantities, joints), in QUANTITIES and UNITS. shares: the same as shares
+    of the way from rest to the limit. limits: (quantities, joints). settled_after: periods, per arm, 0 where it is more
+    than max_settling_periods. shown: positions over time of a few arms (arms, joints, samples) [rad], then NaN.
+    """
+
+    values: Array
+    shares: Array
+    limits: Array
+    settled_after: NDArray[np.int64]
+    shown: Array
+    rest: Array
+    rate: float
+
+    @property
+    def median(self) -> Array:
+        """(quantities, joints)."""
+        middle: Array = np.median(self.values, axis=0)
+        return middle
+
+    @property
+    def quantile(self) -> Array:
+        """Values that all peaks of an arm together stay within, in 99 of 100 arms (quantities, joints).
+
+        One common number of deviations above the medians, so that it moves smoothly with the amplitude.
+        """
+        shares = self.share_at(self._simultaneous())
+        toward = self.limits - self.origin
+        return np.asarray(self.origin + shares * toward)
+
+    @property
+    def stop_chance(self) -> float:
+        """Chance that the guard stops the run: counted, or by the tail of the peaks, whichever is more."""
+        counted = float(np.mean((self.shares[:, :GUARDED] >= 1).any(axis=(1, 2))))
+        return max(counted, min(1.0, float(self.limit_chance[:GUARDED].sum())))
+
+    @property
+    def limit_chance(self) -> Array:
+        """Chance that a quantity passes its limit (quantities, joints): a normal tail above the median."""
+        middle, spread = self._middle()
+        return np.asarray([[0.5 * erfc(z / sqrt(2)) for z in row] for row in ((1 - middle) / spread).tolist()])
+
+    def share_at(self, deviations: float) -> Array:
+        """Shares (quantities, joints) at so many deviations above the median."""
+        middle, spread = self._middle()
+        return np.asarray(middle + deviations * spread)
+
+    @property
+    def origin(self) -> Array:
+        """From where the way to a limit counts (quantities, joints)."""
+        origin = np.zeros_like(self.limits)
+        origin[0] = origin[1] = self.rest
+        return origin
+
+    def _middle(self) -> tuple[Array, Array]:
+        """Medians of the shares and the spread above them (quantities, joints): peaks are skewed towards the limit."""
+        middle = np.median(self.shares, axis=0)
+        above = np.maximum(self.shares - middle, 0.0)
+        return middle, np.maximum(np.sqrt(2 * np.mean(above**2, axis=0)), _LEAST_SPREAD)
+
+    def _simultaneous(self) -> float:
+        middle, spread = self._middle()
+        worst = ((self.shares - middle) / spread)[:, :GUARDED].max(axis=(1, 2))
+        return float(np.quantile(worst, QUANTILE, method="higher"))
+
+
+def quantities_of(config: Config) -> tuple[tuple[str, str], ...]:
+    """Names and units of a prediction's rows: goals are volts where the joints are driven by voltage."""
+    named = tuple(zip(QUANTITIES, UNITS, strict=True))
+    if config.joints[0].drive_mode is not Mode.PWM:
+        return named
+    return tuple(("voltage", "V") if name == "current" else (name, unit) for name, unit in named)
+
+
+def predict(config: Config, plan: Plan, ensemble: Ensemble) -> Prediction:
+    """Simulate `plan` on every arm of the ensemble."""
+    commands = [commands_of(config, segment) for segment in plan.segments]
+
+    def one(arm: int) -> Peaks:
+        physics, scale = ensemble.physics[arm], ensemble.torque_scale[arm]
+        return _reached(config, plan, commands, physics, scale, keep=arm < _SHOWN_ARMS)
+
+    peaks = _each(one, ensemble.size)
+    values = np.stack([peak.values for peak in peaks])
+    limits = limits_of(config)
+    rest = np.array(config.arm.rest_pose)
+    return Prediction(
+        values,
+        _shares(values, limits, rest),
+        limits,
+        np.array([peak.settled_after for peak in peaks]),
+        _side_by_side([peak.position for peak in peaks if peak.position is not None]),
+        rest,
+        plan.rate,
+    )
+
+
+def limits_of(config: Config) -> Array:
+    """(quantities, joints), in QUANTITIES and UNITS."""
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    velocity = np.array([joint.velocity_limit for joint in config.joints])
+    current = np.array([joint.goal_limit for joint in config.joints])
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
+    torque = current * constant
+    return np.stack((low, high, velocity, current, torque, torque * velocity))
+
+
+def peaks_of(config: Config, position: Array, velocity: Array, current: Array) -> Array:
+    """Extreme values (quantities, joints) of a motion (joints, samples) [rad, rad/s, A]; NaN are left out."""
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
+    torque = current * constant[:, None]
+    return np.stack(
+        (
+            np.nanmin(position, axis=1),
+            np.nanmax(position, axis=1),
+            np.nanmax(np.abs(velocity), axis=1),
+            np.nanmax(np.abs(current), axis=1),
+            np.nanmax(np.abs(torque), axis=1),
+            np.nanmax(np.abs(torque * velocity), axis=1),
+        )
+    )
+
+
+def scaled_feedback(feedback: Feedback, scale: Array) -> Feedback:
+    """As an arm feels it whose torque constants are `scale` (joints,) times what was believed."""
+    return Feedback(feedback.stiffness * scale, feedback.damping * scale, feedback.pose, feedback.limit * scale)
+
+
+def _reached(
+    config: Config, plan: Plan, commands: list[Commands], physics: Physics, scale: Array, *, keep: bool
+) -> Peaks:
+    feedback = scaled_feedback(feedback_of(config), scale)
+    motion = simulate_experiment(plan, commands, physics, scale, feedback)
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
+    current = motion.torque / (scale * constant)[:, None]
+    values = peaks_of(config, motion.position, motion.velocity, current)
+    return Peaks(values, motion.settled_after, motion.position.astype(np.float32) if keep else None)
+
+
+def _side_by_side(positions: list[Array]) -> Array:
+    """Positions (joints, samples) of arms that took different times, NaN after the end (arms, joints, samples)."""
+    longest = max(position.shape[1] for position in positions)
+    together = np.full((len(positions), positions[0].shape[0], longest), np.nan, dtype=np.float32)
+    for row, position in zip(together, positions, strict=True):
+        row[:, : position.shape[1]] = position
+    return together
+
+
+def _shares(values: Array, limits: Array, rest: Array) -> Array:
+    shares = np.abs(values / limits)
+    shares[:, 0] = (rest - values[:, 0]) / (rest - limits[0])
+    shares[:, 1] = (values[:, 1] - rest) / (limits[1] - rest)
+    return shares
+
+
+def _each(work: Callable[[int], Peaks], count: int) -> list[Peaks]:
+    """`work` for each arm; the compiled simulation lets go of the interpreter, so two threads share it."""
+    with ThreadPoolExecutor(_THREADS) as threads:
+        return list(threads.map(work, range(count)))

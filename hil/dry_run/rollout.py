@@ -1,0 +1,104 @@
+"""One simulated arm through the whole experiment, period by period, as the stream plays it on a real one."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+from hil.estimation.settled_period import settling_difference
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
+from hil.plan.plan import Plan, Segment
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Torques of one multisine in whole ticks, without any stabiliser's (joints, samples) [N m]."""
+
+    ramp_in: Array
+    period: Array
+    ramp_out: Array
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the arm did (joints, samples) [rad, rad/s, N m], and after how many periods of the first multisine it was
+    settled: 0 where it never was, which ends the experiment.
+    """
+
+    position: Array
+    velocity: Array
+    torque: Array
+    settled_after: int
+
+
+def commands_of(config: Config, segment: Segment) -> Commands:
+    """What is sent to the servos: goals in whole ticks, times the supposed torque constants."""
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
+    tick = np.array(
+        [abs(joint.joint.drive_unit(12.0 if joint.joint.mode is Mode.PWM else 0.0)) for joint in config.joints]
+    )
+
+    def torque(goals: Array) -> Array:
+        return np.ascontiguousarray((np.round(goals / tick) * tick * constant).T)
+
+    return Commands(torque(segment.ramp_in), torque(segment.period_current), torque(segment.ramp_out))
+
+
+def simulate_experiment(
+    plan: Plan, commands: list[Commands], physics: Physics, scale: Array, feedback: Feedback
+) -> Motion:
+    """All multisines, from rest in the feedback's pose. scale: true over supposed torque constant (joints,).
+
+    As on the bus, the periods of a multisine go on until one is like the one before; an arm that has not settled after
+    plan.max_settling_periods plays nothing more.
+    """
+    arm = _Arm(plan, physics, scale, feedback)
+    settled_after = [arm.play_segment(each) for each in commands[:1]]
+    for each in commands[1:]:
+        if settled_after[-1]:
+            settled_after.append(arm.play_segment(each))
+    parts = arm.parts
+    position, velocity, torque = (
+        np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("position", "velocity", "torque")
+    )
+    return Motion(position, velocity, torque, settled_after[0])
+
+
+class _Arm:
+    """The arm while it plays; what it did so far in `parts`."""
+
+    def __init__(self, plan: Plan, physics: Physics, scale: Array, feedback: Feedback) -> None:
+        self._plan, self._physics, self._scale, self._feedback = plan, physics, scale[:, None], feedback
+        self._state = resting(feedback.pose)
+        self.parts: list[Response] = []
+
+    def play_segment(self, commands: Commands) -> int:
+        """Ramps and periods; after how many periods it was settled, 0 if never."""
+        self._play(commands.ramp_in)
+        settled_after = self._settle(commands.period)
+        if settled_after:
+            for _ in range(1, self._plan.periods):
+                self._play(commands.period)
+            self._play(commands.ramp_out)
+        return settled_after
+
+    def _settle(self, period: Array) -> int:
+        former = self._play(period)
+        for count in range(1, self._plan.max_settling_periods + 1):
+            latest = self._play(period)
+            if settling_difference(former, latest) <= self._plan.settle_within:
+                return count
+            former = latest
+        return 0
+
+    def _play(self, command: Array) -> Array:
+        """Simulate under these torques; the positions (joints, samples) [rad]."""
+        part = respond(self._physics, self._state, command * self._scale, self._plan.rate, self._feedback)
+        self._state = part.state
+        self.parts.append(part)
+        return part.position

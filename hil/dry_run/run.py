@@ -1,0 +1,35 @@
+"""What `hil dry-run` does: an ensemble, the experiment on it, the largest safe torque."""
+
+from pathlib import Path
+
+from hil.config.schema import Config
+from hil.dry_run.amplitude import largest_amplitude
+from hil.dry_run.ensemble import Ensemble, prior_ensemble, result_ensemble
+from hil.dry_run.prediction import predict
+from hil.dry_run.stopping_distance import stopping_distance
+from hil.dry_run.summary import DryRun
+from hil.model_file import read_result
+from hil.plan.plan import make_plan
+from hil.setup.idle_bus import quiet_stream
+
+ARMS = 128
+
+
+def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos: bool = False) -> DryRun:
+    """Simulate the configured experiment. result: run folder or result.json of a former identification.
+
+    Raises ConfigError, ResultError, RunFolderError, ExperimentError; with `servos`, DriverError.
+    """
+    ensemble = ensemble_of(config, result, arms)
+    said = quiet_stream(config) if servos else ()
+    plan = None if config.experiment.peak_torque is None else make_plan(config)
+    asked = None if plan is None else predict(config, plan, ensemble)
+    largest = largest_amplitude(config, ensemble)
+    shown = largest.prediction if asked is None else asked
+    stopping = stopping_distance(config, plan or largest.plan, ensemble, shown.quantile[2].clip(max=shown.limits[2]))
+    return DryRun(ensemble.source, ensemble.size, asked, largest, stopping, said)
+
+
+def ensemble_of(config: Config, result: Path | None, arms: int) -> Ensemble:
+    """From the prior, or from a former result."""
+    return prior_ensemble(config, arms) if result is None else result_ensemble(read_result(result), arms)

@@ -1,0 +1,284 @@
+"""How far beyond its position limits an arm goes when it is stopped, by each way in which a stop may come about.
+
+The stop itself is simulated, gravity, friction and the joints' pull at each other included, on arms of an ensemble:
+
+planned   something stops the run at any moment of the planned motion: a signal, lost replies, an alert, a lost port,
+          the program killed
+passed    the motion is not the planned one (a joint held fast, turned round or without torque, another arm than
+          described), so the guard stops it where a limit is passed: one joint on its position limit, outwards at its
+          velocity limit, the others anywhere between theirs
+
+It knows what a dry run knows: rigid links, friction, current lag, and that the servos do as their manual says.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.dry_run.ensemble import Ensemble
+from hil.dry_run.prediction import scaled_feedback
+from hil.estimator.models.parameters import CONSTANTS, Physics
+from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
+from hil.plan.brake import GETS_FASTER, NOTICED_AFTER, braking_gains
+from hil.plan.plan import Plan
+from hil.plan.stabiliser import feedback_of
+
+Array = NDArray[np.float64]
+
+LONGEST_S = 1.5
+"""For which a stopped arm is watched: a swing and its return."""
+
+_ARMS = 16
+_THREADS = 2
+_AHEAD_S = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2)
+"""How far a motion is carried on by its velocity in the search for the moments that lead farthest."""
+_EVENLY = 16
+_IMMOVABLE = 1e3  # kg m^2
+_REACTION = 2
+"""Samples: the one that shows it, and the one under way meanwhile."""
+
+
+class Way(StrEnum):
+    """How the arm is stopped.
+
+    CUT: torque off. BRAKED: braked, then off. REVERSED: the brake pushes where it should hold, is given up and torque
+    cut. SILENT: some or all servos hear nothing, their watchdogs act. SILENT_BRAKE: the same as braking begins.
+    """
+
+    CUT = "cut"
+    BRAKED = "braked"
+    REVERSED = "reversed"
+    SILENT = "silent"
+    SILENT_BRAKE = "silent brake"
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """Largest way beyond a position limit over arms and starts, by the way of the stop, (joints,) [rad] each."""
+
+    planned: dict[Way, Array]
+    passed: dict[Way, Array]
+
+
+@dataclass(frozen=True)
+class _Start:
+    """state: as `respond` takes it (5 or 6, joints). goal: torque that the former goals command (joints,) [N m].
+
+    jammed: a joint that something holds fast.
+    """
+
+    state: Array
+    goal: Array
+    jammed: int | None = None
+
+
+_Piece = tuple[Array, Feedback, int]
+"""Commanded torque (joints,) [N m], what is added to it, for how many samples."""
+
+_Commands = Callable[[_Start], Iterator[list[_Piece]]]
+"""The commands of a stop from its start on, one list for each form that it may take."""
+
+
+def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: Array) -> Stopping:
+    """On a few arms of the ensemble; limits are passed at up to `velocity` (joints,) [rad/s]."""
+    return Stopping(beyond_when_planned(config, plan, ensemble), beyond_when_passed(config, plan, ensemble, velocity))
+
+
+def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[Way, Array]:
+    """Stopped at any moment of the planned motion."""
+    stops = _Stops(config)
+    ways = {
+        Way.CUT: stops.cut,
+        Way.BRAKED: stops.braked,
+        Way.SILENT: stops.silent,
+        Way.SILENT_BRAKE: stops.silent_brake,
+    }
+    goals = _planned_goals(config, plan)
+    return _farthest(stops, ways, ensemble, lambda physics, scale: _planned_starts(config, physics, scale, goals))
+
+
+def beyond_when_passed(
+    config: Config, plan: Plan, ensemble: Ensemble, velocity: Array, pose: Array | None = None
+) -> dict[Way, Array]:
+    """Stopped because a limit was passed at up to `velocity` (joints,) [rad/s], under the plan's largest torque.
+
+    pose: where the arm was then (joints,) [rad]; unless given, one joint is on a limit and the other anywhere.
+    """
+    stops = _Stops(config)
+    peak = np.abs(_planned_goals(config, plan)).max(axis=1)
+    faster = velocity + GETS_FASTER * np.array([joint.velocity_limit for joint in config.joints])
+    ways = {Way.CUT: stops.cut, Way.BRAKED: stops.braked}
+    held = _farthest(stops, ways, ensemble, lambda physics, _: _limit_starts(config, physics, peak, velocity, pose))
+    pushed = {Way.REVERSED: stops.reversed}
+    return held | _farthest(
+        stops, pushed, ensemble, lambda physics, _: _limit_starts(config, physics, peak, faster, pose)
+    )
+
+
+def _farthest(
+    stops: "_Stops", ways: Mapping[Way, _Commands], ensemble: Ensemble, starts: Callable[[Physics, Array], list[_Start]]
+) -> dict[Way, Array]:
+    """The farthest over a few arms and their starts."""
+    few = ensemble.first(_ARMS)
+
+    def one(arm: int) -> list[Array]:
+        physics, scale = few.physics[arm], few.torque_scale[arm]
+        from_here = starts(physics, scale)
+        return [stops.farthest(physics, scale, from_here, commands) for commands in ways.values()]
+
+    with ThreadPoolExecutor(_THREADS) as threads:  # the compiled simulation lets go of the interpreter
+        worst = np.max(list(threads.map(one, range(few.size))), axis=0)
+    return dict(zip(ways, worst, strict=True))
+
+
+def _planned_goals(config: Config, plan: Plan) -> Array:
+    """Commanded torque of the whole plan (joints, samples) [N m]; periods beyond the second add nothing."""
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    parts = []
+    for segment in plan.segments:
+        parts += [segment.ramp_in, segment.period_current, segment.period_current, segment.ramp_out]
+    return np.ascontiguousarray((np.concatenate(parts) * constants).T)
+
+
+def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
+    """Moments of the planned motion, up to a limit: those that lead farthest, and some at even distances."""
+    rest = resting(np.array(config.arm.rest_pose))
+    moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale))
+    until = _within_limits(config, moved)
+    chosen = set(np.linspace(1, until - 1, _EVENLY).astype(int).tolist())
+    for ahead in _AHEAD_S:
+        carried = moved.position[:, 1:until] + ahead * moved.velocity[:, 1:until]
+        chosen |= {1 + int(at) for at in (*carried.argmin(axis=1), *carried.argmax(axis=1))}
+    return [
+        _Start(
+            np.stack((*_at(moved, at), moved.torque[:, at - 1], *_at(moved, at - 1))),
+            moved.torque[:, at] / scale,
+        )
+        for at in sorted(chosen)
+    ]
+
+
+def _within_limits(config: Config, moved: Response) -> int:
+    """Samples, two at least, before the guard stops the motion because it passes a limit."""
+    low, high = (np.array(side)[:, None] for side in zip(*(j.position_limit for j in config.joints), strict=True))
+    fastest = np.array([joint.velocity_limit for joint in config.joints])[:, None]
+    passed = (moved.position < low) | (moved.position > high) | (np.abs(moved.velocity) > fastest)
+    first = np.flatnonzero(passed.any(axis=0))
+    return max(2, int(first[0])) if first.size else passed.shape[1]
+
+
+def _at(moved: Response, sample: int) -> tuple[Array, Array]:
+    return moved.position[:, sample], moved.velocity[:, sample]
+
+
+def _felt(config: Config, scale: Array) -> Feedback:
+    return scaled_feedback(feedback_of(config), scale)
+
+
+def _limit_starts(config: Config, physics: Physics, peak: Array, velocity: Array, pose: Array | None) -> list[_Start]:
+    """One joint outwards at its velocity and driven outwards; the other at any speed, or jammed."""
+    starts = []
+    joints = range(len(config.joints))
+    rest = config.arm.rest_pose
+    for joint, outward in product(joints, (-1.0, 1.0)):
+        limit = config.joints[joint].position_limit[0 if outward < 0 else 1]
+        corners = product(*([limit] if k == joint else [rest[k], *config.joints[k].position_limit] for k in joints))
+        speeds = [[outward] if k == joint else [-1.0, 0.0, 1.0] for k in joints]
+        goal = outward * np.where(np.arange(len(joints)) == joint, peak, 0.0)
+        for at in map(np.array, corners) if pose is None else [pose]:
+            starts += [_Start(_moving(at, np.array(each) * velocity), goal) for each in product(*speeds)]
+            if len(joints) == 2:
+                handed = _handed_on(physics, at, joint, outward, velocity)
+                starts.append(_Start(_moving(at, handed), goal, jammed=1 - joint))
+    return starts
+
+
+def _moving(pose: Array, velocity: Array) -> Array:
+    state = resting(pose)
+    state[1] = state[4] = velocity
+    return state
+
+
+def _handed_on(physics: Physics, pose: Array, joint: int, outward: float, velocity: Array) -> Array:
+    """The velocities after the other joint has jammed: what it had is handed on to this one, at once."""
+    p = dict(zip(CONSTANTS, physics.vector.tolist(), strict=True))
+    across = p["coupling"] * float(np.cos(pose[1]))
+    shared = p["inertia_2"] + across
+    own = (p["inertia_1"] + p["inertia_2"] + 2 * across, p["inertia_2"] + p["armature_2"])[joint]
+    after = np.zeros_like(pose)
+    after[joint] = outward * (velocity[joint] + abs(shared) / own * velocity[1 - joint])
+    return after
+
+
+def _held(physics: Physics, joint: int) -> Physics:
+    """The arm with a joint that nothing moves: its rotor alone is given an inertia without end."""
+    vector = physics.vector.copy()
+    vector[CONSTANTS.index(("inertia_1", "armature_2")[joint])] += _IMMOVABLE
+    return Physics(vector, physics.delay, physics.lag)
+
+
+class _Stops:
+    """The ways of stopping, as commands over time from a start."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        rate = config.experiment.rate
+        self._rate = rate
+        self._low, self._high = np.array([joint.position_limit for joint in config.joints]).T
+        constants = np.array([joint.torque_per_goal for joint in config.joints])
+        self._clamp = feedback_of(config).limit
+        nothing = np.zeros_like(constants)
+        self._none = Feedback.none(len(config.joints))
+        self._brake = Feedback(nothing, np.array(braking_gains(config)) * constants, nothing, self._clamp)
+        self._off: _Piece = (nothing, self._none, round(LONGEST_S * rate))
+        self._braking = round(config.safety.damp_time * rate)
+        self._heard_for = round(config.safety.watchdog * rate) + 1
+        self._missed_for = config.safety.max_missing + _REACTION
+
+    def farthest(self, physics: Physics, scale: Array, starts: list[_Start], commands: _Commands) -> Array:
+        """The largest way beyond a limit (joints,) [rad]."""
+        reached = np.zeros_like(scale)
+        for start in starts:
+            arm = physics if start.jammed is None else _held(physics, start.jammed)
+            for pieces in commands(start):
+                state = start.state
+                for command, feedback, count in pieces:
+                    held = np.repeat((command * scale)[:, None], count, axis=1)
+                    moved = respond(arm, state, held, self._rate, scaled_feedback(feedback, scale))
+                    state = moved.state
+                    for joint, position in enumerate(moved.position):
+                        beyond = max(self._low[joint] - position.min(), position.max() - self._high[joint])
+                        reached[joint] = max(reached[joint], beyond)
+        return reached
+
+    def cut(self, start: _Start) -> Iterator[list[_Piece]]:
+        yield [(start.goal, self._none, _REACTION), self._off]
+
+    def braked(self, start: _Start) -> Iterator[list[_Piece]]:
+        if self._braking and self._config.safety.stop == "damp":
+            yield [(start.goal, self._none, _REACTION), (self._off[0], self._brake, self._braking), self._off]
+        else:
+            yield from self.cut(start)
+
+    def reversed(self, start: _Start) -> Iterator[list[_Piece]]:
+        pushed = np.clip(self._brake.damping * start.state[1], -self._clamp, self._clamp)
+        yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
+
+    def silent(self, start: _Start) -> Iterator[list[_Piece]]:
+        """All servos keep their goals until their watchdogs act, or one does, and the others are cut before."""
+        kept = (start.goal, self._none, self._heard_for)
+        yield [kept, self._off]
+        for silent in range(start.goal.size if start.goal.size > 1 else 0):
+            alone = np.where(np.arange(start.goal.size) == silent, start.goal, 0.0)
+            first = min(self._missed_for, self._heard_for - 1)
+            yield [(start.goal, self._none, first), (alone, self._none, self._heard_for - first), self._off]
+
+    def silent_brake(self, start: _Start) -> Iterator[list[_Piece]]:
+        goal = np.clip(-self._brake.damping * start.state[1], -self._clamp, self._clamp)
+        yield [(goal, self._none, self._heard_for), self._off]

@@ -1,0 +1,1 @@
+"""From a recording to a result: settled period or any motion, physical quantities, comparison."""

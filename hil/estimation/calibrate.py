@@ -1,0 +1,83 @@
+"""`hil calibrate`: each joint's torque constant from two runs, one of them with a known mass bolted on."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hil.config.schema import Config
+from hil.errors import ConfigError
+from hil.estimation.model_from_config import wanted_model
+from hil.estimation.settled_period import settled_period
+from hil.estimator.calibration import Calibration, KnownMass, calibrate
+from hil.estimator.identify import identify
+from hil.plan.plan import IDENTIFY
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
+
+SCHEMA = 1
+
+
+def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -> dict[str, Any]:
+    """The calibration as a dictionary; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
+    config, other = without.load_config(), with_mass.load_config()
+    _same_arm(config, other)
+    if config.arm.gravity == 0.0:
+        raise ConfigError("arm.gravity = 0: nothing pulls at the mass; calibrate in a vertical plane.")
+    periods = [
+        settled_period(each, run.load_facts(), load_samples(run.samples_path, len(each.joints)), IDENTIFY)
+        for each, run in ((config, without), (other, with_mass))
+    ]
+    # The ratio of the torque constants is what the mass tells, and each of them.
+    model = replace(wanted_model(config.model, len(config.joints)), torque_scale=False)
+    first = identify(periods[0], model)
+    found = calibrate(periods[0], periods[1], first, known, config.arm.gravity)
+    return _described(config, found)
+
+
+def _same_arm(config: Config, other: Config) -> None:
+    for one, two in zip(config.joints, other.joints, strict=False):
+        if one.torque_per_goal != two.torque_per_goal:
+            raise ConfigError(
+                f"joint {one.name!r}: one run supposes {one.torque_per_goal:g} N m per unit of goal and the other "
+                f"{two.torque_per_goal:g}; record both with the same TOML."
+            )
+    if len(config.joints) != len(other.joints):
+        raise ConfigError(f"one run has {len(config.joints)} joints and the other {len(other.joints)}.")
+
+
+def _described(config: Config, found: Calibration) -> dict[str, Any]:
+    factor, std = found.factor.tolist(), found.factor_std.tolist()
+    base = len(config.joints)
+    return {
+        "schema": SCHEMA,
+        "torque_per_goal": {
+            joint.name: {
+                "value": joint.torque_per_goal * factor[i],
+                "std": joint.torque_per_goal * std[i],
+                "supposed": joint.torque_per_goal,
+                "unit": f"N m/{'V' if joint.drive_mode.name == 'PWM' else 'A'}",
+            }
+            for i, joint in enumerate(config.joints)
+        },
+        "parameters": {
+            name: {"value": float(value), "std": float(error)}
+            for name, value, error in zip(found.names, found.value, found.std, strict=True)
+        },
+        "fit": {"residual_rms_ticks": found.residual_steps.tolist(), "misfit": found.misfit, "joints": base},
+    }
+
+
+def calibration_lines(result: dict[str, Any]) -> list[str]:
+    """What was found and what to write into the TOML."""
+    lines = []
+    for name, entry in result["torque_per_goal"].items():
+        lines.append(
+            f"{name}: {entry['value']:.4f} +- {entry['std']:.4f} {entry['unit']} "
+            f"({100 * (entry['value'] / entry['supposed'] - 1):+.1f} % from the {entry['supposed']:g} supposed)"
+        )
+    worst = float(np.max(result["fit"]["residual_rms_ticks"]))
+    lines.append(f"Residual of both runs: {worst:.3f} encoder steps at most; rounding alone leaves 0.289.")
+    lines.append("The standard errors hold noise only: the mass's own error, and its distance's, come on top in full.")
+    lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these and estimate again.")
+    return lines

@@ -1,0 +1,121 @@
+"""`hil compare`: other methods on the recording of a run, beside the result of this one."""
+
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from hil.config.schema import Config
+from hil.errors import ConfigError
+from hil.estimation.model_from_config import wanted_model
+from hil.estimation.settled_period import settled_period
+from hil.estimation.truth import true_parameters
+from hil.estimator.baselines.compare import Peer, compare_peers
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import EstimationError
+from hil.estimator.identify import identify
+from hil.estimator.models.model import Model
+from hil.estimator.selection.prediction import settled_prediction_error
+from hil.plan.plan import HELD_OUT, IDENTIFY
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder, write_json
+
+SCHEMA = 1
+OURS = "hil"
+OURS_PLAIN = "hil_coulomb"
+"""This project's estimate with the friction that mujoco.sysid has too: like against like, for the time it takes."""
+
+
+def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> dict[str, Any]:
+    """Every method on the settled period of `run`; also written to compare.json there.
+
+    By method: parameters and std by name, worst_relative_error (on a fake arm; of inertias, gravity and friction),
+    held_out_rms (free prediction of the other multisine over its motion, worst joint; null where the simulation
+    under these parameters does not settle), seconds, settings. Raises HilError, EstimationError.
+    """
+    config, facts = run.load_config(), run.load_facts()
+    samples = load_samples(run.samples_path, len(config.joints))
+    period = settled_period(config, facts, samples, IDENTIFY)
+    held_out = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
+    truth = true_parameters(config)
+    methods = {peer.name: judged(peer, truth, held_out) for peer in all_methods(config, period, truth, mujoco, seed)}
+    compared = {"schema": SCHEMA, "config": facts.config, "truth": truth, "methods": methods}
+    write_json(run.path / "compare.json", compared)
+    return compared
+
+
+def all_methods(
+    config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
+) -> Iterator[Peer]:
+    """This project's own estimate first, then its peers."""
+    ours = _ours(period, OURS, wanted_model(config.model, period.joints))
+    yield ours
+    length = link_length(config)
+    yield from compare_peers(period, length, config.arm.gravity)
+    if mujoco:
+        from hil.estimation.mujoco_peer import fit_with_mujoco
+
+        if length is None and period.joints == 2:
+            raise ConfigError("mujoco.sysid needs the length of link 1: add length_1 under [known].")
+        centre = dict(truth) if truth else {name: ours.parameters[name] for name in ours.std if name in ours.parameters}
+        yield _ours(period, OURS_PLAIN, Model(period.joints, "coulomb", "delay"))
+        yield fit_with_mujoco(period, centre, length or 0.0, config.arm.gravity, seed)
+
+
+def link_length(config: Config) -> float | None:
+    """Of link 1 [m]: as the fake arm has it or [known] says; None when nobody knows."""
+    if config.known is not None and config.known.length_1 is not None:
+        return config.known.quantities()["length_1"].value
+    if config.is_fake and config.fake is not None and config.fake.arm is not None:
+        return config.fake.arm.links[0].length
+    return None
+
+
+def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> dict[str, Any]:
+    """One method's entry of compare.json."""
+    entry: dict[str, Any] = {
+        "parameters": peer.parameters,
+        "std": peer.std,
+        "seconds": round(peer.seconds, 6),
+        "settings": peer.settings,
+        "settings_tried": peer.tried,
+    }
+    if truth is not None:
+        name, worst = worst_error(peer.parameters, truth)
+        entry |= {"worst_relative_error": worst, "worst_parameter": name}
+    if held_out is not None:
+        entry["held_out_rms"] = _held_out(held_out, peer.parameters)
+    return entry
+
+
+def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
+    """Largest relative error of inertias, gravity, viscous and Coulomb friction, and whose it is.
+
+    Offsets are left out: they are near zero and a relative error says nothing. A parameter that the method does
+    not have counts as 0, an error of 1.
+    """
+    errors = {
+        name: abs(parameters.get(name, 0.0) / true - 1.0)
+        for name, true in truth.items()
+        if true and not name.startswith("offset")
+    }
+    worst = max(errors, key=lambda name: errors[name])
+    return worst, errors[worst]
+
+
+def _ours(period: SettledPeriod, name: str, model: Model) -> Peer:
+    began = time.perf_counter()
+    estimate = identify(period, model)
+    seconds = time.perf_counter() - began
+    std = dict(zip(estimate.names, estimate.std.tolist(), strict=True))
+    settings = model.description
+    return Peer(name, estimate.parameters, std, seconds, settings, 1)
+
+
+def _held_out(period: SettledPeriod, parameters: Mapping[str, float]) -> float | None:
+    try:
+        error = float(settled_prediction_error(period, parameters).max())
+    except (EstimationError, ValueError, OverflowError, ZeroDivisionError):
+        return None
+    return error if np.isfinite(error) else None

@@ -1,0 +1,18 @@
+"""From `[model]` to the model that the estimator fits."""
+
+from hil.config.schema import ModelConfig
+from hil.estimator.models.model import Model
+
+
+def wanted_model(wanted: ModelConfig, joints: int) -> Model:
+    """What the file asks for, of an arm of `joints`; where it says "auto", Stribeck friction."""
+    return Model(
+        joints,
+        wanted.fixed_friction,
+        wanted.drive,
+        presliding=wanted.presliding,
+        asymmetry=wanted.asymmetry,
+        ripple=wanted.ripple,
+        zeros=wanted.zeros,
+        torque_scale=wanted.torque_scale,
+    )

@@ -1,0 +1,79 @@
+"""From a run folder to its result: settled period, both stages, the check on a multisine that was not used."""
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.estimation.model_from_config import wanted_model
+from hil.estimation.physical import physical_entries
+from hil.estimation.result import make_result
+from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
+from hil.estimation.settled_period import settled_period
+from hil.estimation.settled_warnings import warnings_of
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.identify import Estimate, identify, predict
+from hil.estimator.models.parameters import Physics
+from hil.estimator.selection.settled import Choice, choose
+from hil.estimator.selection.validation import validate
+from hil.estimator.selection.verdict import judge
+from hil.plan.plan import HELD_OUT, IDENTIFY
+from hil.plan.stabiliser import stabiliser_share
+from hil.runs.period_file import PlayedPeriod, save_periods
+from hil.runs.recording import Phase, load_samples
+from hil.runs.run_folder import RunFolder
+from hil.runs.timing import timing
+
+
+def estimate_run(run: RunFolder) -> dict[str, Any]:
+    """Estimate from the recording in `run` and write its result.json; the result. Raises HilError, EstimationError."""
+    config, facts = run.load_config(), run.load_facts()
+    samples = load_samples(run.samples_path, len(config.joints))
+    started = time.perf_counter()
+    period = settled_period(config, facts, samples, IDENTIFY)
+    other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
+    estimate, choice = _estimate(config, period, other, run.load_starts())
+    played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+    if other is not None:
+        predicted = _predict(config, estimate, other)
+        played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
+    held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
+    validation = validate(period, estimate)
+    checked = {
+        **describe_validation(validation, held_out),
+        "verdict": describe_verdict(judge(estimate, validation, held_out)),
+        "warnings": warnings_of(config, facts, samples, period),
+        **({"model_choice": describe_choice(choice)} if choice else {}),
+    }
+    seconds = round(time.perf_counter() - started, 3)
+    kept_time = {**timing(samples, config.experiment.rate), "estimation_seconds": seconds}
+    result = make_result(config, facts.config, period, estimate, checked, kept_time)
+    if config.known is not None:
+        result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
+    if config.stabiliser is not None:
+        chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(IDENTIFY))
+        result["stabiliser"] = stabiliser_share(config, samples[chosen]).as_json()
+    save_periods(run.path, played)
+    run.write_result(result)
+    return result
+
+
+def _estimate(
+    config: Config, period: SettledPeriod, other: SettledPeriod | None, starts: list[dict[str, float]]
+) -> tuple[Estimate, Choice | None]:
+    """The estimate of the model that the configuration asks for, or of the one chosen, with how it was."""
+    wanted = config.model
+    if wanted.friction == "auto":
+        choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts)
+        return choice.estimate, choice
+    return identify(period, wanted_model(wanted, len(config.joints)), starts=starts), None
+
+
+def _predict(config: Config, estimate: Estimate, other: SettledPeriod) -> NDArray[np.float64]:
+    """The model's free prediction of another multisine, (joints, samples) [rad]."""
+    if other.stabiliser is None:
+        return predict(estimate, other.torque, other.rate, other.command_to_sample)
+    arm, pose = Physics.of(estimate.parameters), np.array(config.arm.rest_pose)
+    return other.stabiliser.settled_positions(arm, pose, other.rate, other.command_to_sample)

@@ -1,0 +1,108 @@
+"""From a recording to what the estimator takes: the settled periods of one multisine."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.errors import RecordingCutShort
+from hil.estimation.lateness import acting_torque, lateness, velocity_of
+from hil.estimator.data.periodicity import period_difference
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.simulation.closed_loop import Stabilised
+from hil.plan.stabiliser import feedback_of, feedback_torque
+from hil.runs.recording import Phase
+from hil.runs.run_folder import RunFacts
+
+
+def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], role: str) -> SettledPeriod:
+    """The settled periods of the multisine played for `role`; raises RecordingCutShort."""
+    experiment = config.experiment
+    count = experiment.samples
+    chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))
+    rows = samples[chosen]
+    whole = len(rows) // count
+    periods = rows[: whole * count].reshape(whole, count)
+    position = np.moveaxis(periods["position"], 2, 1)
+    position = np.where(np.isfinite(position), position, np.nan)
+    for index, joint in enumerate(config.joints):
+        if whole and not np.isfinite(position[:, index]).any():
+            raise RecordingCutShort(f"{joint.name} never said where it is during {role!r}: look at its cable and ID.")
+    first = _first_settled(position, experiment.settle_within)
+    if first is None or whole - first < experiment.periods:
+        wanted = experiment.periods + 1
+        raise RecordingCutShort(
+            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods, and among "
+            f"them no {experiment.periods} settled ones; {wanted * count} samples are the least. Record again."
+        )
+    begin, end = first * count, (first + experiment.periods) * count
+    # With the row before: its goal holds until the first write.
+    goals = rows["goal_current"][begin - 1 : end].T * _torque_constants(config)[:, None]
+    late = lateness(rows[begin:end])
+    torque = acting_torque(goals, late, experiment.rate)
+    angle = position[first : first + experiment.periods]
+    period = SettledPeriod(
+        rate=experiment.rate,
+        torque=_by_period(torque, count).mean(axis=0),
+        position=_mean_of_periods(angle),
+        command_to_sample=facts.command_to_sample,
+        position_step=np.array(facts.position_step),
+        periods=experiment.periods,
+        stabiliser=None if config.stabiliser is None else _stabilised(config, rows, torque, begin),
+    )
+    on_time = angle - velocity_of(period) * _by_period(late[None], count)
+    return replace(period, position=_mean_of_periods(on_time), position_std=_scatter(on_time))
+
+
+def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean (joints, samples) over those of the periods (periods, joints, samples) that have the sample, or NaN."""
+    count = np.isfinite(position).sum(axis=0)
+    mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _by_period(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """(joints, samples) of several periods of `count` samples as (periods, joints, count)."""
+    return np.moveaxis(values.reshape(len(values), -1, count), 1, 0)
+
+
+def _torque_constants(config: Config) -> NDArray[np.float64]:
+    return np.array([joint.torque_per_goal for joint in config.joints])
+
+
+def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float64], first: int) -> Stabilised:
+    """What the stabiliser gave of the `torque` (joints, samples) from row `first` on, from the samples it acted on."""
+    with_former = rows[first - 1 : first + torque.shape[1]]
+    given = np.nan_to_num(feedback_torque(config, with_former)).T
+    excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)
+    former = np.nan_to_num(np.stack((with_former["position"][0], with_former["velocity"][0])))
+    commanded = with_former["goal_current"][0] * _torque_constants(config)
+    return Stabilised(feedback_of(config), np.ascontiguousarray(excitation), former, commanded)
+
+
+def _scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Standard deviation of the mean over periods, (periods, joints, samples) [rad], per joint; None for one period."""
+    count = len(position)
+    if count < 2:
+        return None
+    scatter: NDArray[np.float64] = np.sqrt(np.nanmean(np.nanvar(position, axis=0, ddof=1), axis=1) / count)
+    return scatter
+
+
+def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
+    """The first period that is like the one before it, as the stream decided."""
+    for period in range(1, len(position)):
+        if settling_difference(position[period - 1], position[period]) <= within:
+            return period
+    return None
+
+
+def settling_difference(former: NDArray[np.float64], latest: NDArray[np.float64]) -> float:
+    """How far a period, (joints, samples) [rad], is from the one before: RMS over the motion's RMS, the worst joint.
+
+    Only the later halves are compared. Where they agree the former period ended settled, so all of the latest one is,
+    even though the former began with the transient of the ramp: a whole period of arm time is saved.
+    """
+    half = former.shape[1] // 2
+    return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())

@@ -1,0 +1,60 @@
+"""What looks wrong in a recording but does not stop the estimation: said, with the joint and what to change."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.runs.recording import Phase
+from hil.runs.run_folder import RunFacts
+
+LARGE = 0.5  # of the largest goal: smaller ones say little about clipping
+SHORT = 0.85  # measured over commanded current below which a motor did not get what it was told
+OFTEN = 0.05  # of the large samples
+LEAST_SWING = 30.0  # encoder steps
+LOST = 0.01  # of the samples
+
+
+def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
+    """One sentence for each thing."""
+    found = clipping_warnings(config, samples[samples["phase"] == Phase.PERIODIC])
+    for index, joint in enumerate(config.joints):
+        swing = float(np.nanmax(period.position[index]) - np.nanmin(period.position[index]))
+        steps = swing / facts.position_step[index]
+        if steps < LEAST_SWING:
+            found.append(
+                f"{joint.name} moved by {steps:.0f} encoder steps only: its parameters rest on rounding; raise its "
+                "peak_torque."
+            )
+        lost = 1.0 - float(np.mean(period.valid[index]))
+        if lost > LOST:
+            found.append(f"{joint.name}: {100 * lost:.1f} % of the samples are missing; look at cable, baud and rate.")
+    return found
+
+
+def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
+    """Of joints that got less current than they were told."""
+    return [
+        said
+        for index, joint in enumerate(config.joints)
+        if joint.drive_mode is Mode.CURRENT
+        for said in _clipped(joint.name, samples["goal_current"][:, index], samples["current"][:, index])
+    ]
+
+
+def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]) -> list[str]:
+    """Where a motor gets less current than it was told: its supply sags, or its own current limit is lower."""
+    # A lagging current loop is behind where the goal moves, not where it stays.
+    large = (np.abs(goal) > LARGE * np.abs(goal).max()) & np.isfinite(measured)
+    if not large.any():
+        return []
+    short = np.abs(measured[large]) < SHORT * np.abs(goal[large])
+    part = float(np.mean(short))
+    if part <= OFTEN:
+        return []
+    return [
+        f"{name} got less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the strong "
+        "samples: it is clipped by the servo's own current limit or by the supply's voltage at speed; lower "
+        "peak_torque or raise the supply."
+    ]

@@ -1,0 +1,54 @@
+"""What the joints' torque constants leave open in a result, in sentences for terminal and report."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from hil.config.schema import JointConfig
+from hil.drivers.servo_model import Mode
+
+RATIO = "torque_scale_2"
+
+
+class Driven(Protocol):
+    """A joint as the configuration or a model describes it."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def torque_per_goal(self) -> float:
+        """N m per A, or per V in pwm mode."""
+
+    @property
+    def torque_per_goal_std(self) -> float: ...
+
+
+def torque_constants_said(joints: Sequence[Driven], extra: dict[str, Any]) -> str:
+    """Which torque constants the values scale with, and how well they are known; empty where they are exact.
+
+    extra: the result's terms beside the base parameters; with their ratio found, only the first constant is left open.
+    """
+    unsure = [
+        f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.2g} %"
+        for joint in joints
+        if joint.torque_per_goal_std
+    ]
+    if RATIO not in extra:
+        known = f"Every value also scales with its joint's torque constant, known to: {', '.join(unsure)}."
+        return known if unsure else ""
+    first, second = joints
+    ratio = extra[RATIO]
+    found = (
+        f"Against {first.name}, {second.name} gives {ratio['value']:.5g} +- {ratio['std']:.1g} times the torque that "
+        f"its torque constant says. Every value scales with {first.name}'s alone"
+    )
+    if not first.torque_per_goal_std:
+        return f"{found}."
+    return f"{found}, known to {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
+
+
+def by_voltage_said(joints: Sequence[JointConfig]) -> str:
+    """What viscous friction holds where the joints are driven by voltage; empty where they are not."""
+    if all(joint.drive_mode is not Mode.PWM for joint in joints):
+        return ""
+    return "Driven by voltage: the viscous friction includes what the motor generates when it turns."

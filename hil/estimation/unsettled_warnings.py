@@ -1,0 +1,75 @@
+"""What looks wrong in an estimate from any data: said, with the joint and what to change."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hil.estimator.data.recording import Recording
+from hil.estimator.fit.multiple_shooting import ShootingEstimate
+
+LEAST_SWING = 30.0  # encoder steps
+LOST = 0.01  # of the samples
+MANY_TURNS = 2.0
+FLAT = 0.05  # of the samples at the very largest torque: a sine has fewer
+LEFT = 0.1  # residual over the motion's RMS
+WEAK, UNSEEN = 0.5, 10.0  # standard error over value
+
+
+def any_warnings(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[str]:
+    """One sentence for each thing."""
+    found = []
+    for joint in range(estimate.model.joints):
+        name = f"Joint {joint + 1}"
+        found += _motion(recordings, joint, name)
+        found += _flat(recordings, joint, name)
+        motion = float(np.sqrt(np.mean([np.var(each.filled()[joint]) for each in recordings])))
+        left = float(estimate.residual_rms[joint]) / motion
+        if left > LEFT:
+            found.append(
+                f"{name}: the fit leaves {100 * left:.2g} % of the motion, so do not use these numbers: check the "
+                "units, signs and zero of position and torque; then try shorter segments."
+            )
+    return [*found, *_weak(estimate)]
+
+
+def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
+    found = []
+    swing = max(float(np.ptp(each.filled()[joint])) for each in recordings)
+    steps = swing / max(float(each.position_step[joint]) for each in recordings)
+    if steps < LEAST_SWING:
+        found.append(
+            f"{name} moved by {steps:.0f} encoder steps only: its parameters rest on rounding; drive it harder."
+        )
+    turns = swing / (2.0 * np.pi)
+    if turns > MANY_TURNS:
+        found.append(f"{name} moved over {turns:.0f} turns: if it did not, its positions are not in the unit given.")
+    lost = 1.0 - float(np.mean(np.concatenate([np.isfinite(each.position[joint]) for each in recordings])))
+    if lost > LOST:
+        found.append(f"{name}: {100 * lost:.1f} % of its positions are missing.")
+    return found
+
+
+def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
+    """A measured torque that stays at its largest value was cut off there; a command may."""
+    for each in recordings:
+        size = np.abs(each.torque[joint])
+        at_most = float(np.mean(size > 0.9999 * size.max()))
+        if each.between == "linear" and FLAT < at_most < 0.9:
+            return [
+                f"{name}: its torque stays at {size.max():.3g} N m in {100 * at_most:.0f} % of the samples: if the "
+                "current was clipped, give the measured one, or drive it less."
+            ]
+    return []
+
+
+def _weak(estimate: ShootingEstimate) -> list[str]:
+    count = len(estimate.model.base_names)
+    known = zip(estimate.names[:count], estimate.value, estimate.std, strict=False)
+    weak = [
+        f"{name} ({100 * std / abs(value):.0f} %)" if std < UNSEEN * abs(value) else f"{name} (not at all)"
+        for name, value, std in known
+        if not name.startswith("offset") and std > WEAK * abs(value)
+    ]
+    if not weak:
+        return []
+    return [f"Hardly known from this motion: {', '.join(weak)}. Faster, wider motion of each joint would tell."]

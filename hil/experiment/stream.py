@@ -1,0 +1,218 @@
+"""The experiment in time: at each tick one exchange, the guard looks, the recorder keeps.
+
+Played in order: rest; for each multisine a ramp in, periods until two successive ones are alike, the periods that will
+be used, a ramp out; then no current until the arm is at rest. Where a stop allows it, the arm is braked before `run`
+raises; torque is cut by whoever switched it on.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError, ServoFault
+from hil.drivers.rate import FixedRate
+from hil.drivers.state import State
+from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop
+from hil.estimation.settled_period import settling_difference
+from hil.experiment.guard import Guard
+from hil.experiment.stop_request import StopRequest
+from hil.plan.brake import Brake, may_brake
+from hil.plan.plan import Plan, Segment, rest_window
+from hil.plan.stabiliser import Stabiliser
+from hil.runs.recording import Phase, Recorder, missed
+
+_WATCH_EVERY_S = 0.05
+_LEAST_MOTION_STEPS = 4
+
+
+class Progress(NamedTuple):
+    """What a person watches: samples taken, of how many expected, the phase, and the latest state."""
+
+    taken: int
+    expected: int
+    phase: Phase
+    role: str
+    state: State
+
+
+Watch = Callable[[Progress], None]
+Note = Callable[[str], None]
+
+
+class Stream:
+    """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
+
+    watch: called about 20 times a second with the progress. note: called with each event worth keeping.
+    """
+
+    def __init__(
+        self, bus: ServoBus, plan: Plan, config: Config, recorder: Recorder, stop: StopRequest, watch: Watch, note: Note
+    ) -> None:
+        self._bus = bus
+        self._clock = bus.port.clock
+        self._plan = plan
+        self._config = config
+        self._safety = config.safety
+        self._guard = Guard(config)
+        self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
+        self._recorder = recorder
+        self._stop = stop
+        self._watch = watch
+        self._note = note
+        self._interval = 1 / plan.rate
+        self._ticks = FixedRate(bus.port.clock, plan.rate)
+        self._index = 0
+        self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
+        self._goal = [0.0] * len(bus.joints)
+        self._segment = 0
+        self._state: State | None = None
+
+    def run(self) -> None:
+        """Play the whole plan; raises ExperimentError, SafetyStop, StopRequested, PortLost."""
+        try:
+            self._play_all()
+        except ExperimentError as error:
+            if may_brake(self._config, error):
+                self._brake()
+            raise
+
+    def _play_all(self) -> None:
+        self._rest()
+        for number, segment in enumerate(self._plan.segments):
+            self._segment = number
+            self._note(f"{segment.role}: ramp in")
+            self._play(segment.ramp_in, Phase.RAMP_IN)
+            self._play_periods(segment)
+            self._note(f"{segment.role}: ramp out")
+            self._play(segment.ramp_out, Phase.RAMP_OUT)
+        self._come_to_rest()
+
+    def _rest(self) -> None:
+        self._note("rest")
+        state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
+        moving = self._moving(state)
+        if moving:
+            raise ExperimentError(f"The arm moves before the start: {moving}. Let it hang still, then start again.")
+
+    def _play_periods(self, segment: Segment) -> None:
+        """Periods until one is like the one before it, which then is the first settled one; then the rest of them."""
+        samples = len(segment.period_current)
+        former = self._play_period(segment, 0)
+        self._check_motion(former)
+        for period in range(1, self._plan.max_settling_periods + 1):
+            latest = self._play_period(segment, period)
+            difference = settling_difference(former, latest)
+            if difference <= self._plan.settle_within:
+                self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
+                for further in range(1, self._plan.periods):
+                    self._play_period(segment, period + further)
+                return
+            former = latest
+        raise NotSettled(
+            f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
+            f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
+            f"{self._plan.settle_within:.1%}. Look for play, a dragging cable or a slipping joint; or raise "
+            "max_settling_periods."
+        )
+
+    def _check_motion(self, position: NDArray[np.float64]) -> None:
+        """A joint that friction or something harder holds shows after one period, before minutes are spent on it."""
+        for joint, moved in zip(
+            self._bus.joints, np.nanmax(position, axis=1) - np.nanmin(position, axis=1), strict=True
+        ):
+            if moved <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
+                raise ExperimentError(
+                    f"{joint.title} moved by {moved:.4f} rad in a whole period: it is stuck, or friction holds it. "
+                    "Move it by hand with torque off; if it is free, raise experiment.peak_torque."
+                )
+
+    def _play_period(self, segment: Segment, period: int) -> NDArray[np.float64]:
+        """Play one period; its positions, (joints, samples) [rad], NaN where missing."""
+        first = self._recorder.count
+        self._play(segment.period_current, Phase.PERIODIC, period)
+        return np.array(self._recorder.samples["position"][first:].T)
+
+    def _come_to_rest(self) -> None:
+        self._note("coming to rest")
+        window = rest_window(self._plan.rate)
+        for _ in range(0, self._plan.end_samples, window):
+            self._play(self._silence(window), Phase.COMING_TO_REST)
+            speeds = np.abs(self._recorder.samples["velocity"][-window:])
+            # Replies that are missing say nothing; a joint of which none came is not known to be at rest.
+            fastest = np.fmax.reduce(speeds, axis=0)
+            if (fastest < self._safety.rest_velocity).all():
+                self._note("at rest")
+                return
+        told = ", ".join(f"{speed:.2f}" for speed in fastest)
+        self._note(f"still moving at {told} rad/s after {self._safety.rest_time:g} s without current")
+
+    def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
+        """Send goal currents, (samples, joints) [A], one row a tick; the last state."""
+        state = missed(self._goal, self._clock.now())
+        for goal in goals.tolist():
+            state = self._sample(goal, phase, period)
+        return state
+
+    def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
+        deadline, now, late = self._ticks.wait()
+        if late:
+            # Skipped, never caught up in a burst: the servos keep the former goal.
+            state = missed(self._goal, now)
+        else:
+            wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
+            self._goal = self._guard.clamp(wanted)
+            state = self._bus.exchange(self._goal)
+        self._recorder.keep(deadline, phase, self._segment, period, state)
+        self._index += 1
+        if late:
+            self._guard.late()
+        else:
+            self._look(state, phase)
+        self._stop.check()
+        # Heat and supply come with one sample in many: that one is always shown.
+        if self._index % self._watch_every == 0 or state.slow is not None:
+            role = self._plan.segments[self._segment].role
+            self._watch(Progress(self._index, self._plan.expected, phase, role, state))
+        return state
+
+    def _look(self, state: State, phase: Phase) -> None:
+        if any(state.error):
+            try:
+                self._bus.check_alerts(state)
+            except ServoFault as fault:
+                raise SafetyStop(str(fault), Cause.ALERT) from fault
+        former, self._state = self._state, state
+        self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        if phase is Phase.REST and self._stabiliser is None:
+            self._guard.look_at_rest(state)
+
+    def _brake(self) -> None:
+        """Brake until the arm is slow, cannot be felt, time is over, or somebody insists. Never raises."""
+        brake = Brake(self._config)
+        state = self._state
+        with suppress(DriverError):
+            for _ in range(self._plan.brake_samples):
+                goals = None if state is None else brake.goals(state)
+                if goals is None:
+                    return
+                deadline, _, late = self._ticks.wait()
+                if late or self._stop.insisted:
+                    return
+                state = self._bus.exchange(goals)
+                self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
+
+    def _silence(self, samples: int) -> NDArray[np.float64]:
+        return np.zeros((samples, len(self._bus.joints)))
+
+    def _moving(self, state: State) -> str:
+        limit = self._safety.rest_velocity
+        return ", ".join(
+            f"{joint} at {velocity:.2f} rad/s"
+            for joint, velocity in zip(self._bus.joints, state.velocity, strict=True)
+            if abs(velocity) > limit
+        )

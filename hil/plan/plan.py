@@ -1,0 +1,150 @@
+"""What will be played: the multisines of an experiment as goal currents, sample by sample, ramps included."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.errors import ConfigError
+from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
+
+IDENTIFY, HELD_OUT = "identify", "held_out"
+ROLES = (IDENTIFY, HELD_OUT)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One multisine and what it is for. `period_current`: goal currents of one period, (samples, joints) [A]."""
+
+    role: str
+    multisine: Multisine
+    period_current: NDArray[np.float64]
+    ramp_samples: int
+
+    @property
+    def ramp_in(self) -> NDArray[np.float64]:
+        """Goal currents before the first period: its end, faded in, so that the period itself starts whole."""
+        count = self.ramp_samples
+        fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
+        return self._before(count) * fade[:, None]
+
+    @property
+    def ramp_out(self) -> NDArray[np.float64]:
+        """Goal currents after the last period: its beginning, faded out."""
+        count = self.ramp_samples
+        fade = 0.5 + 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
+        index = np.arange(count) % len(self.period_current)
+        return self.period_current[index] * fade[:, None]
+
+    @property
+    def peak_torque(self) -> NDArray[np.float64]:
+        """Largest commanded torque (joints,) [N m]."""
+        peaks: NDArray[np.float64] = np.abs(self.multisine.torque).max(axis=1)
+        return peaks
+
+    def _before(self, count: int) -> NDArray[np.float64]:
+        index = np.arange(-count, 0) % len(self.period_current)
+        return self.period_current[index]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that the stream will play, in order."""
+
+    rate: float
+    segments: tuple[Segment, ...]
+    rest_samples: int
+    end_samples: int
+    brake_samples: int
+    max_settling_periods: int
+    periods: int
+    settle_within: float
+
+    def first_segment(self) -> "Plan":
+        """The plan with its first multisine alone."""
+        return replace(self, segments=self.segments[:1])
+
+    @property
+    def capacity(self) -> int:
+        """The largest number of samples that playing can take."""
+        longest = self.max_settling_periods + self.periods
+        played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
+        return self.rest_samples + played + self.end_samples + self.brake_samples
+
+    @property
+    def expected(self) -> int:
+        """The number of samples when the second period is settled, as on most arms."""
+        played = sum((1 + self.periods) * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
+        return self.rest_samples + played
+
+
+def scaled(config: Config, plan: Plan, peak_torque: NDArray[np.float64]) -> Plan:
+    """The same waves with other peaks, (joints,) [N m]; each segment's own peaks are brought to these."""
+    return replace(plan, segments=tuple(_scaled_segment(config, segment, peak_torque) for segment in plan.segments))
+
+
+def _scaled_segment(config: Config, segment: Segment, peak_torque: NDArray[np.float64]) -> Segment:
+    wave = segment.multisine
+    factor = peak_torque / np.abs(wave.torque).max(axis=1)
+    amplitudes = tuple(tuple(float(f * a) for a in each) for f, each in zip(factor, wave.amplitudes, strict=True))
+    multisine = replace(wave, amplitudes=amplitudes, torque=wave.torque * factor[:, None])
+    return Segment(segment.role, multisine, period_current(config, multisine), segment.ramp_samples)
+
+
+def period_current(config: Config, multisine: Multisine) -> NDArray[np.float64]:
+    """One period of goal currents within the limits, (samples, joints) [A]."""
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    limits = np.array([joint.goal_limit for joint in config.joints])
+    clipped: NDArray[np.float64] = np.clip(multisine.torque.T / constants, -limits, limits)
+    return clipped
+
+
+def make_plan(config: Config) -> Plan:
+    """Design the excitation of a configuration; the same seed gives the same plan."""
+    experiment = config.experiment
+    roles = ROLES if experiment.held_out else (IDENTIFY,)
+    return Plan(
+        rate=experiment.rate,
+        segments=tuple(_segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
+        rest_samples=max(1, round(experiment.rest * experiment.rate)),
+        end_samples=_whole_windows(config.safety.rest_time, experiment.rate),
+        brake_samples=round(config.safety.damp_time * experiment.rate),
+        max_settling_periods=experiment.max_settling_periods,
+        periods=experiment.periods,
+        settle_within=experiment.settle_within,
+    )
+
+
+def rest_window(rate: float) -> int:
+    """Samples after which the stream looks whether the arm has come to rest."""
+    return max(1, round(0.2 * rate))
+
+
+def _whole_windows(seconds: float, rate: float) -> int:
+    window = rest_window(rate)
+    return window * max(1, math.ceil(seconds * rate / window))
+
+
+def _lines(config: Config) -> Sequence[Sequence[int]]:
+    """The harmonics of each joint; the configuration has either a band or the lines themselves."""
+    experiment = config.experiment
+    if experiment.band is None:
+        return experiment.lines or []
+    low, high = experiment.band
+    if experiment.detection:
+        return detecting_lines(experiment.period, (low, high), len(config.joints), experiment.seed)
+    return zippered_lines(experiment.period, (low, high), len(config.joints))
+
+
+def _segment(config: Config, role: str, seed: int) -> Segment:
+    experiment = config.experiment
+    if experiment.peak_torque is None:
+        raise ConfigError(
+            f"{config.path}: experiment.peak_torque is missing. `hil dry-run` finds how much is safe; or set "
+            "pilot = true."
+        )
+    multisine = design_multisine(experiment.rate, experiment.period, _lines(config), experiment.peak_torque, seed)
+    return Segment(role, multisine, period_current(config, multisine), round(experiment.ramp * experiment.rate))

@@ -1,0 +1,145 @@
+"""Samples on file as they are taken: a preallocated, memory-mapped `.npy` of a structured type.
+
+What has been sampled is on file even if the process is killed (not if the machine loses power: the pages are the
+kernel's until it writes them). A row whose phase is 0 has not been recorded.
+"""
+
+import os
+import struct
+from collections.abc import Sequence
+from enum import IntEnum
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.drivers.state import State
+from hil.errors import RunFolderError
+
+
+class Phase(IntEnum):
+    """What the stream was doing when it took a sample."""
+
+    NOT_RECORDED = 0
+    REST = 1
+    RAMP_IN = 2
+    PERIODIC = 3
+    RAMP_OUT = 4
+    COMING_TO_REST = 5
+    BRAKING = 6
+
+
+def sample_type(joints: int) -> np.dtype[np.void]:
+    """One row: times [s], where in the plan, and per joint goal and measured current [A], velocity [rad/s], position
+    [rad], the servo's ERR byte, whether its reply is missing (then the measured values are NaN), and, a few times a
+    second in turn (else NaN), the servo's own clock [s], its supply [V] and its temperature [degrees C].
+    """
+    each = (joints,)
+    return np.dtype(
+        [
+            ("deadline", "<f8"),
+            ("time_before_write", "<f8"),
+            ("time_after_read", "<f8"),
+            ("phase", "u1"),
+            ("segment", "u1"),
+            ("period", "<i2"),
+            ("goal_current", "<f8", each),
+            ("current", "<f8", each),
+            ("velocity", "<f8", each),
+            ("position", "<f8", each),
+            ("error", "u1", each),
+            ("missing", "u1", each),
+            ("servo_clock", "<f4", each),
+            ("supply_voltage", "<f4", each),
+            ("temperature", "<f4", each),
+        ]
+    )
+
+
+class Recorder:
+    """Keeps samples in `path`, at most `capacity` of them. A context manager; leaving it cuts the file to length."""
+
+    def __init__(self, path: Path, joints: int, capacity: int) -> None:
+        self._path = path
+        self._row = struct.Struct(f"<dddBBh{4 * joints}d{2 * joints}B{3 * joints}f")
+        self._nothing_slow = (float("nan"),) * (3 * joints)
+        dtype = sample_type(joints)
+        assert self._row.size == dtype.itemsize
+        try:
+            self._samples = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=(capacity,))
+            _reserve(path)
+        except OSError as error:
+            raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        self._bytes = memoryview(self._samples.view(np.uint8).data)
+        self.count = 0
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def samples(self) -> NDArray[np.void]:
+        """The rows recorded so far."""
+        return self._samples[: self.count]
+
+    def keep(self, deadline: float, phase: Phase, segment: int, period: int, state: State) -> None:
+        """Put one sample on file."""
+        self._row.pack_into(
+            self._bytes,
+            self.count * self._row.size,
+            deadline,
+            state.time_before_write,
+            state.time_after_read,
+            phase,
+            segment,
+            period,
+            *state.goal_current,
+            *state.current,
+            *state.velocity,
+            *state.position,
+            *state.error,
+            *state.missing,
+            *(self._nothing_slow if state.slow is None else chain(*state.slow)),
+        )
+        self.count += 1
+
+    def close(self) -> None:
+        """Cut the file to the rows that were recorded; harmless when closed."""
+        if self._bytes.nbytes == 0:
+            return
+        rows = np.array(self.samples)
+        self._bytes.release()
+        self._bytes = memoryview(b"")
+        temporary = self._path.with_suffix(".partial.npy")
+        np.save(temporary, rows, allow_pickle=False)
+        temporary.replace(self._path)
+
+
+def _reserve(path: Path) -> None:
+    """Take the disk space now: writing to a mapped page that a full disk cannot hold would kill the process."""
+    with path.open("r+b") as file:
+        os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+
+
+def missed(goal_current: Sequence[float], now: float) -> State:
+    """The sample of a deadline that passed unused: the former goal currents stayed in force, nothing was measured."""
+    nothing = (float("nan"),) * len(goal_current)
+    return State(
+        now, now, tuple(goal_current), nothing, nothing, nothing, (0,) * len(goal_current), (True,) * len(goal_current)
+    )
+
+
+def load_samples(path: Path, joints: int) -> NDArray[np.void]:
+    """The recorded rows of a `samples.npy`, also of one whose process was killed. Raises RunFolderError."""
+    try:
+        samples = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise RunFolderError(f"{path} cannot be read as a recording: {error}.") from error
+    expected = sample_type(joints)
+    if samples.dtype != expected:
+        raise RunFolderError(f"{path} holds rows of another type than a recording of {joints} joints.")
+    recorded: NDArray[np.void] = samples[samples["phase"] != Phase.NOT_RECORDED]
+    return recorded

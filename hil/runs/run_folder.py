@@ -1,0 +1,199 @@
+"""The run folder: an exact copy of the configuration, what was run on what, events, samples, result.
+
+config.toml     copied byte for byte
+experiment.json the [experiment] that was really played, where the tool chose it (pilot, torque found by dry runs)
+run.json        versions, start time, and the few facts that the samples need to be read again
+events.jsonl    what happened when, one JSON object a line, written as it happens
+samples.npy     every sample (hil.runs.recording)
+lateness.json   how many samples were how late (hil.runs.timing)
+result.json     parameters with error bars, fit, validation, timing
+period.npz      the settled periods as measured and as the model has them (hil.runs.period_file)
+"""
+
+import json
+import platform
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from hil import __version__, strict_json
+from hil.config.schema import Config, ExperimentConfig, parse_config
+from hil.errors import RunFolderError
+from hil.plan.plan import Plan
+
+SCHEMA = 1
+_PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What `estimate` needs beside configuration and samples.
+
+    command_to_sample: s from the goal currents' arrival at the servos to the sampling of their positions.
+    position_step: rad per encoder step, per joint. segments: the role of each multisine, in the order played.
+    """
+
+    config: str
+    command_to_sample: float
+    position_step: list[float]
+    segments: list[str]
+
+
+class RunFolder:
+    """A folder of one run. `create` makes a new one, `open` reads one that exists."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, path: Path, config: Config) -> "RunFolder":
+        """Make the folder and copy the configuration; raises RunFolderError when it is taken or not writable."""
+        run = cls(path)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            if any(path.iterdir()):
+                raise RunFolderError(f"Run folder {path} is not empty; name another with --out, or remove it.")
+            run.config_path.write_bytes(config.path.read_bytes())
+        except OSError as error:
+            raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> "RunFolder":
+        """A folder that holds a run; raises RunFolderError."""
+        run = cls(path)
+        for needed in (run.config_path, run.run_path, run.samples_path):
+            if not needed.is_file():
+                raise RunFolderError(f"{path} is not a run folder: it has no {needed.name}.")
+        return run
+
+    @property
+    def config_path(self) -> Path:
+        return self.path / "config.toml"
+
+    @property
+    def run_path(self) -> Path:
+        return self.path / "run.json"
+
+    @property
+    def samples_path(self) -> Path:
+        return self.path / "samples.npy"
+
+    @property
+    def result_path(self) -> Path:
+        return self.path / "result.json"
+
+    @property
+    def played_path(self) -> Path:
+        return self.path / "experiment.json"
+
+    def load_config(self) -> Config:
+        """The configuration, with the experiment that was really played. Raises ConfigError, RunFolderError."""
+        config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
+        if not self.played_path.is_file():
+            return config
+        try:
+            played = ExperimentConfig(**_read_json(self.played_path))
+        except ValidationError as error:
+            raise RunFolderError(f"{self.played_path} is damaged: {error}.") from error
+        return config.model_copy(update={"experiment": played})
+
+    def below(self, name: str, played: Config) -> "RunFolder":
+        """A run of its own in a folder of this one, on the way to it; raises RunFolderError."""
+        folder = RunFolder.create(self.path / name, played)
+        folder.write_played(played)
+        return folder
+
+    @property
+    def starts_path(self) -> Path:
+        return self.path / "starts.json"
+
+    def write_starts(self, starts: list[dict[str, float]]) -> None:
+        """Keep parameters from which the estimate starts too, now and when it is made anew."""
+        write_json(self.starts_path, {"starts": starts})
+
+    def load_starts(self) -> list[dict[str, float]]:
+        """Those kept, if any were; raises RunFolderError."""
+        if not self.starts_path.is_file():
+            return []
+        starts = _read_json(self.starts_path).get("starts")
+        if not isinstance(starts, list):
+            raise RunFolderError(f"{self.starts_path} is damaged: it holds no list of starts.")
+        return starts
+
+    def write_played(self, played: Config) -> None:
+        """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found."""
+        write_json(self.played_path, played.experiment.model_dump())
+
+    def write_facts(self, facts: RunFacts, plan: Plan) -> None:
+        """Write run.json: the facts, and what was run on what."""
+        described = {
+            "schema": SCHEMA,
+            **asdict(facts),
+            "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+            "versions": {"hil": __version__, **{name: version(name) for name in _PACKAGES}},
+            "python": platform.python_version(),
+            "machine": platform.platform(),
+            "excitation": [
+                {
+                    "role": segment.role,
+                    "lines": [list(map(int, lines)) for lines in segment.multisine.lines],
+                    "crest_factor": [round(float(value), 4) for value in segment.multisine.crest_factor],
+                }
+                for segment in plan.segments
+            ],
+        }
+        write_json(self.run_path, described)
+
+    def load_facts(self) -> RunFacts:
+        values = _read_json(self.run_path)
+        if values.get("schema") != SCHEMA:
+            raise RunFolderError(
+                f"{self.run_path}: schema {values.get('schema')!r} is not {SCHEMA}; this run was made by another hil."
+            )
+        try:
+            return RunFacts(
+                str(values["config"]),
+                float(values["command_to_sample"]),
+                [float(step) for step in values["position_step"]],
+                [str(role) for role in values["segments"]],
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunFolderError(f"{self.run_path} is damaged: {error!r}.") from error
+
+    def event(self, time: float, what: str) -> None:
+        """Append one event, with its time on the port's clock [s]; raises RunFolderError."""
+        line = json.dumps({"time": round(time, 6), "event": what}, ensure_ascii=False)
+        path = self.path / "events.jsonl"
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+        except OSError as error:
+            raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+    def write_result(self, result: dict[str, Any]) -> None:
+        write_json(self.result_path, result)
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write a JSON file whole or not at all."""
+    temporary = path.with_suffix(".partial")
+    try:
+        temporary.write_text(strict_json.dumps(value, indent=2) + "\n", encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path} cannot be read: {error}.") from error
+    if not isinstance(value, dict):
+        raise RunFolderError(f"{path} is damaged: it holds no JSON object.")
+    return value

@@ -1,0 +1,1 @@
+"""Servos made ready: scan, settings, preflight checks, a new arm's file."""

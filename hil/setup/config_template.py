@@ -1,0 +1,137 @@
+"""The commented TOML file of an arm, from the few things that must be known of it."""
+
+import json
+import math
+from dataclasses import dataclass
+
+from hil.drivers.joint import Joint
+from hil.drivers.servo_model import Mode, Published, servo_model
+
+STANDARD_GRAVITY = 9.81
+_OF_STALL = 0.3  # of the stall current or the supply: what the guard allows at first
+_OF_LIMIT = 0.25  # of that: the first excitation's peak on joint 1; half of it on joint 2
+_CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
+_RATES = (400, 200, 100, 50, 20)
+
+
+@dataclass(frozen=True)
+class JointAnswers:
+    """One joint. rest: angle where it hangs [rad]; swing: how far it may go from there to either side [rad]."""
+
+    name: str
+    id: int
+    model: str
+    zero_ticks: int
+    rest: float
+    direction: int = 1
+    swing: float = math.pi / 2
+
+    @property
+    def joint(self) -> Joint:
+        servo = servo_model(self.model)
+        return Joint(self.name, self.id, servo, self.direction, self.zero_ticks, servo.default_mode)
+
+
+@dataclass(frozen=True)
+class ArmAnswers:
+    """One arm. gravity: m/s^2 in its plane. head: what the file's first lines say."""
+
+    url: str
+    baud: int
+    joints: tuple[JointAnswers, ...]
+    gravity: float
+    head: str
+
+
+def arm_toml(arm: ArmAnswers) -> str:
+    """The file's text."""
+    rate = _rate(arm)
+    head = [f"# {line}" for line in arm.head.splitlines()]
+    port = ["[port]", f"url = {json.dumps(arm.url)}", f"baud = {arm.baud}"]
+    mechanism = [
+        "[arm]",
+        _line(f"gravity = {arm.gravity:g}", "m/s^2; 0 for an arm that moves in a horizontal plane"),
+        _line(f"rest_pose = {_list([joint.rest for joint in arm.joints], 4)}", "rad: where it hangs; hil looks first"),
+    ]
+    experiment = [
+        "[experiment]",
+        _line(f"rate = {rate:.1f}", "samples per second; hil check tells what this bus can do"),
+        _line("period = 10.0", "s"),
+        _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: lines shared out between the joints in turn"),
+        _line(f"peak_torque = {_list(_peaks(arm), 3)}", "N m: small for a first run"),
+        _line("ramp = 1.0", "s, in and out"),
+        "seed = 1",
+    ]
+    model = [
+        "[model]",
+        _line('friction = "stribeck"', '"coulomb" has less, "stribeck_load" more; "auto" tries them all'),
+        _line('drive = "lag"', '"delay": a pure delay instead of a current loop'),
+    ]
+    if len(arm.joints) == 2:
+        model.append(_line("torque_scale = true", "find how far the second torque constant is off against the first"))
+    safety = ["[safety]", _line("watchdog = 0.1", "s of silence after which a servo stops by itself")]
+    tables = [head, port, *(_joint(joint) for joint in arm.joints), mechanism, experiment, model, safety]
+    return "\n\n".join("\n".join(table) for table in tables) + "\n"
+
+
+def _line(setting: str, meaning: str) -> str:
+    return f"{setting:<30} # {meaning}"
+
+
+def _joint(answers: JointAnswers) -> list[str]:
+    servo = servo_model(answers.model)
+    pwm = servo.default_mode is Mode.PWM
+    published = servo.torque_per_volt if pwm else servo.torque_per_ampere
+    constant, limit = ("torque_per_volt", "voltage_limit") if pwm else ("torque_constant", "current_limit")
+    unit = "V" if pwm else "A"
+    figures = f"{published.low:.3g} to {published.high:.3g}" if published.high > published.low else "one figure"
+    ends = [answers.rest - answers.swing, answers.rest + answers.swing]
+    return [
+        "[[joints]]",
+        f"name = {json.dumps(answers.name, ensure_ascii=False)}",
+        f"id = {answers.id}",
+        f"model = {json.dumps(answers.model)}",
+        _line(f"direction = {answers.direction}", "-1 where the servo turns against the joint"),
+        _line(f"zero_ticks = {answers.zero_ticks}", "Present Position where the joint's angle is 0"),
+        _line(f"{constant} = {published.value:.3g}", f"N m/{unit} at the output shaft; published: {figures}"),
+        _line(
+            f"{constant}_std = {_spread(published):.2g}",
+            "all of the joint's values scale with it",
+        ),
+        _line(f"position_limit = {_list(ends, 2)}", "rad"),
+        _line("velocity_limit = 10.0", "rad/s"),
+        _line(f"{limit} = {_goal_limit(answers):.2g}", f"{unit}: {_OF_STALL * 100:.0f} % of stall"),
+    ]
+
+
+def _spread(published: Published) -> float:
+    """A standard deviation for a published constant: half of how far the figures are apart, and never below a tenth."""
+    return max(0.1 * published.value, (published.high - published.low) / 2)
+
+
+def _goal_limit(answers: JointAnswers) -> float:
+    """A or V: part of what the servo stalls at, at its middle supply."""
+    servo = servo_model(answers.model)
+    stall = servo.stalls[len(servo.stalls) // 2]
+    most = _OF_STALL * (stall.voltage if servo.default_mode is Mode.PWM else stall.current)
+    return float(f"{most:.2g}")
+
+
+def _peaks(arm: ArmAnswers) -> list[float]:
+    """N m: the outer joint carries less."""
+    peaks = []
+    for number, answers in enumerate(arm.joints):
+        servo = servo_model(answers.model)
+        published = servo.torque_per_volt if servo.default_mode is Mode.PWM else servo.torque_per_ampere
+        peaks.append(_OF_LIMIT * 0.5**number * _goal_limit(answers) * published.value)
+    return peaks
+
+
+def _rate(arm: ArmAnswers) -> float:
+    """The highest usual rate whose cycle leaves the bus half idle."""
+    cycle = _CYCLE_BYTES * len(arm.joints) * 10 / arm.baud + 0.4e-3
+    return float(next((rate for rate in _RATES if 2 * cycle < 1 / rate), _RATES[-1]))
+
+
+def _list(values: list[float], decimals: int) -> str:
+    return f"[{', '.join(f'{value:.{decimals}f}' for value in values)}]"

@@ -1,0 +1,59 @@
+"""The bus before anything moves: the servos' own limits, and a second of the real exchange with torque off."""
+
+import numpy as np
+
+from hil import fakes
+from hil.config.schema import Config
+from hil.drivers.bus import ServoBus
+from hil.drivers.rate import FixedRate
+from hil.drivers.servo_model import VELOCITY_UNIT, VOLTAGE_UNIT, Mode
+
+_SECONDS = 1.0
+
+
+def quiet_stream(config: Config) -> tuple[str, ...]:
+    """What the servos say of themselves, and how the exchange keeps time, in lines for a person. Raises DriverError."""
+    fakes.register()
+    with ServoBus.open(config.bus) as bus:
+        return (*_limits(config, bus), _timing(config, bus))
+
+
+def _limits(config: Config, bus: ServoBus) -> list[str]:
+    lines = []
+    for joint, described in zip(bus.joints, config.joints, strict=True):
+        servo = bus.servo(joint)
+        supply, least, most = (
+            VOLTAGE_UNIT * servo.read(name)
+            for name in ("Present Input Voltage", "Min Voltage Limit", "Max Voltage Limit")
+        )
+        parts = [
+            f"supply {supply:.1f} V of {least:.1f} to {most:.1f}",
+            f"{servo.read('Present Temperature')} of {servo.read('Temperature Limit')} degrees C",
+            f"velocity limit {VELOCITY_UNIT * servo.read('Velocity Limit'):.1f} rad/s (not enforced in current mode)",
+        ]
+        if joint.mode is Mode.CURRENT:
+            own = servo.read("Current Limit") * abs(joint.drive_unit(0.0))
+            short = " : TOO LOW, goals would be refused" if own < described.goal_limit else ""
+            parts.insert(0, f"own current limit {own:.2f} A, current_limit {described.goal_limit:g} A{short}")
+        lines.append(f"{joint.title}: {'; '.join(parts)}.")
+    return lines
+
+
+def _timing(config: Config, bus: ServoBus) -> str:
+    rate = config.experiment.rate
+    ticks = FixedRate(bus.port.clock, rate)
+    nothing = [0.0] * len(bus.joints)
+    lateness, round_trip, missing = [], [], 0
+    for _ in range(round(_SECONDS * rate)):
+        tick = ticks.wait()
+        if tick.missed:
+            continue
+        state = bus.exchange(nothing)
+        lateness.append(1e6 * (state.time_before_write - tick.deadline))
+        round_trip.append(1e6 * (state.time_after_read - state.time_before_write))
+        missing += any(state.missing)
+    late, there = (float(np.quantile(values, 0.99)) for values in (lateness, round_trip))
+    return (
+        f"With torque off at {rate:g} per second: lateness p99 {late:.0f} us, round trip p99 {there:.0f} of "
+        f"{1e6 / rate:.0f} us, {ticks.missed} missed deadlines, {missing} lost replies."
+    )

@@ -1,0 +1,112 @@
+"""`hil init`: what the bus can tell of an arm is read, what it cannot is asked. Nothing is written to a servo."""
+
+import math
+from collections.abc import Callable, Sequence
+
+from hil.drivers.control_table import load_control_table
+from hil.drivers.port import Port
+from hil.drivers.servo import Servo
+from hil.drivers.servo_model import SERVO_MODELS, servo_model
+from hil.errors import ExperimentError
+from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers
+from hil.setup.scan import Found, Heard
+
+Ask = Callable[[str, str], str]
+"""Asks a question, with what an empty answer means; gives the answer."""
+Say = Callable[[str], None]
+
+_NAMES = ("shoulder", "elbow")
+_MOVED_TICKS = 30
+_MOST_SWING = 175.0  # degrees
+
+
+def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) -> ArmAnswers:
+    """The arm behind an open port, of what a scan heard on it. Raises ExperimentError where that makes no arm."""
+    baud, servos = _one_baud(heard)
+    port.set_baud(baud)
+    chosen = _choose(servos, ask, say)
+    handles = [Servo(port, found.id, load_control_table(str(found.model))) for found in chosen]
+    for servo in handles:
+        if servo.read("Torque Enable"):
+            raise ExperimentError(f"{servo.title} holds its torque. Switch its supply off and on, then start again.")
+    names = [_name(number, found, ask) for number, found in enumerate(chosen)]
+    vertical = _yes("Does the arm move in a vertical plane, so that it hangs down by itself?", ask, say)
+    directions = [_direction(servo, name, ask, say) for servo, name in zip(handles, names, strict=True)]
+    ask("Let the arm hang at rest, or lay it straight if it moves in a horizontal plane, and press Enter", "")
+    joints = []
+    for number, (servo, found, name) in enumerate(zip(handles, chosen, names, strict=True)):
+        rest = -math.pi / 2 if vertical and number == 0 else 0.0
+        unit = directions[number] * servo_model(str(found.model)).position_unit
+        zero = servo.read("Present Position") - round(rest / unit)
+        swing = _swing(name, ask, say)
+        joints.append(JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing))
+    head = (
+        "Written by hil init. Before the first run: read each line, then `hil check` this file.\n"
+        "NOT yet run on this arm: limits and torques are careful guesses from the servos' models."
+    )
+    return ArmAnswers(url, baud, tuple(joints), STANDARD_GRAVITY if vertical else 0.0, head)
+
+
+def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
+    """The baud at which servos answered, and those that can be driven."""
+    answered = {each.baud: [found for found in each.servos if found.model in SERVO_MODELS] for each in heard}
+    usable = {baud: servos for baud, servos in answered.items() if servos}
+    if not usable:
+        raise ExperimentError(
+            "No servo that hil can drive answers. Look at `hil scan`; possible models: " + ", ".join(SERVO_MODELS) + "."
+        )
+    if len(usable) > 1:
+        found = "; ".join(f"{baud}: ID {', '.join(str(one.id) for one in servos)}" for baud, servos in usable.items())
+        raise ExperimentError(f"Servos answer at more than one baud ({found}). Bring them to one with hil setup.")
+    return next(iter(usable.items()))
+
+
+def _choose(servos: list[Found], ask: Ask, say: Say) -> list[Found]:
+    by_id = {found.id: found for found in servos}
+    listed = ", ".join(f"{found.id} ({found.model})" for found in servos)
+    usual = " ".join(str(found.id) for found in servos[:2])
+    while True:
+        answer = ask(f"IDs of the arm's one or two joints, from the base outwards; there are {listed}", usual)
+        words = answer.replace(",", " ").split()
+        if 1 <= len(words) <= 2 and len(set(words)) == len(words) and all(_known(word, by_id) for word in words):
+            return [by_id[int(word)] for word in words]
+        say(f"{answer!r}: give one or two different IDs out of {', '.join(map(str, by_id))}, for example: {usual}")
+
+
+def _known(word: str, by_id: dict[int, Found]) -> bool:
+    return word.isdecimal() and int(word) in by_id
+
+
+def _name(number: int, found: Found, ask: Ask) -> str:
+    return ask(f"Name of the joint with ID {found.id}", _NAMES[number])[:20] or _NAMES[number]
+
+
+def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
+    """Which way Present Position counts, seen so that the arm hangs down and points right when it is lifted."""
+    before = servo.read("Present Position")
+    ask(f"Turn {name} by hand a little counter-clockwise, at most a quarter turn, hold it there and press Enter", "")
+    moved = servo.read("Present Position") - before
+    if abs(moved) < _MOVED_TICKS:
+        say(f"{name} did not move: direction = 1 is assumed. Correct it in the file if the servo turns the other way.")
+        return 1
+    return 1 if moved > 0 else -1
+
+
+def _swing(name: str, ask: Ask, say: Say) -> float:
+    while True:
+        answer = ask(f"How far may {name} swing from there to either side, in degrees", "90")
+        try:
+            degrees = float(answer)
+        except ValueError:
+            degrees = math.nan
+        if 5 <= degrees <= _MOST_SWING:
+            return math.radians(degrees)
+        say(f"{answer!r}: give a number of degrees from 5 to {_MOST_SWING:g}")
+
+
+def _yes(question: str, ask: Ask, say: Say) -> bool:
+    while True:
+        answer = ask(f"{question} (yes or no)", "yes").lower()
+        if answer in ("y", "yes", "n", "no"):
+            return answer.startswith("y")
+        say(f"{answer!r}: answer yes or no")

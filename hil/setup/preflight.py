@@ -1,0 +1,248 @@
+"""Everything that would stop an experiment, looked at before one, with how to mend it. Torque stays off."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+from hil.config.schema import Config, JointConfig
+from hil.drivers.bus import ServoBus
+from hil.drivers.control_table import model_names
+from hil.drivers.errors import DriverError, NoReply, PortLost, PortNotOpened
+from hil.drivers.joint import Joint
+from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
+from hil.drivers.packet import HardwareError
+from hil.drivers.servo import Servo, describe_error
+from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
+from hil.setup.bus_rate import check_rate
+
+_WARM_BELOW_LIMIT_C = 15
+_LONG_RETURN_DELAY_US = 20
+
+
+class Level(StrEnum):
+    """OK; a WARNING does not stop the experiment; a STOP does."""
+
+    OK = "ok"
+    WARNING = "warning"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at: what, on what, what was found, and where it is not well how to mend it."""
+
+    level: Level
+    where: str
+    what: str
+    found: str
+    mend: str = ""
+
+
+def check_arm(config: Config) -> Iterator[Finding]:
+    """Look at port, servos, pose and rate, in this order; what cannot be looked at is a STOP, never an exception."""
+    try:
+        bus = ServoBus.connect(config.bus)
+    except PortNotOpened as error:
+        yield Finding(Level.STOP, config.port.url, "port", "cannot be opened", str(error))
+        return
+    with bus:
+        yield Finding(Level.OK, bus.port.url, "port", f"opened at {config.port.baud} baud")
+        yield _latency_timer(bus)
+        all_well = True
+        for joint_config, joint in zip(config.joints, bus.joints, strict=True):
+            for finding in _servo(config, joint_config, joint, bus.servo(joint)):
+                all_well &= finding.level is not Level.STOP
+                yield finding
+        if not all_well:
+            yield Finding(Level.STOP, "bus", "rate", "not measured", "Mend what stops the servos first.")
+            return
+        yield from _rate(config, bus)
+
+
+def _latency_timer(bus: ServoBus) -> Finding:
+    url, what = bus.port.url, "latency timer"
+    file = latency_timer(url)
+    if file is None:
+        return Finding(Level.OK, url, what, "none (no FTDI adapter)")
+    before_ms = read_latency_ms(file)
+    lowered = bus.port.lower_latency()
+    found = f"{before_ms} ms" if before_ms <= WANTED_MS else f"was {before_ms} ms, now {read_latency_ms(file)} ms"
+    if lowered:
+        return Finding(Level.OK, url, what, found)
+    level = Level.STOP if before_ms >= FACTORY_MS else Level.WARNING
+    return Finding(level, url, what, f"{before_ms} ms, {WANTED_MS} is needed", f"Type: {command_to_set(file)}")
+
+
+def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
+    """Everything about one servo, read only; breaks off where it does not answer or is another model."""
+    where = str(joint)
+    try:
+        number = servo.ping()
+    except NoReply:
+        mend = f"Check supply and cable. `hil scan {config.port.url}` finds it at another ID or baud."
+        yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", mend)
+        return
+    except DriverError as error:
+        yield Finding(Level.STOP, where, "answers", "damaged", str(error))
+        return
+    if number != servo.table.number:
+        found = model_names().get(number, f"model number {number}")
+        yield Finding(Level.STOP, where, "model", f"a {found}", "Correct `model` or `id` in the configuration.")
+        return
+    yield Finding(Level.OK, where, "model", servo.table.model)
+    for look in (*_LOOKS, _pose):
+        try:
+            level, what, found, mend = look(config, joint_config, joint, servo)
+        except PortLost as error:
+            yield Finding(Level.STOP, where, "port", "lost", str(error))
+            return
+        except DriverError as error:
+            mend = (
+                f"{error} It answers a ping: if it never answers a read, its Status Return Level is 0; switch its "
+                "supply off and on, which sets it back to 2."
+            )
+            yield Finding(Level.STOP, where, "registers", "cannot be read", mend)
+            return
+        yield Finding(level, where, what, found, mend)
+
+
+_Seen = tuple[Level, str, str, str]
+_Look = Callable[[Config, JointConfig, Joint, Servo], _Seen]
+
+
+def _graded(fine: bool, what: str, found: str, mend: str, otherwise: Level = Level.STOP) -> _Seen:
+    return (Level.OK, what, found, "") if fine else (otherwise, what, found, mend)
+
+
+def _firmware(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
+    firmware, needed = servo.read("Firmware Version"), joint.servo.watchdog_firmware
+    mend = f"The Bus Watchdog needs {needed} or newer: update it with DYNAMIXEL Wizard 2.0."
+    return _graded(firmware >= needed, "firmware", str(firmware), mend)
+
+
+def _status_level(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    level = servo.read("Status Return Level")
+    mend = "At less than 2 no write is confirmed. Switch its supply off and on, which sets it back to 2."
+    return _graded(level == 2, "status return level", str(level), mend)
+
+
+def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    error = servo.hardware_error()
+    mend = "It stays without torque until it is rebooted: find the cause, then switch its supply off and on."
+    return _graded(error == HardwareError(0), "hardware error", describe_error(error), mend)
+
+
+def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    torque = servo.read("Torque Enable")
+    mend = "Something drives it: stop that program first; or switch its supply off and on."
+    return _graded(torque == 0, "torque", "on" if torque else "off", mend)
+
+
+def _drive_mode(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    drive_mode = servo.read("Drive Mode")
+    mend = (
+        "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), bit 3 lets any goal turn torque on. "
+        "Set it with DYNAMIXEL Wizard 2.0."
+    )
+    return _graded(drive_mode == 0, "drive mode", str(drive_mode), mend)
+
+
+def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
+    mode = servo.read("Operating Mode")
+    found = f"{mode}, as needed" if mode == joint.mode else f"{mode}; the experiment sets {joint.mode:d}"
+    return Level.OK, "operating mode", found, ""
+
+
+def _return_delay(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    delay_us = round(RETURN_DELAY_UNIT * 1e6) * servo.read("Return Delay Time")
+    mend = f"Each reply waits for it. Type: hil setup {_port(config)} --id {joint_config.id} --return-delay-us 0"
+    fine = delay_us <= _LONG_RETURN_DELAY_US
+    return _graded(fine, "return delay", f"{delay_us} us", mend, Level.WARNING)
+
+
+def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    value = servo.read("Baud Rate")
+    found = str(BAUD_RATES[value]) if value < len(BAUD_RATES) else f"unknown value {value}"
+    mend = f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then port.baud = 1000000"
+    return _graded(config.port.baud >= 1_000_000, "baud", found, mend, Level.WARNING)
+
+
+def _drive_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
+    if joint.mode is Mode.PWM:
+        volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * servo.read("PWM Limit") / FULL_PWM_TICKS
+        mend = f"Lower voltage_limit in the configuration, or raise the servo's PWM Limit (at most {FULL_PWM_TICKS})."
+        return _graded(joint_config.goal_limit <= volts, "PWM limit", f"{volts:.1f} V at this supply", mend)
+    amperes = servo.read("Current Limit") * abs(joint.drive_unit(0.0))
+    mend = (
+        f"The configuration's current_limit is {joint_config.goal_limit:g} A: lower it, or raise the servo's Current "
+        "Limit with DYNAMIXEL Wizard 2.0."
+    )
+    return _graded(joint_config.goal_limit <= amperes, "current limit", f"{amperes:.3f} A", mend)
+
+
+def _shutdown(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    mask = HardwareError(servo.read("Shutdown"))
+    wanted = HardwareError.OVERHEATING | HardwareError.OVERLOAD
+    mend = "Overheating and overload should stop it: set Shutdown to its factory value with DYNAMIXEL Wizard 2.0."
+    return _graded(wanted in mask, "shuts down on", describe_error(mask), mend, Level.WARNING)
+
+
+def _voltage(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    voltage, low, high = (
+        VOLTAGE_UNIT * servo.read(name) for name in ("Present Input Voltage", "Min Voltage Limit", "Max Voltage Limit")
+    )
+    found = f"{voltage:.1f} V ({low:.1f} to {high:.1f})"
+    return _graded(low <= voltage <= high, "voltage", found, "Mend the supply: outside its limits it shuts down.")
+
+
+def _temperature(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    heat, limit = servo.read("Present Temperature"), servo.read("Temperature Limit")
+    found = f"{heat} C (limit {limit})"
+    if heat >= limit:
+        return Level.STOP, "temperature", found, "Let it cool down."
+    mend = "Close to its limit: let it cool down, or lower experiment.peak_torque."
+    return _graded(heat < limit - _WARM_BELOW_LIMIT_C, "temperature", found, mend, Level.WARNING)
+
+
+def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
+    ticks = servo.read("Present Position")
+    angle = joint.angle(ticks)
+    rest = config.arm.rest_pose[[each.id for each in config.joints].index(joint.id)]
+    zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
+    mend = (
+        f"arm.rest_pose says {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "
+        f"at rest now, set zero_ticks = {zero}."
+    )
+    return _graded(abs(angle - rest) <= config.arm.rest_tolerance, "pose", f"{angle:+.3f} rad", mend)
+
+
+_LOOKS: tuple[_Look, ...] = (
+    _firmware,
+    _status_level,
+    _hardware_error,
+    _torque,
+    _drive_mode,
+    _mode,
+    _baud,
+    _return_delay,
+    _drive_limit,
+    _shutdown,
+    _voltage,
+    _temperature,
+)
+
+
+def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
+    try:
+        report = check_rate(bus, config.experiment.rate)
+    except DriverError as error:
+        yield Finding(Level.STOP, "bus", "rate", "not measured", str(error))
+        return
+    for way in report.ways:
+        yield Finding(Level.OK if way.sound else Level.WARNING, "bus", way.name, str(way))
+    level = Level.STOP if report.mend else Level.OK
+    yield Finding(level, "bus", "rate", f"{config.experiment.rate:g} Hz wanted, {report.found}", report.mend)
+
+
+def _port(config: Config) -> str:
+    return str(config.path) if config.is_fake else config.port.url

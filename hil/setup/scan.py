@@ -1,0 +1,99 @@
+"""Which servos are on a port: every baud rate, every ID, and how each servo is.
+
+One broadcast ping per baud rate: servos answer it in the order of their IDs, so all 253 are asked at once.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from serial.tools import list_ports
+
+from hil.drivers.control_table import load_control_table, model_names
+from hil.drivers.errors import DriverError, PortNotOpened
+from hil.drivers.packet import BROADCAST_ID, MAX_ID, Framer, Instruction, encode
+from hil.drivers.port import Port
+from hil.drivers.servo import Servo, describe_error
+from hil.drivers.servo_model import BAUD_RATES, VOLTAGE_UNIT
+
+_SLOT_S = 3e-3
+"""How long one ID may take to answer a broadcast ping; dynamixel-sdk allows the same."""
+
+_STATUS_BYTES = 14
+
+
+class Found(NamedTuple):
+    """One servo that answered. model None: a number that no control table has. `trouble`: nothing where all is well.
+
+    voltage: V. temperature: degrees C. Both None where they could not be read.
+    """
+
+    baud: int
+    id: int
+    model_number: int
+    model: str | None
+    firmware: int
+    voltage: float | None
+    temperature: float | None
+    trouble: str
+
+
+class Heard(NamedTuple):
+    """One baud rate: who answered, and what is wrong there as a whole."""
+
+    baud: int
+    servos: tuple[Found, ...]
+    trouble: str
+
+
+def serial_ports() -> list[tuple[str, str]]:
+    """Device and description of every serial port of this machine that has hardware behind it."""
+    return [(port.device, port.description) for port in list_ports.comports() if port.hwid != "n/a"]
+
+
+def scan(
+    port: Port, bauds: Sequence[int] = BAUD_RATES, progress: Callable[[int], None] = lambda _: None
+) -> Iterator[Heard]:
+    """Ask at each baud rate in turn; raises PortLost. progress: called with each baud before it is tried.
+
+    Rates that the adapter cannot do are given with their trouble said.
+    """
+    for baud in bauds:
+        progress(baud)
+        try:
+            port.set_baud(baud)
+        except PortNotOpened as error:
+            yield Heard(baud, (), str(error))
+            continue
+        yield _listen(port)
+
+
+def _listen(port: Port) -> Heard:
+    framer = Framer()
+    answers = {}
+    port.discard_input()
+    port.write(encode(BROADCAST_ID, Instruction.PING))
+    deadline = port.clock.now() + _SLOT_S * (MAX_ID + 1) + port.latency + port.wire_time(_STATUS_BYTES)
+    while (remaining := deadline - port.clock.now()) > 0:
+        for packet in framer.feed(port.read(_STATUS_BYTES, min(remaining, 0.05))):
+            if packet.is_status and len(packet.data) == 3:
+                answers[packet.id] = packet.data
+                deadline += port.wire_time(_STATUS_BYTES)
+    servos = tuple(_describe(port, servo_id, data) for servo_id, data in sorted(answers.items()))
+    damaged = framer.bad_crc or framer.noise_bytes + framer.pending > _STATUS_BYTES
+    return Heard(port.baud, servos, "damaged answers: two servos with the same ID, or a bad cable" if damaged else "")
+
+
+def _describe(port: Port, servo_id: int, data: bytes) -> Found:
+    number, firmware = data[0] | data[1] << 8, data[2]
+    model = model_names().get(number)
+    if model is None:
+        return Found(port.baud, servo_id, number, None, firmware, None, None, "no control table for this model")
+    servo = Servo(port, servo_id, load_control_table(model))
+    try:
+        voltage = VOLTAGE_UNIT * servo.read("Present Input Voltage")
+        temperature = float(servo.read("Present Temperature"))
+        error = servo.hardware_error()
+    except (DriverError, KeyError) as problem:
+        return Found(port.baud, servo_id, number, model, firmware, None, None, f"cannot be read: {problem}")
+    trouble = f"hardware error: {describe_error(error)}; reboot it" if error else ""
+    return Found(port.baud, servo_id, number, model, firmware, round(voltage, 1), temperature, trouble)

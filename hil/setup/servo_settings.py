@@ -1,0 +1,112 @@
+"""Set up one servo: ID, baud rate, return delay. Every write to EEPROM is asked for first and read back after."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from hil.drivers.control_table import load_control_table, model_names
+from hil.drivers.errors import DriverError, NoReply, ServoRefused, WrongModel, WrongSetting
+from hil.drivers.port import Port
+from hil.drivers.servo import Servo
+from hil.drivers.servo_model import BAUD_RATES
+
+Confirm = Callable[[str], bool]
+
+RETURN_DELAY_UNIT_US = 2
+_PING_ONLY = load_control_table("XM430-W350")
+# Model Number, ID and the like stand at the same addresses in every X-series table.
+
+
+class Change(NamedTuple):
+    """One register: what it held, what it was to hold, and whether it was written (read back) or declined."""
+
+    register: str
+    before: int
+    after: int
+    written: bool
+
+
+def open_servo(port: Port, servo_id: int) -> Servo:
+    """The servo with this ID, by whatever model it is; raises NoReply, WrongModel, WrongSetting when torque is on."""
+    number = Servo(port, servo_id, _PING_ONLY, f"The servo with ID {servo_id}").ping()
+    model = model_names().get(number)
+    if model is None:
+        raise WrongModel(f"The servo with ID {servo_id} has model number {number}, which no control table describes.")
+    servo = Servo(port, servo_id, load_control_table(model))
+    if servo.read("Torque Enable"):
+        raise WrongSetting(f"{servo.title} has torque on, which locks its EEPROM. Stop what drives it, then try again.")
+    return servo
+
+
+def set_up(
+    servo: Servo, confirm: Confirm, *, new_id: int | None, new_baud: int | None, return_delay_us: int | None
+) -> list[Change]:
+    """Make the changes that are asked for and differ from what is there, each after `confirm` said yes to its question.
+
+    Raises ServoRefused where a register does not read back as written, WrongSetting where the new ID is taken, and
+    what `Servo.read` raises. The port is left at the servo's new baud.
+    """
+    changes = []
+    if return_delay_us is not None:
+        changes.append(_set_return_delay(servo, confirm, return_delay_us))
+    if new_id is not None:
+        change, servo = _set_id(servo, confirm, new_id)
+        changes.append(change)
+    if new_baud is not None:
+        changes.append(_set_baud(servo, confirm, new_baud))
+    return changes
+
+
+def _set_return_delay(servo: Servo, confirm: Confirm, delay_us: int) -> Change:
+    name = "Return Delay Time"
+    before, after = servo.read(name), delay_us // RETURN_DELAY_UNIT_US
+    was = f"{before * RETURN_DELAY_UNIT_US} us"
+    written = before != after and confirm(f"{servo.title}: change {name} from {was} to {delay_us} us?")
+    if written:
+        servo.write(name, after)
+    return Change(name, before, after, written)
+
+
+def _set_id(servo: Servo, confirm: Confirm, new_id: int) -> tuple[Change, Servo]:
+    if new_id == servo.id:
+        return Change("ID", new_id, new_id, False), servo
+    renamed = Servo(servo.port, new_id, servo.table)
+    if _somebody_at(renamed):
+        raise WrongSetting(f"ID {new_id} is taken: another servo answers there. Two servos with one ID talk at once.")
+    if not confirm(f"{servo.title}: change its ID from {servo.id} to {new_id}?"):
+        return Change("ID", servo.id, new_id, False), servo
+    servo.write_only("ID", new_id)
+    _verify(renamed, "ID", new_id)
+    return Change("ID", servo.id, new_id, True), renamed
+
+
+def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
+    name, port, former = "Baud Rate", servo.port, servo.port.baud
+    before, after = servo.read(name), BAUD_RATES.index(baud)
+    question = f"{servo.title}: change its baud from {former} to {baud}? All servos on one bus need the same."
+    if before == after or not confirm(question):
+        return Change(name, before, after, False)
+    # First whether the adapter can do it at all: a servo at a baud that nobody here speaks is lost.
+    port.set_baud(baud)
+    port.set_baud(former)
+    servo.write_only(name, after)
+    port.set_baud(baud)
+    try:
+        _verify(servo, name, after)
+    except DriverError:
+        port.set_baud(former)
+        raise
+    return Change(name, before, after, True)
+
+
+def _somebody_at(servo: Servo) -> bool:
+    try:
+        servo.ping(attempts=2)
+    except NoReply:
+        return False
+    return True
+
+
+def _verify(servo: Servo, register: str, value: int) -> None:
+    actual = servo.read(register)
+    if actual != value:
+        raise ServoRefused(f"{servo.title}: {register} was written as {value} but reads back as {actual}.")

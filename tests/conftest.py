@@ -1,0 +1,77 @@
+"""A fake arm with a short experiment, and the ports that a test opened, to look at the servos themselves."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from hil.config.schema import Config, load_config
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
+
+
+@pytest.fixture
+def ports(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Every port opened during the test, in order; `.bus.servos` are the emulated servos."""
+    opened: list[Any] = []
+    open_port = serial.serial_for_url
+
+    def keep(*args: Any, **kwargs: Any) -> Any:
+        opened.append(open_port(*args, **kwargs))
+        return opened[-1]
+
+    monkeypatch.setattr(serial, "serial_for_url", keep)
+    return opened
+
+
+@pytest.fixture
+def arm_file(tmp_path: Path) -> Callable[..., Path]:
+    """Writes the ideal fake arm with a 2 s period and the changes asked for, (old, new) each; gives its path."""
+
+    def write(*changes: tuple[str, str], base: str = "fake_two_link_ideal") -> Path:
+        text = (CONFIGS / f"{base}.toml").read_text(encoding="utf-8")
+        short = (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
+        for old, new in (*short, *changes):
+            assert old in text, f"{old!r} is not in {base}.toml"
+            text = text.replace(old, new, 1)
+        path = tmp_path / "arm.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def arm(arm_file: Callable[..., Path]) -> Callable[..., Config]:
+    """The same as a checked configuration."""
+    return lambda *changes, **options: load_config(arm_file(*changes, **options))
+
+
+def _identify(path: Path, folder: Path) -> Path:
+    config = load_config(path)
+    run = RunFolder.create(folder, config)
+    run_experiment(config, run, path, lambda _: None)
+    estimate_run(run)
+    return run.path
+
+
+@pytest.fixture(scope="session")
+def identified_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of the ideal fake arm with a short period, shared by all tests: only to be read."""
+    folder = tmp_path_factory.mktemp("identified")
+    text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
+    text = text.replace("period = 10.0 ", "period = 2.0 ").replace("band = [0.1, 5.0]", "band = [0.5, 6.0]")
+    path = folder / "arm.toml"
+    path.write_text(text, encoding="utf-8")
+    return _identify(path, folder / "run")
+
+
+@pytest.fixture
+def identified(identified_once: Path, tmp_path: Path) -> Path:
+    """A copy of that run folder for one test."""
+    return Path(shutil.copytree(identified_once, tmp_path / "identified"))

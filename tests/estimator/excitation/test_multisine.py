@@ -1,0 +1,103 @@
+"""Multisines: lines where asked, peaks as asked, low crest factors, the same bits for the same seed."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil.estimator.errors import ExcitationError
+from hil.estimator.excitation.multisine import design_multisine, detecting_lines, zippered_lines
+
+
+@given(st.floats(1.0, 50.0), st.floats(0.0, 2.0), st.floats(2.5, 20.0), st.integers(1, 4))
+def test_lines_are_shared_out_and_belong_to_one_joint(period: float, low: float, high: float, joints: int) -> None:
+    if int(high * period) - max(1, int(low * period) + 1) + 1 < joints:
+        return
+    lines = zippered_lines(period, (low, high), joints)
+    every = sorted(line for joint in lines for line in joint)
+    assert every == list(range(every[0], every[-1] + 1))
+    assert max(map(len, lines)) - min(map(len, lines)) <= 1
+    assert low * period - 1e-6 <= every[0] < low * period + 1.0 + 1e-6 or every[0] == 1
+    assert high * period - 1.0 - 1e-6 < every[-1] <= high * period + 1e-6
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+def test_detecting_lines_are_odd_and_leave_one_in_four_out(joints: int) -> None:
+    lines = detecting_lines(10.0, (0.1, 5.0), joints, seed=3)
+    driven = sorted(line for joint in lines for line in joint)
+    odd = list(range(1, 51, 2))
+    assert set(driven) <= set(odd) and len(set(driven)) == len(driven) == 19
+    for first in range(0, 24, 4):
+        assert len(set(odd[first : first + 4]) - set(driven)) == 1
+    assert max(map(len, lines)) - min(map(len, lines)) <= 1
+    assert lines == detecting_lines(10.0, (0.1, 5.0), joints, seed=3) != detecting_lines(10.0, (0.1, 5.0), joints, 4)
+    with pytest.raises(ExcitationError, match="odd harmonics"):
+        detecting_lines(1.0, (2.0, 4.5), 2, 1)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 1000), st.integers(4, 12))
+def test_spectrum_and_peak_are_as_asked(seed: int, count: int) -> None:
+    lines = (tuple(range(1, 2 * count, 2)), tuple(range(2, 2 * count + 1, 2)))
+    wave = design_multisine(100.0, 2.0, lines, (0.7, 0.3), seed)
+    spectrum = np.abs(np.fft.rfft(wave.torque, axis=1)) * 2.0 / wave.samples
+    for joint, excited in enumerate(lines):
+        others = np.delete(spectrum[joint], list(excited))
+        assert np.allclose(spectrum[joint, list(excited)], wave.amplitudes[joint], rtol=1e-9)
+        assert others.max() < 1e-12
+    assert np.allclose(np.abs(wave.torque).max(axis=1), (0.7, 0.3), rtol=1e-12)
+
+
+def test_the_sum_of_cosines_is_what_is_written() -> None:
+    wave = design_multisine(50.0, 4.0, ((1, 3, 8), (2, 5)), (1.0, 2.0), 3)
+    t = np.arange(wave.samples) / wave.rate
+    for joint in range(wave.joints):
+        lines = zip(wave.lines[joint], wave.amplitudes[joint], wave.phases[joint], strict=True)
+        summed = sum(a * np.cos(2.0 * np.pi * k * t / wave.period + phase) for k, a, phase in lines)
+        assert np.allclose(wave.torque[joint], summed, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_crest_factor_is_low(seed: int) -> None:
+    """Schroeder's phases give 1.7 and more for 25 lines, random ones 2.5 to 3.5."""
+    wave = design_multisine(400.0, 10.0, zippered_lines(10.0, (0.1, 5.0), 2), (0.8, 0.42), seed)
+    assert wave.crest_factor.max() < 1.43
+
+
+def test_many_lines_take_no_longer_than_a_person_notices() -> None:
+    began = time.perf_counter()
+    wave = design_multisine(400.0, 100.0, zippered_lines(100.0, (0.1, 5.0), 2), (0.8, 0.42), 1)
+    assert len(wave.lines[0]) == 246
+    assert time.perf_counter() - began < 4.0  # 0.5 s on a machine with nothing else to do
+    assert wave.crest_factor.max() < 1.43
+
+
+def test_a_seed_is_a_multisine() -> None:
+    lines = ((1, 3, 5, 7), (2, 4, 6, 8))
+    once, again, other = (design_multisine(100.0, 1.0, lines, (1.0, 1.0), seed) for seed in (5, 5, 6))
+    assert np.array_equal(once.torque, again.torque)
+    assert np.abs(once.torque - other.torque).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("lines", "peak", "said"),
+    [
+        (((1, 2), (2, 3)), (1.0, 1.0), "line 2 is given to joint 1 and joint 2"),
+        (((1, 50), (2,)), (1.0, 1.0), "line 50 of joint 1 is outside 1 to 49"),
+        (((1,), ()), (1.0, 1.0), "joint 2 has no lines"),
+        (((1,), (2,)), (1.0, 0.0), "peak torque of joint 2"),
+        (((1,), (2,)), (1.0,), "1 peak torques for 2 joints"),
+    ],
+)
+def test_what_cannot_be_built_is_said(lines: tuple[tuple[int, ...], ...], peak: tuple[float, ...], said: str) -> None:
+    with pytest.raises(ExcitationError, match=said):
+        design_multisine(100.0, 1.0, lines, peak, 0)
+
+
+def test_an_empty_band_and_a_broken_period_are_refused() -> None:
+    with pytest.raises(ExcitationError, match="holds 1 harmonics"):
+        zippered_lines(1.0, (0.9, 1.1), 2)
+    with pytest.raises(ExcitationError, match="whole number"):
+        design_multisine(100.0, 1.005, ((1,),), (1.0,), 0)

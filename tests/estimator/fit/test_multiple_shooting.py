@@ -1,0 +1,181 @@
+"""Multiple shooting on motions that never settle, and what is no recording at all."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.estimator.baselines.idim import fit_inverse_dynamics
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import RecordingError, ShapeError, StandstillError
+from hil.estimator.fit.multiple_shooting import estimate_by_shooting
+from hil.estimator.fit.segmented_least_squares import Segmented
+from hil.estimator.models.model import Model
+from hil.estimator.selection.prediction import prediction_rms
+from hil.estimator.selection.unsettled import choose_by_shooting
+from hil.fakes.plants.arm import Arm, base_parameters
+from hil.fakes.plants.plant import make_plant
+
+STEP = 2.0 * np.pi / 4096
+
+
+def swing(arm: Arm, seconds: float, seed: int) -> Recording:
+    """A motion that repeats nothing: sines of no common period from rest, sampled at jittered times."""
+    random = np.random.default_rng(seed)
+    joints = len(arm.links)
+    time = np.cumsum(random.uniform(0.0015, 0.0035, round(seconds / 0.0025)))
+    rate, phase = random.uniform(2.0, 9.0, (joints, 4)), random.uniform(0.0, 6.0, (joints, 4))
+    peak = np.array([0.28, 0.15])[:joints, None]
+    torque = peak * np.sin(rate[:, :, None] * time + phase[:, :, None]).sum(axis=1)
+    constant = np.array([drive.torque_constant for drive in arm.drives])
+    plant = make_plant(arm)
+    position = np.empty_like(torque)
+    for k, now in enumerate(time):
+        plant.advance(now, torque[:, k - 1] / constant if k else np.zeros(joints))
+        position[:, k] = plant.position
+    return Recording(time, torque, np.round(position / STEP) * STEP, np.full(joints, STEP), between="held")
+
+
+@pytest.fixture(scope="module")
+def recording(ideal_arm: Arm) -> Recording:
+    return swing(ideal_arm, 8.0, 1)
+
+
+def start(recording: Recording) -> np.ndarray:
+    return fit_inverse_dynamics([recording], 8.0, 0.05).value
+
+
+def errors(estimate: Any, arm: Arm) -> dict[str, float]:
+    found = estimate.parameters
+    return {
+        name: found[name] / true - 1.0 for name, true in base_parameters(arm).items() if not name.startswith("offset")
+    }
+
+
+def test_a_motion_that_never_settles_gives_the_arm_and_honest_errors(ideal_arm: Arm, recording: Recording) -> None:
+    estimate = estimate_by_shooting([recording], Model(2), start(recording))
+    assert max(map(abs, errors(estimate, ideal_arm).values())) < 0.01
+    truth = np.array(list(base_parameters(ideal_arm).values()))
+    z = (estimate.value[:12] - truth) / estimate.std[:12]
+    assert 0.1 < np.sqrt(np.mean(z**2)) < 3.5
+    assert np.all(estimate.residual_rms < 0.32 * STEP)
+    other = swing(ideal_arm, 3.0, 2)
+    assert prediction_rms([other], estimate.parameters, 1.0, 2).max() < 0.01
+
+
+def test_torque_constants_that_are_off_by_different_factors_are_told_apart(recording: Recording) -> None:
+    believed = replace(recording, torque=recording.torque / np.array([[1.0], [1.1]]))
+    estimate = estimate_by_shooting([believed], Model(2, torque_scale=True), start(believed))
+    assert estimate.parameters["torque_scale_2"] == pytest.approx(1.1, rel=2e-3)
+    assert np.all(estimate.residual_rms < 0.32 * STEP)
+
+
+def test_recordings_are_used_together_each_with_its_own_encoder_zeros(ideal_arm: Arm, recording: Recording) -> None:
+    zeros = np.array([[-0.05, 0.03], [0.04, 0.02]])
+    shifted = [
+        replace(each, position=each.position - zero[:, None])
+        for each, zero in zip((recording, swing(ideal_arm, 4.0, 3)), zeros, strict=True)
+    ]
+    estimate = estimate_by_shooting(shifted, Model(2), start(shifted[0]), zeros=True)
+    assert estimate.segments == 12
+    assert estimate.zeros == pytest.approx(zeros, abs=0.002)
+    assert np.all(np.abs(estimate.zeros - zeros) < 4.0 * estimate.zeros_std)
+    assert max(map(abs, errors(estimate, ideal_arm).values())) < 0.01
+    known = prediction_rms(shifted, estimate.parameters, 1.0, 2, estimate.zeros)
+    assert known.max() < 0.01 < prediction_rms(shifted, estimate.parameters, 1.0, 2).max()
+
+
+def test_friction_is_chosen_by_segments_left_out(pendulum: Arm) -> None:
+    rising = {"coulomb_width": 0.03, "stribeck_rise": 0.6, "stribeck_velocity": 0.4}
+    drives = tuple(drive.model_copy(update=rising) for drive in pendulum.drives)
+    recorded = swing(pendulum.model_copy(update={"drives": drives}), 6.0, 5)
+    choice = choose_by_shooting([recorded], "delay", start(recorded))
+    assert choice.chosen.model.friction == "stribeck" and choice.gained > 1.5
+    assert choice.estimate.parameters["stribeck_rise_1"] == pytest.approx(0.6, rel=0.1)
+    assert len(choice.trials) == 5
+    with pytest.raises(RecordingError, match="two segments"):
+        choose_by_shooting([recorded], "delay", start(recorded), length=6.0)
+
+
+def test_a_pendulum_with_lost_samples(pendulum: Arm) -> None:
+    whole = swing(pendulum, 5.0, 4)
+    position = whole.position.copy()
+    position[0, 100:115] = np.nan
+    holed = replace(whole, position=position)
+    estimate = estimate_by_shooting([holed], Model(1), start(holed))
+    assert max(map(abs, errors(estimate, pendulum).values())) < 0.01
+
+
+def test_mean_torque_is_the_integral_of_what_was_held_or_drawn() -> None:
+    time = np.array([0.0, 0.1, 0.25, 0.3, 0.5, *(0.5 + 0.01 * np.arange(1, 40))])
+    torque = np.sin(9.0 * time)[None]
+    position = np.sin(time)[None]
+    edges = np.array([-0.1, 0.05, 0.12, 0.26, 0.6])
+    fine = np.linspace(edges[:-1], edges[1:], 200_001)
+    for between in ("held", "linear"):
+        recording = Recording(time, torque, position, np.array([1e-3]), between=between)  # type: ignore[arg-type]
+        late = fine - 0.02
+        at = np.clip(np.searchsorted(time, late, side="right") - 1, 0, None)
+        drawn = torque[0, at] if between == "held" else np.interp(late, time, torque[0])
+        assert recording.mean_torque(edges, 0.02)[0] == pytest.approx(drawn.mean(axis=0), abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "said"),
+    [
+        (lambda r: {"time": r.time[::-1]}, RecordingError, "it must ascend"),
+        (lambda r: {"time": 1000.0 * r.time}, RecordingError, "is time in seconds"),
+        (lambda r: {"time": r.time + 3.0 * (r.time > 1.0)}, RecordingError, "cut the recording there"),
+        (lambda r: {"time": np.where(r.time > 1.0, np.nan, r.time)}, RecordingError, "time of sample"),
+        (lambda r: {"position": 4096.0 * r.position}, RecordingError, "are these degrees or encoder"),
+        (lambda r: {"position": r.position + 2.0 * np.pi * (r.time > 1.0)}, RecordingError, "unwrap the angle"),
+        (lambda r: {"position": np.full_like(r.position, np.nan)}, RecordingError, "0 % of"),
+        (lambda r: {"position": np.zeros_like(r.position)}, StandstillError, "joint 1 moved by 0 rad"),
+        (lambda r: {"torque": np.where(r.time > 1.0, np.nan, r.torque)}, RecordingError, "torques are not finite"),
+        (lambda r: {"torque": 0.0 * r.torque}, RecordingError, "all torques are 0"),
+        (lambda r: {"torque": 1e6 * r.torque}, RecordingError, "check its unit"),
+        (lambda r: {"torque": r.torque[:, :-1]}, ShapeError, "must be"),
+        (lambda r: {"position_step": np.zeros(2)}, RecordingError, "must be positive"),
+    ],
+)
+def test_what_is_no_recording_is_named(
+    recording: Recording, change: Callable[[Recording], dict[str, Any]], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        replace(recording, **change(recording))
+
+
+def test_too_short_is_refused(recording: Recording) -> None:
+    few = slice(0, 20)
+    with pytest.raises(RecordingError, match="at least 32"):
+        replace(
+            recording, time=recording.time[few], torque=recording.torque[:, few], position=recording.position[:, few]
+        )
+    with pytest.raises(RecordingError, match="record longer or faster"):
+        fit_inverse_dynamics([recording], 0.05, 0.05)
+
+
+def test_what_changes_together_and_leaves_no_trace_is_not_known() -> None:
+    """Of three coordinates the motion shows the first and the sum of the others."""
+    information = np.array([[4.0, 0.0, 0.0], [0.0, 9.0, 9.0], [0.0, 9.0, 9.0]])
+    scores = np.array([[1.0, 0.5, 0.5], [-0.5, 1.0, 1.0]])
+    found = Segmented(np.zeros(3), np.zeros((2, 4)), 1.0, information, scores, 1)
+    std = np.sqrt(np.diag(found.covariance()))
+    assert np.isfinite(std[0]) and std[0] > 0.0
+    assert np.isinf(std[1:]).all()
+
+
+def test_recordings_that_disagree_make_all_less_certain() -> None:
+    """Twelve segments of three recordings: once each its own noise, once the same error in all of a recording's."""
+    random = np.random.default_rng(1)
+    groups = np.repeat([0, 1, 2], 4)
+    noise = random.normal(size=(12, 2))
+    repeated = np.repeat([[3.0, -1.0], [-2.0, 2.0], [-1.0, -1.0]], 4, axis=0)
+    alone, alike = (
+        Segmented(np.zeros(2), np.zeros((12, 4)), 1.0, np.eye(2), scores, 1) for scores in (noise, repeated)
+    )
+    grown = [np.diag(found.covariance(groups) / found.covariance()) for found in (alone, alike)]
+    assert grown[0].max() < 2.5
+    assert grown[1].min() > 4.0

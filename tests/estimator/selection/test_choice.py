@@ -1,0 +1,146 @@
+"""Friction chosen by what it predicts, robustness, intervals and verdict, on arms that the estimator did not write."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.recorded_arm import servo_arm
+from hil.estimator.data.settled_period import SettledPeriod, without_spikes
+from hil.estimator.excitation.multisine import Multisine
+from hil.estimator.fit.covariance import correlation_time, structured_share
+from hil.estimator.fit.ripple import find_ripple
+from hil.estimator.fit.stage1 import fit_lines
+from hil.estimator.identify import identify
+from hil.estimator.models.model import Model
+from hil.estimator.selection.settled import choose
+from hil.estimator.selection.validation import validate
+from hil.estimator.selection.verdict import judge
+from hil.fakes.plants.arm import Arm, base_parameters
+from tests.estimator.conftest import STICKING
+
+Recorder = Callable[[Arm, Multisine], SettledPeriod]
+Wave = Callable[..., Multisine]
+
+
+def worst(parameters: dict[str, float], arm: Arm) -> float:
+    truth = base_parameters(arm)
+    return max(abs(parameters[name] / true - 1.0) for name, true in truth.items() if not name.startswith("offset"))
+
+
+def test_the_plain_model_is_kept_where_nothing_more_is_true(
+    ideal_arm: Arm, ideal_period: SettledPeriod, recorded: Recorder, wave: Wave
+) -> None:
+    choice = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay")
+    assert choice.estimate.model == Model(2, "coulomb", "delay")
+    assert choice.gained == 1.0 and choice.cost == pytest.approx(1.0)
+    # A start that leads nowhere is counted, so it was taken, and costs the result nothing.
+    astray = {name: 0.1 * value for name, value in base_parameters(ideal_arm).items()}
+    again = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay", starts=[astray])
+    assert again.estimate.iterations != choice.estimate.iterations
+    assert again.estimate.value == pytest.approx(choice.estimate.value, rel=1e-3)
+
+
+def test_friction_is_chosen_by_what_it_predicts(
+    sticking_arm: Arm, sticking_period: SettledPeriod, recorded: Recorder, wave: Wave
+) -> None:
+    choice = choose([sticking_period], recorded(sticking_arm, wave(2, (0.8, 0.42))), "lag")
+    assert choice.estimate.model == Model(2, "stribeck", "lag")
+    assert worst(choice.estimate.parameters, sticking_arm) < 0.005
+    assert choice.estimate.residual_steps.max() <= 0.30
+    assert choice.chosen.held_out is not None and choice.chosen.held_out.max() < 0.001
+    assert choice.gained > 3.0 and choice.cost > 1.0
+
+
+def test_friction_that_yields_before_it_slides_is_found_out(recorded: Recorder, wave: Wave) -> None:
+    bristles = {"presliding_stiffness": 15.0, "presliding_damping": 0.5}
+    arm = servo_arm({**STICKING, **bristles})
+    periods = [recorded(arm, wave(seed, (0.8, 0.42))) for seed in (1, 2)]
+    choice = choose(periods[:1], periods[1], "lag")
+    found = choice.estimate
+    assert found.model.presliding
+    assert worst(found.parameters, arm) < 0.005
+    assert found.residual_steps.max() <= 0.30
+    assert choice.chosen.held_out is not None and choice.chosen.held_out.max() < 0.001
+    std = dict(zip(found.names, found.std, strict=True))
+    for name, true in bristles.items():
+        for joint in ("1", "2"):
+            assert abs(found.parameters[f"{name}_{joint}"] - true) < max(0.02 * true, 3.0 * std[f"{name}_{joint}"])
+    plain = choice.trials[2]
+    assert plain.model.friction == "stribeck_load" and plain.score > 3.0 * choice.chosen.score
+
+
+def test_a_wild_reading_costs_nothing(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
+    position = ideal_period.position.copy()
+    wild = np.random.default_rng(1).choice(ideal_period.samples, 8, replace=False)
+    position[0, wild] += 1.0
+    spiked = replace(ideal_period, position=position)
+    left_out = np.flatnonzero(~without_spikes(spiked).valid[0])
+    # Two steps away from a wild reading the median itself is off by a sample's motion.
+    assert set(wild) <= set(left_out) and left_out.size <= 3 * wild.size
+    estimate = identify(spiked, Model(2))
+    assert worst(estimate.parameters, ideal_arm) < 0.002
+    assert estimate.outliers >= 8
+
+
+def test_two_runs_together_tell_more_than_one(
+    ideal_arm: Arm, ideal_period: SettledPeriod, recorded: Recorder, wave: Wave
+) -> None:
+    other = recorded(ideal_arm, wave(2, (0.8, 0.42)))
+    both, one = identify([ideal_period, other], Model(2)), identify(ideal_period, Model(2))
+    assert worst(both.parameters, ideal_arm) < 0.001
+    assert np.mean(both.std[:12] / one.std[:12]) < 0.85
+
+
+def test_the_zeros_of_the_encoders_are_found(ideal_period: SettledPeriod) -> None:
+    shifted = replace(ideal_period, position=ideal_period.position - np.array([[0.03], [-0.02]]))
+    found = identify(shifted, Model(2, zeros=True)).parameters
+    assert found["zero_1"] == pytest.approx(0.03, abs=2e-4)
+    assert found["zero_2"] == pytest.approx(-0.02, abs=2e-4)
+
+
+def test_the_ratio_of_two_torque_constants_is_found(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
+    believed = replace(ideal_period, torque=ideal_period.torque / np.array([[1.0], [1.1]]))
+    without, found = identify(believed, Model(2), hasty=True), identify(believed, Model(2, torque_scale=True))
+    assert without.residual_steps.max() > 1.0, "no arm is like this one with equal torque constants"
+    assert found.parameters["torque_scale_2"] == pytest.approx(1.1, rel=1e-3)
+    assert worst(found.parameters, ideal_arm) < 0.002
+    elsewhere = {name: 1.5 * value for name, value in found.parameters.items()}
+    again = identify(believed, Model(2, torque_scale=True), starts=[elsewhere])
+    assert again.parameters == pytest.approx(found.parameters, rel=0.01), "only a place to start"
+
+
+def test_intervals_cover_the_truth_where_the_model_lacks_something(
+    sticking_arm: Arm, sticking_period: SettledPeriod
+) -> None:
+    estimate = identify(sticking_period, Model(2, "coulomb", "lag"))
+    truth = np.array(list(base_parameters(sticking_arm).values()))
+    assert np.abs((estimate.value[:12] - truth) / estimate.std[:12]).max() < 2.6
+    verdict = judge(estimate, validate(sticking_period, estimate), None)
+    assert verdict.trust != "yes"
+    assert "the model does not have" in verdict.sentences[0]
+
+
+def test_a_good_estimate_is_trusted(ideal_period: SettledPeriod) -> None:
+    estimate = identify(ideal_period, Model(2))
+    validation = validate(ideal_period, estimate)
+    assert validation.correlated_lags.max() < 0.15
+    assert validation.free_run is not None and validation.free_run.max() < 0.002
+    assert validation.levels.excited.min() > 100.0 * validation.levels.distortion.max()
+    assert judge(estimate, validation, np.array([0.001, 0.001])).trust == "yes"
+
+
+def test_ripple_is_found_without_a_starting_value(ideal_arm: Arm, recorded: Recorder, wave: Wave) -> None:
+    drives = [drive.model_copy(update={"ripple": 0.03, "ripple_cycles": 9.0}) for drive in ideal_arm.drives]
+    period = recorded(ideal_arm.model_copy(update={"drives": tuple(drives)}), wave(1, (0.8, 0.42)))
+    found = find_ripple([period], fit_lines(period))
+    assert found["ripple_cycles_1"] == pytest.approx(9.0, abs=0.26)
+    assert found["ripple_sin_2"] == pytest.approx(0.03, rel=0.3)
+
+
+def test_colour_and_structure_of_a_residual_are_seen() -> None:
+    white = np.random.default_rng(1).standard_normal((2, 4000))
+    smooth = np.stack([np.convolve(row, np.ones(20) / 4.5, mode="same") for row in white])
+    assert correlation_time([white]) < 12 and correlation_time([smooth]) > 20
+    assert structured_share(white).max() < 0.05 and structured_share(white + smooth).min() > 0.3

@@ -1,0 +1,363 @@
+"""Every fault: it happens at its time, to its servo, as often as its probability says, and the same seed repeats it."""
+
+import termios
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from hil.drivers.packet import (
+    ALERT,
+    BROADCAST_ID,
+    Framer,
+    HardwareError,
+    Instruction,
+    StatusError,
+    encode,
+    encode_status,
+)
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.bus.faults import FAULTS, Fault, FaultKind, parse_fault
+from hil.fakes.description import DescriptionError, load_fake
+from hil.fakes.plants.plant import PlantError
+from hil.fakes.protocol_fake import open_fake
+from hil.fakes.servo.registers import load_model
+from hil.fakes.servo.servo import BOOT_S, Servo
+from tests.support.paths import CONFIGS
+
+CONFIG = CONFIGS / "fake_two_link.toml"
+PING = encode(1, Instruction.PING)
+PONG = encode_status(1, 0, b"\xfc\x03\x30")
+
+
+def raw_replies(bench: Any, count: int = 1, servo_id: int = 1) -> list[bytes]:
+    """What comes back for each of so many pings."""
+    replies = []
+    for _ in range(count):
+        bench.bus.write(encode(servo_id, Instruction.PING))
+        replies.append(bench.bus.read(1000, 0.1))
+    return replies
+
+
+def test_all_kinds_are_described() -> None:
+    assert set(FAULTS) == set(FaultKind)
+
+
+# Packets
+
+
+def test_lost_reply_strikes_one_servo_while_it_lasts(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="lost_reply", servo=1, at=0.5, duration=1.0))
+    assert raw_replies(bench) == [PONG]
+    bench.wait(0.6)
+    assert raw_replies(bench) == [b""]
+    assert len(raw_replies(bench, servo_id=2)[0]) == 14
+    bench.wait(1.0)
+    assert raw_replies(bench) == [PONG]
+    assert [(struck.kind, struck.servo) for struck in bench.bus.faults.happened] == [("lost_reply", 1)]
+
+
+def test_a_lost_reply_in_a_group_leaves_the_others(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="lost_reply", servo=1))
+    request = encode(BROADCAST_ID, Instruction.SYNC_READ, b"\x7e\0\x0a\0\x01\x02")
+    assert [reply.id for reply in bench.exchange(request)] == [2]
+
+
+@pytest.mark.parametrize("kind", ["corrupted_reply", "truncated_reply"])
+def test_damaged_replies_are_no_packets(bench: Any, kind: str) -> None:
+    bench.bus.faults.add(Fault(kind=kind))
+    replies = raw_replies(bench, 20)
+    assert len(set(replies)) > 3
+    for raw in replies:
+        assert raw != PONG
+        assert list(Framer().feed(raw)) == []
+        assert len(raw) == len(PONG) or (kind == "truncated_reply" and 0 < len(raw) < len(PONG))
+
+
+def test_corrupted_reply_flips_as_many_bits_as_asked(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="corrupted_reply", amount=1))
+    for raw in raw_replies(bench, 10):
+        assert sum((a ^ b).bit_count() for a, b in zip(raw, PONG, strict=True)) == 1
+
+
+def test_duplicated_reply(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="duplicated_reply"))
+    assert raw_replies(bench) == [PONG + PONG]
+
+
+def test_late_reply_comes_after_the_next_ones(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="late_reply", servo=1, amount=0.02, duration=0.01))
+    bench.bus.write(PING)
+    assert bench.bus.read(14, 0.015) == b""
+    bench.bus.write(encode(2, Instruction.PING))
+    second = bench.bus.read(14, 0.004)
+    assert second[4] == 2
+    assert bench.bus.read(14, 0.1) == PONG
+
+
+def test_noise_comes_before_a_reply_that_is_still_found(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="noise", amount=5))
+    (raw,) = raw_replies(bench)
+    assert len(raw) == 19
+    assert raw.endswith(PONG)
+    assert [packet.id for packet in Framer().feed(raw)] == [1]
+
+
+def test_lost_and_corrupted_instructions(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="lost_instruction", duration=1.0))
+    bench.bus.faults.add(Fault(kind="corrupted_instruction", at=1.0, duration=1.0))
+    light = encode(1, Instruction.WRITE, b"\x41\0\x01")
+    assert bench.exchange(light) == []
+    bench.wait(1.0)
+    (status,) = bench.exchange(light)
+    assert status.error == StatusError.CRC
+    assert bench.servo().value("LED") == 0
+    bench.wait(1.0)
+    assert bench.exchange(light)[0].error == 0
+
+
+def test_probability_and_seed() -> None:
+    def struck(seed: int) -> list[bool]:
+        bus = FakeBus([Servo(load_model("XM430-W350"), 1)], _Still(), VirtualClock(), seed=seed)
+        bus.faults.add(Fault(kind="lost_reply", probability=0.3))
+        lost = []
+        for _ in range(300):
+            bus.write(PING)
+            lost.append(bus.read(14, 0.01) == b"")
+        return lost
+
+    assert struck(1) == struck(1)
+    assert struck(1) != struck(2)
+    assert 60 < sum(struck(1)) < 120
+
+
+class _Still:
+    joints = 1
+    position = (0.0,)
+    velocity = (0.0,)
+    current = (0.0,)
+
+    def advance(self, until: float, current: object) -> None: ...
+
+
+# Servos and joints
+
+
+def test_silent_servo_drives_on_and_its_watchdog_stops_it(bench: Any) -> None:
+    bench.arm(1, watchdog=3, goal_ticks=100)
+    bench.bus.faults.add(Fault(kind="silent_servo", servo=1, at=bench.bus.time, duration=0.5))
+    for _ in range(4):
+        bench.wait(0.03)
+        bench.ask(2, Instruction.PING)
+        assert raw_replies(bench) == [b""]
+    assert bench.servo(1).watchdog_tripped
+    bench.wait(0.5)
+    assert len(raw_replies(bench)[0]) == 14
+
+
+def test_reboot_takes_torque_and_deafens_for_a_while(bench: Any) -> None:
+    bench.arm(1, goal_ticks=100)
+    bench.bus.faults.add(Fault(kind="reboot", servo=1, at=1.0))
+    bench.clock.wait_until(0.999)
+    assert bench.servo(1).torque_enabled
+    bench.clock.wait_until(1.001)
+    assert not bench.servo(1).torque_enabled
+    assert raw_replies(bench) == [b""]
+    bench.clock.wait_until(1.0 + BOOT_S)
+    assert raw_replies(bench) == [PONG]
+    assert bench.plant.velocity[0] == pytest.approx(50 * 0.269 * 1.0, rel=0.06)  # it coasts since
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "shuts_down"),
+    [
+        ("overheating", HardwareError.OVERHEATING, True),
+        ("overload", HardwareError.OVERLOAD, True),
+        ("low_voltage", HardwareError.INPUT_VOLTAGE, False),
+    ],
+)
+def test_hardware_errors(bench: Any, kind: str, error: HardwareError, shuts_down: bool) -> None:
+    bench.arm(1, goal_ticks=100)
+    bench.arm(2, goal_ticks=100)
+    bench.bus.faults.add(Fault(kind=kind, servo=2, at=0.5, duration=1.0))
+    bench.clock.wait_until(0.6)
+    assert bench.servo(2).hardware_error == error
+    assert bench.servo(2).torque_enabled is not shuts_down
+    assert bench.servo(1).hardware_error == 0
+    assert raw_replies(bench, servo_id=2)[0][8] == ALERT
+    bench.clock.wait_until(2.0)
+    assert bench.servo(2).hardware_error == error  # stays until a reboot
+    assert bench.servo(2).value("Present Input Voltage") == 120
+
+
+def test_encoder_jump_and_back(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="encoder_jump", servo=1, at=1.0, duration=1.0, amount=-300))
+    assert bench.read(1, 132, 4, signed=True) == 0
+    bench.clock.wait_until(1.5)
+    assert bench.read(1, 132, 4, signed=True) == -300
+    assert bench.read(2, 132, 4, signed=True) == 0
+    bench.clock.wait_until(2.5)
+    assert bench.read(1, 132, 4, signed=True) == 0
+
+
+def test_stuck_joint_holds_the_arm_and_lets_go() -> None:
+    port = open_fake(load_fake(CONFIG))
+    bus = port.bus
+    for servo_id in (1, 2):
+        for body in (b"\x0b\0\0", b"\x66\0\0\0", b"\x40\0\x01", b"\x66\0\x78\0"):
+            port.write(encode(servo_id, Instruction.WRITE, body))
+            port.read(11)
+    bus.faults.add(Fault(kind="stuck_joint", servo=2, at=0.3, duration=0.5))
+    port.clock.wait_until(0.3)
+    bus.advance(0.3)
+    held = bus.plant.position[1]
+    assert abs(held) > 0.01
+    port.clock.wait_until(0.79)
+    bus.advance(0.79)
+    assert bus.plant.position[1] == pytest.approx(held, abs=1e-3)
+    assert bus.plant.velocity[1] == 0.0
+    assert bus.plant.velocity[0] != 0.0
+    port.clock.wait_until(1.0)
+    bus.advance(1.0)
+    assert bus.plant.velocity[1] != 0.0
+
+
+def test_a_plant_that_cannot_jam_says_so(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="stuck_joint"))
+    with pytest.raises(PlantError, match="FreeInertia has no jam"):
+        bench.wait(0.1)
+        bench.bus.advance(bench.clock.now())
+
+
+def test_by_chance_or_not_at_all(bench: Any) -> None:
+    bench.bus.faults.add(*(Fault(kind="overload", at=0.01 * k, probability=0.0) for k in range(20)))
+    bench.wait(1.0)
+    assert bench.servo(1).hardware_error == 0
+    assert bench.bus.faults.happened == []
+
+
+def test_clear_ends_what_lasts(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="silent_servo"), Fault(kind="reboot", at=5.0))
+    assert raw_replies(bench) == [b""]
+    assert [fault.kind for fault in bench.bus.faults.lasting] == ["silent_servo"]
+    bench.bus.faults.clear()
+    assert raw_replies(bench) == [PONG]
+    assert bench.bus.faults.lasting == ()
+
+
+# The cable
+
+
+def test_a_pulled_cable_fails_as_a_real_one_and_comes_back() -> None:
+    port = open_fake(load_fake(CONFIG))
+    port.bus.faults.add(Fault(kind="cable_pulled", at=1.0, duration=0.5))
+    port.write(encode(1, Instruction.WRITE, b"\x62\0\x05"))
+    port.read(11)
+    port.write(encode(1, Instruction.WRITE, b"\x40\0\x01"))
+    port.read(11)
+    port.clock.wait_until(0.9999)
+    port.write(PING)
+    with pytest.raises(serial.SerialException, match="unplugged"):
+        port.read(14)  # the reply is cut off in the middle
+    assert port.clock.now() == pytest.approx(1.0)
+    for use in (lambda: port.write(PING), lambda: port.read(1), lambda: port.in_waiting):
+        with pytest.raises(serial.SerialException, match="Input/output error"):
+            use()
+    with pytest.raises(termios.error):
+        port.reset_input_buffer()
+    port.close()
+    with pytest.raises(serial.SerialException, match="cable is pulled"):
+        port.open()
+    assert port.bus._servos[0].torque_enabled
+    port.clock.wait_until(1.6)
+    with pytest.raises(serial.PortNotOpenError):
+        port.write(PING)
+    port.open()
+    port.write(PING)
+    assert port.read(14) == PONG
+    assert port.bus.servos[1].watchdog_tripped  # nobody spoke for 0.1 s
+
+
+def test_what_was_open_when_the_cable_was_pulled_stays_lost() -> None:
+    port = open_fake(load_fake(CONFIG))
+    port.bus.faults.add(Fault(kind="cable_pulled", at=1.0, duration=0.5))
+    port.clock.wait_until(2.0)
+    with pytest.raises(serial.SerialException):
+        port.write(PING)
+    port.close()
+    port.open()
+    port.write(PING)
+    assert port.read(14) == PONG
+
+
+# Descriptions
+
+
+def test_from_the_command_line() -> None:
+    fault = parse_fault("lost_reply:servo=2,at=3,duration=0.5,probability=0.2")
+    assert fault == Fault(kind="lost_reply", servo=2, at=3.0, duration=0.5, probability=0.2)
+    assert parse_fault("overload") == Fault(kind="overload")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("gone", "kinds: lost_reply, corrupted_reply"),
+        ("overload:when=3", '"when=3" is not KEY=VALUE with a key of at, duration'),
+        ("overload:at=soon", "at = 'soon': must be a number"),
+        ("overload:probability=2", "probability = 2.0"),
+        ("overload:servo=1.5", "servo = '1.5': must be a number"),
+    ],
+)
+def test_wrong_on_the_command_line(text: str, said: str) -> None:
+    with pytest.raises(ValueError, match="fault") as caught:
+        parse_fault(text)
+    assert said in str(caught.value)
+
+
+def with_fault(tmp_path: Path, fault: str) -> Path:
+    path = tmp_path / "arm.toml"
+    path.write_text(CONFIG.read_text(encoding="utf-8") + f"\n[[fake.faults]]\n{fault}\n", encoding="utf-8")
+    return path
+
+
+def test_from_toml(tmp_path: Path) -> None:
+    path = with_fault(tmp_path, 'kind = "lost_reply"\nservo = 2\nat = 1.5')
+    port = open_fake(load_fake(path))
+    assert port.bus.faults.next_change == 1.5
+    port.clock.wait_until(2.0)
+    port.write(encode(2, Instruction.PING))
+    assert port.read(14) == b""
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ('kind = "gone"', "fake.faults[1].kind = 'gone'"),
+        ('kind = "overload"\nat = -1.0', "fake.faults[1].at = -1.0: must be at least 0"),
+        ('kind = "overload"\nservo = 3', "overload of servo 3: the IDs are 1, 2"),
+        ('kind = "overload"\nwhen = 3.0', "fake.faults[1].when is not a known key"),
+    ],
+)
+def test_wrong_in_toml(tmp_path: Path, fault: str, said: str) -> None:
+    with pytest.raises(DescriptionError) as caught:
+        load_fake(with_fault(tmp_path, fault))
+    assert said in str(caught.value)
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+    def played() -> bytes:
+        path = with_fault(tmp_path, 'kind = "corrupted_reply"\nprobability = 0.4')
+        text = path.read_text(encoding="utf-8")
+        path.write_text(text.replace("id = 1\nmodel", "id = 1\ncurrent_noise_a = 0.01\nmodel", 2), encoding="utf-8")
+        port = open_fake(load_fake(path))
+        received = b""
+        for _ in range(100):
+            port.clock.wait_until(port.clock.now() + 0.0025)
+            port.write(encode(BROADCAST_ID, Instruction.SYNC_READ, b"\x7e\0\x0a\0\x01\x02"))
+            received += port.read(42)
+        return received
+
+    assert played() == played()

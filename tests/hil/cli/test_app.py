@@ -1,0 +1,194 @@
+"""The command line as a person meets it: output, files, exit codes, and one clear message instead of a traceback."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.runs.recording import load_samples
+from tests.support.command_line import hil
+from tests.support.paths import CONFIGS
+
+ArmFile = Callable[..., Path]
+
+LONG = (
+    ("period = 2.0", "period = 100.0"),
+    ("band = [0.5, 6.0]", "band = [0.1, 0.3]"),
+    ("peak_torque = [0.80, 0.42]", "peak_torque = [0.2, 0.1]"),  # so slow a motion would go over the top with more
+)
+"""Changes that make an experiment long enough to be interrupted."""
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.setenv("COLUMNS", "120")
+
+
+def without_timing(result: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in result.items() if key != "timing"}
+
+
+def test_identify_prints_a_table_and_estimate_gives_the_same_numbers_again(
+    arm_file: ArmFile, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert hil("identify", arm_file(), "--out", "run") == 0
+    printed = capsys.readouterr()
+    for said in (
+        "inertia_1",
+        "kg m^2",
+        "offset_2",
+        "truth",
+        "Residual",
+        "0.2887",
+        "Run folder: run",
+        "hil estimate run",
+    ):
+        assert said in printed.out
+    assert "Torque is off on all 2 servos" in printed.err
+    first = json.loads(Path("run/result.json").read_text(encoding="utf-8"))
+    assert hil("estimate", "run", "--json") == 0
+    again = json.loads(capsys.readouterr().out)
+    assert without_timing(again) == without_timing(first)
+    assert list(first["parameters"]) == list(first["truth"])
+    assert first["schema"] == 1 and first["joints"] == 2
+
+
+def test_a_recording_alone_is_estimated_later(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("record", arm_file(), "--out", "run", "--json") == 0
+    recorded = json.loads(capsys.readouterr().out)
+    assert recorded["samples"] == len(load_samples(Path("run/samples.npy"), 2)) > 1000
+    assert recorded["timing"]["lost_replies"] == 0
+    assert not Path("run/result.json").exists()
+    assert hil("estimate", "run") == 0
+    assert "gravity_1" in capsys.readouterr().out
+
+
+def test_a_pilot_is_not_recorded_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    config = CONFIGS / "first_time.toml"
+    assert hil("record", config, "--out", "run") == 2
+    assert "give experiment.peak_torque and set pilot = false" in capsys.readouterr().err
+    assert not Path("run").exists()
+
+
+def test_json_is_the_only_thing_on_standard_output_and_a_seed_gives_one_result(
+    arm_file: ArmFile, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = arm_file()
+    assert hil("identify", path, "--out", "a", "--json") == 0
+    first = json.loads(capsys.readouterr().out)
+    assert hil("identify", path, "--out", "b", "--json") == 0
+    second = json.loads(capsys.readouterr().out)
+    assert without_timing(first) == without_timing(second)
+    assert first["timing"]["lost_replies"] == 0 and first["timing"]["rate_held"] == pytest.approx(400.0)
+
+
+def test_the_run_folder_is_named_after_time_and_arm(arm_file: ArmFile) -> None:
+    assert hil("identify", arm_file(), "--json") == 0
+    (folder,) = Path("runs").iterdir()
+    assert folder.name.endswith("-arm")
+    assert {file.name for file in folder.iterdir()} == {
+        "config.toml", "run.json", "events.jsonl", "samples.npy", "lateness.json", "result.json", "period.npz",
+        "report.html",
+    }  # fmt: skip
+    assert (folder / "config.toml").read_bytes() == Path("arm.toml").read_bytes()
+    events = [json.loads(line)["event"] for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert events[-1].startswith("Torque is off on all 2 servos")
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "said"),
+    [
+        (("rate = 400.0", "rate = -1"), 2, "arm.toml: experiment.rate = -1: must be at least 20"),
+        (('"fake://" ', '"/dev/no-such-port" '), 2, "Cannot open port '/dev/no-such-port'"),
+        (('"fake://" ', '"fake://elsewhere.toml" '), 2, "elsewhere.toml: cannot be read"),
+        (("id = 2", "id = 7"), 1, "'elbow' (ID 7, XM430-W350) does not answer"),
+        (('model = "XM430-W350"', 'model = "XM540-W270"'), 2, "answers at ID 1"),
+        (("[-3.1, 3.1]", "[-0.5, 0.5]"), 1, "outside its position limit"),
+        (("seed = 1\n", "seed = 1\nsettle_within = 1e-9\nmax_settling_periods = 1\n"), 1, "experiment.settle_within"),
+    ],
+)
+def test_a_failure_is_one_message_and_an_exit_code(
+    arm_file: ArmFile, capsys: pytest.CaptureFixture[str], change: tuple[str, str], code: int, said: str
+) -> None:
+    assert hil("identify", arm_file(change), "--out", "run") == code
+    printed = capsys.readouterr()
+    assert said in printed.err
+    assert "Traceback" not in printed.err
+    assert printed.out == ""
+    if "outside" in said:
+        assert "Torque is off on all 2 servos, read back." in printed.err
+
+
+def test_bad_arguments_and_files(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("identify", "nowhere.toml") == 2
+    assert "nowhere.toml: cannot be read: No such file" in capsys.readouterr().err
+    assert hil("identify") == 2
+    assert hil("estimate", "nowhere") == 2
+    assert "nowhere is not a run folder: it has no config.toml" in capsys.readouterr().err
+    Path("file").touch()
+    assert hil("identify", arm_file(), "--out", "file/run") == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_recording_cut_short_is_said(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("identify", arm_file(), "--out", "run", "--json") == 0
+    path = Path("run/samples.npy")
+    whole = np.load(path)
+    np.save(path, whole[:1200])
+    capsys.readouterr()
+    assert hil("estimate", "run") == 1
+    assert "800 samples" in (message := capsys.readouterr().err) or "samples of the multisine" in message
+    path.write_bytes(path.read_bytes()[:5000])
+    assert hil("estimate", "run") == 2
+    assert "samples.npy cannot be read" in capsys.readouterr().err
+
+
+def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path: Path) -> None:
+    path = arm_file(*LONG)
+    with subprocess.Popen([sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]) as process:
+        samples = tmp_path / "run" / "samples.npy"
+        for _ in range(600):
+            time.sleep(0.05)
+            if samples.is_file() and samples.stat().st_size and len(load_samples(samples, 2)) > 1000:
+                break
+        os.kill(process.pid, signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    kept = load_samples(samples, 2)
+    assert len(kept) > 1000
+    assert (kept["time_after_read"] > kept["time_before_write"]).all()
+
+
+def test_sigterm_ends_in_a_message_and_exit_code_1(arm_file: ArmFile, tmp_path: Path) -> None:
+    path = arm_file(*LONG)
+    command = [sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        for _ in range(600):
+            time.sleep(0.05)
+            if (tmp_path / "run" / "events.jsonl").is_file() and "ramp in" in (
+                tmp_path / "run" / "events.jsonl"
+            ).read_text(encoding="utf-8"):
+                break
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr is not None
+        message = process.stderr.read()
+        assert process.wait() == 1
+    assert "Stopped by SIGTERM." in message
+    assert "Torque is off on all 2 servos, read back." in message
+    assert "Traceback" not in message
+
+
+def test_help_shows_an_example_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("identify", "--help") == 0
+    assert "Example: hil identify configs/fake_two_link.toml" in capsys.readouterr().out
+    assert hil("--version") == 0
+    assert capsys.readouterr().out.startswith("hil 0.")

@@ -1,0 +1,99 @@
+"""`hil init`: a file that can be run, from what is on the bus and a few answers."""
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hil.config.schema import load_config, parse_config, port_url
+from hil.drivers.port import open_port
+from hil.drivers.servo_model import SERVO_MODELS, Mode
+from hil.errors import ExperimentError
+from hil.setup.config_template import ArmAnswers, JointAnswers, arm_toml
+from hil.setup.interview import interview
+from hil.setup.scan import Found, Heard, scan
+from tests.support.command_line import hil
+
+ArmFile = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+
+
+def test_defaults_make_a_file_that_runs(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("init", arm_file(), "--baud", 1_000_000, "--yes", "--out", "mine.toml") == 0
+    printed = capsys.readouterr()
+    assert "hil check mine.toml" in printed.out
+    assert "shoulder did not move" in printed.err
+    config = load_config(Path("mine.toml"))
+    assert [(joint.id, joint.model) for joint in config.joints] == [(1, "XM430-W350"), (2, "XM430-W350")]
+    assert [joint.zero_ticks for joint in config.joints] == pytest.approx([3072, 2048], abs=2)
+    assert "NOT yet run on this arm" in Path("mine.toml").read_text(encoding="utf-8")
+    assert hil("check", "mine.toml") == 0
+    assert hil("init", arm_file(), "--yes", "--out", "mine.toml") == 2
+    assert "mine.toml is there already" in capsys.readouterr().err
+
+
+def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> None:
+    answers = {
+        "IDs of the arm's": ["7", "1 1", "2"],
+        "Name of the joint": ["wrist"],
+        "Does the arm move": ["perhaps", "no"],
+        "How far may wrist": ["far", "720", "45"],
+    }
+    said: list[str] = []
+
+    def ask(question: str, usual: str) -> str:
+        kept = next((given for start, given in answers.items() if question.startswith(start)), [])
+        return kept.pop(0) if kept else usual
+
+    url = port_url(str(arm_file()))
+    port = open_port(url, 1_000_000)
+    try:
+        arm = interview(port, url, list(scan(port, (1_000_000,))), ask, said.append)
+    finally:
+        port.close()
+    (joint,) = arm.joints
+    assert (joint.id, joint.name, joint.rest) == (2, "wrist", 0.0)
+    assert joint.zero_ticks == pytest.approx(2048, abs=2)
+    assert joint.swing == pytest.approx(math.pi / 4)
+    assert arm.gravity == 0.0
+    assert [text.split(":")[0] for text in said] == [
+        "'7'",
+        "'1 1'",
+        "'perhaps'",
+        "wrist did not move",
+        "'far'",
+        "'720'",
+    ]
+    assert parse_config(arm_toml(arm), Path("x.toml")).joints[0].position_limit == pytest.approx([-0.79, 0.79])
+
+
+def test_a_bus_that_makes_no_arm_is_said(arm_file: ArmFile) -> None:
+    url = port_url(str(arm_file()))
+    port = open_port(url, 1_000_000)
+    one = Found(57_600, 1, 1020, "XM430-W350", 48, 12.0, 30.0, "")
+    try:
+        for heard, text in (
+            ([Heard(57_600, (), "")], "No servo that hil can drive answers"),
+            ([Heard(57_600, (one,), ""), Heard(1_000_000, (one._replace(id=2),), "")], "more than one baud"),
+        ):
+            with pytest.raises(ExperimentError, match=text):
+                interview(port, url, heard, lambda _, usual: usual, lambda _: None)
+    finally:
+        port.close()
+
+
+@pytest.mark.parametrize("model", SERVO_MODELS)
+@pytest.mark.parametrize("baud", [57_600, 1_000_000, 4_000_000])
+def test_every_model_and_baud_gives_a_file_that_is_valid(model: str, baud: int) -> None:
+    joints = (JointAnswers('the "first"', 1, model, 3072, -math.pi / 2), JointAnswers("elbow", 2, model, 2048, 0.0))
+    config = parse_config(arm_toml(ArmAnswers("/dev/ttyUSB0", baud, joints, 9.81, "A test.")), Path("x.toml"))
+    assert config.joints[0].name == 'the "first"'
+    assert (config.joints[0].drive_mode is Mode.PWM) == (model == "XL430-W250")
+    assert config.experiment.rate * 2 * 78 * 10 / baud < 1.1

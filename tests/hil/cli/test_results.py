@@ -1,0 +1,54 @@
+"""`hil report` and `hil export` on the command line: what they print, and runs that are not what they should be."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.command_line import hil
+
+
+@pytest.fixture(autouse=True)
+def _argv(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", sys.argv)
+
+
+def test_report_prints_where_it_is(identified: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("report", identified) == 0
+    assert capsys.readouterr().out.strip() == str(identified / "report.html")
+    assert hil("report", identified, "--out", tmp_path / "x.html", "--svg", tmp_path / "pictures") == 0
+    printed = capsys.readouterr().out
+    assert (tmp_path / "x.html").is_file()
+    assert f"{len(list((tmp_path / 'pictures').glob('*.svg')))} pictures in" in printed
+
+
+def test_export_prints_files_and_what_they_lack(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("export", identified, "--format", "urdf", "--format", "toml") == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == str(identified / "arm.urdf") and printed[-1] == str(identified / "arm.toml")
+    assert any(line.startswith("  URDF has no place for armature_2 = 0.0") for line in printed)
+
+
+@pytest.mark.parametrize("command", [("report",), ("export", "--format", "urdf")])
+def test_a_run_that_is_not_whole_is_one_message_and_code_2(
+    identified: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    path = identified / "result.json"
+    newer = json.dumps({**json.loads(path.read_text(encoding="utf-8")), "schema": 7})
+    for content, said in ((newer, "a newer hil"), ('{"schema": 1,', "half written or damaged"), (None, "hil estimate")):
+        path.unlink() if content is None else path.write_text(content, encoding="utf-8")
+        assert hil(*command, identified) == 2
+        printed = capsys.readouterr()
+        assert said in printed.err and "result.json" in printed.err
+        assert printed.out == "" and "Traceback" not in printed.err
+    assert hil(*command, tmp_path / "nowhere") == 2
+
+
+def test_arguments_that_do_not_go_together(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("export", identified, "--format", "toml", "--format", "json", "--out", "x") == 2
+    assert "--out names one file" in capsys.readouterr().err
+    assert hil("export", identified, "--format", "step") == 2
+    assert "'step' is not a format" in capsys.readouterr().err
+    assert hil("export", identified, "--format", "urdf", "--link-length", 0.2) == 2
+    assert "--link-length = 0.2 m is not needed" in capsys.readouterr().err

@@ -1,0 +1,138 @@
+"""Dry runs: what they foresee, what they allow, and the command around them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.dry_run import is_within, prior_study, run_on
+from hil.config.schema import Config, load_config, parse_config
+from hil.dry_run.amplitude import Amplitude, largest_amplitude
+from hil.dry_run.ensemble import prior_ensemble
+from hil.dry_run.nearest_arms import likely_arms
+from hil.dry_run.prediction import GUARDED, predict, scaled_feedback
+from hil.dry_run.rollout import commands_of, simulate_experiment
+from hil.errors import ConfigError
+from hil.estimator.models.parameters import CONSTANTS
+from hil.plan.plan import make_plan
+from hil.plan.stabiliser import feedback_of
+from hil.runs.recording import Phase
+from tests.support.command_line import hil
+from tests.support.paths import CONFIGS
+
+Arm = Callable[..., Config]
+KNOWN = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.180]\n")
+
+
+@pytest.fixture
+def known(arm: Arm) -> Config:
+    return arm(KNOWN, ("seed = 1\n", "seed = 1\nheld_out = false\n"))
+
+
+def test_the_same_prior_gives_the_same_prediction_and_more_torque_larger_peaks(known: Config) -> None:
+    ensemble = prior_ensemble(known, 24)
+    plan = make_plan(known)
+    first, again = predict(known, plan, ensemble), predict(known, plan, ensemble)
+    assert (first.values == again.values).all()
+    experiment = known.experiment.model_copy(update={"peak_torque": [0.4, 0.21]})
+    less = predict(known, make_plan(known.model_copy(update={"experiment": experiment})), ensemble)
+    assert (less.median[2] < first.median[2]).all()
+    assert (first.quantile[1:] >= first.median[1:] - 1e-9).all() and (first.quantile[0] <= first.median[0]).all()
+
+
+def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known: Config) -> None:
+    found = largest_amplitude(known, prior_ensemble(known, 48))
+    assert found.prediction.stop_chance <= known.safety.limit_chance
+    assert (found.prediction.shares[:, :GUARDED] < 1.0).all()
+    assert found.prediction.shares[:, :GUARDED].max() > 0.6, "and not for lack of trying"
+
+
+def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_file: Callable[..., Path]) -> None:
+    path = arm_file()  # the hanging one's place
+    text = (CONFIGS / "fake_horizontal.toml").read_text(encoding="utf-8")
+    for old, new in (KNOWN, ("period = 10.0 ", "held_out = false\nperiod = 4.0 "), ("[0.30, 0.18]", "[0.15, 0.09]")):
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    held_text = text.replace(
+        "[model]\n", "[stabiliser]\nstiffness = [1.0, 0.5]\ndamping = [0.02, 0.01]\n\n[model]\n", 1
+    )
+    widths = {}
+    for name, each in (("free", text), ("held", held_text)):
+        path.write_text(each, encoding="utf-8")
+        config = load_config(path)
+        plan, ensemble = make_plan(config), prior_ensemble(config, 48)
+        assert all(physics.vector[[4, 5]].tolist() == [0.0, 0.0] for physics in ensemble.physics), "nothing weighs"
+        foreseen = predict(config, plan, ensemble)
+        widths[name] = foreseen.quantile[1] - foreseen.quantile[0]
+        seen = run_on(config, Amplitude(plan, plan.segments[0].peak_torque, foreseen), path.parent / name)
+        assert seen is not None and is_within(config, seen, foreseen.quantile), name
+    assert (widths["held"] < 0.8 * widths["free"]).all()
+
+
+def test_seen_peaks_stay_within_the_predicted_ones() -> None:
+    study = prior_study(12)
+    assert study["within_quantile"] >= 11 / 12 and study["limit_touched"] == 0
+
+
+def test_the_arm_that_moved_alike_is_found_among_the_prior_ones(known: Config) -> None:
+    ensemble, plan = prior_ensemble(known, 10), make_plan(known)
+    commands = [commands_of(known, segment) for segment in plan.segments]
+    scale = ensemble.torque_scale[6]
+    motion = simulate_experiment(plan, commands, ensemble.physics[6], scale, scaled_feedback(feedback_of(known), scale))
+    first, count = plan.segments[0].ramp_samples, plan.segments[0].multisine.samples
+    samples = np.zeros(count, dtype=[("phase", "i1"), ("segment", "i1"), ("position", "f8", 2)])
+    samples["phase"], samples["position"] = Phase.PERIODIC, motion.position[:, first : first + count].T
+    samples["position"][::7] = np.nan
+    nearest, other = likely_arms(known, ensemble, plan, samples, 2)
+    truth = dict(zip(CONSTANTS, ensemble.physics[6].vector.tolist(), strict=True))
+    assert nearest["torque_scale_2"] == pytest.approx(scale[1] / scale[0])
+    assert nearest["gravity_2"] * scale[0] == pytest.approx(truth["gravity_2"])
+    assert nearest["stribeck_rise_1"] == truth["stribeck_rise_1"] and other["gravity_2"] != nearest["gravity_2"]
+
+
+def test_without_link_lengths_there_is_no_prior(arm: Arm) -> None:
+    with pytest.raises(ConfigError, match=r"needs arm\.link_lengths"):
+        prior_ensemble(arm(), 4)
+
+
+def test_pilot_needs_link_lengths_and_peak_torque_may_be_left_out(arm_file: Callable[..., Path]) -> None:
+    with pytest.raises(ConfigError, match=r"pilot = true needs arm\.link_lengths"):
+        load_config(arm_file(("seed = 1\n", "seed = 1\npilot = true\n")))
+    text = arm_file(KNOWN).read_text(encoding="utf-8").replace("peak_torque", "# peak_torque")
+    config = parse_config(text, Path("arm.toml"))
+    assert config.experiment.peak_torque is None
+    with pytest.raises(ConfigError, match="peak_torque is missing"):
+        make_plan(config)
+
+
+@pytest.mark.parametrize(("peak", "code"), [("[0.20, 0.10]", 0), ("[1.60, 1.20]", 1)])
+def test_the_verdict_is_the_exit_code(
+    arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], peak: str, code: int
+) -> None:
+    path = arm_file(KNOWN, ("[0.80, 0.42]", peak), ("seed = 1\n", "seed = 1\nheld_out = false\n"))
+    assert hil("dry-run", path, "--arms", "24", "--json") == code
+    said: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert said["safe"] is (code == 0) and said["arms"] == 24
+    elbow = said["asked"]["joints"]["elbow"]
+    assert set(elbow) == {"lowest position", "highest position", "velocity", "current", "torque", "power"}
+    assert elbow["velocity"]["limit"] == 20.0 and elbow["velocity"]["unit"] == "rad/s"
+
+
+def test_a_table_for_a_person_with_what_the_servos_say(
+    arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    path = arm_file(KNOWN, ("[0.80, 0.42]", "[0.20, 0.10]"), ("seed = 1\n", "seed = 1\nheld_out = false\n"))
+    assert hil("dry-run", path, "--arms", "20", "--servos") == 0
+    said = capsys.readouterr().out
+    for part in (
+        "SAFE",
+        "Largest safe torque",
+        "own current limit 3.21 A",
+        "With torque off at 400 per second",
+        "settle",
+    ):
+        assert part in said, part

@@ -1,0 +1,205 @@
+"""Recordings from elsewhere, runs cut short, peers and the known mass, as a person meets them on the command line."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.estimator.baselines import compare as peers
+from hil.runs.recording import load_samples
+from tests.support.command_line import hil
+from tests.support.paths import CONFIGS, DATA, ROOT
+
+ArmFile = Callable[..., Path]
+RECORDINGS = DATA / "dfki_double_pendulum"
+WHOLE = ROOT.parent / "shared" / "data" / "dfki_double_pendulum"
+DFKI = CONFIGS / "recordings" / "dfki_double_pendulum.toml"
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+
+
+def ratio(result: dict) -> tuple[float, float]:
+    """Length of link 1 [m] as coupling and gravity_2 say, and its standard error."""
+    names = result["covariance"]["names"]
+    covariance = np.array(result["covariance"]["matrix"])
+    coupling, gravity = (result["parameters"][name]["value"] for name in ("coupling", "gravity_2"))
+    slope = np.zeros(len(names))
+    length = 9.81 * coupling / gravity
+    slope[names.index("coupling")], slope[names.index("gravity_2")] = length / coupling, -length / gravity
+    return length, float(np.sqrt(slope @ covariance @ slope))
+
+
+def test_a_real_arm_recorded_by_others(capsys: pytest.CaptureFixture[str]) -> None:
+    """Four seconds of it: link 1 is 0.2 m long, which nothing in the file says."""
+    text = DFKI.read_text(encoding="utf-8").replace('friction = "stribeck_load"', 'friction = "coulomb"')
+    Path("arm.toml").write_text(text.replace("presliding = true", "presliding = false"), encoding="utf-8")
+    assert hil("estimate", RECORDINGS / "c1_sinusoids_143339.csv", "--config", "arm.toml", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["joints"] == 2 and result["fit"]["segments"] == 8
+    length, std = ratio(result)
+    assert length == pytest.approx(0.2, rel=0.2) and abs(length - 0.2) < 3.0 * std
+    assert max(result["fit"]["residual_rms_rad"]) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not WHOLE.is_dir(), reason="the whole recordings are not here")
+def test_the_whole_of_it_is_within_four_percent(capsys: pytest.CaptureFixture[str]) -> None:
+    files = sorted(WHOLE.glob("c1_sinusoids_*.csv"))
+    assert hil("estimate", *files, "--config", DFKI, "--json") == 0
+    length, std = ratio(json.loads(capsys.readouterr().out))
+    assert length == pytest.approx(0.2, rel=0.04) and abs(length - 0.2) < 1.96 * std
+
+
+CSV = "t,q1,q2,i1,i2\n" + "".join(
+    f"{0.01 * k:.2f},{np.degrees(np.sin(0.05 * k)):.4f},{np.degrees(np.cos(0.09 * k)):.4f},{np.sin(0.1 * k):.4f},0.1\n"
+    for k in range(200)
+)
+COLUMNS = (
+    '[columns]\ntime = "t"\nposition = ["q1", "q2"]\nposition_unit = "deg"\n'
+    'current = ["i1", "i2"]\ntorque_constant = [1.8, 1.8]\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("csv", "toml", "code", "said"),
+    [
+        (CSV, COLUMNS.replace('"q2"]', '"elbow"]'), 2, "has no column 'elbow'; it has t, q1, q2, i1, i2"),
+        (CSV, COLUMNS.replace("torque_constant = [1.8, 1.8]", ""), 2, "columns.torque_constant is missing"),
+        (CSV, COLUMNS.replace('"deg"', '"degrees"'), 2, "position_unit"),
+        (CSV, COLUMNS.replace("[1.8, 1.8]", "[1.8]"), 2, "has 1 entries; position has 2"),
+        (CSV, COLUMNS.replace('"deg"', '"turns"'), 1, "are these degrees or encoder"),
+        (CSV, COLUMNS.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'), 1, "jumps by"),
+        (CSV, "[arm]\ngravity = 9.81\n", 2, "has no [columns] table"),
+        (CSV.replace("\n0.50,", "\n0.50,x"), COLUMNS, 2, "column 'q1' holds no number"),
+        (CSV.replace("\n0.50,", "\n0.50,1,"), COLUMNS, 2, "6 fields for 5 columns"),
+        (CSV.replace(",0.1\n", ",nan\n", 3), COLUMNS, 1, "joint 2: 3 torques are not finite"),
+        (CSV[:300], COLUMNS, 2, "fields for 5 columns"),
+        ("".join(CSV.splitlines(True)[:20]), COLUMNS, 1, "at least 32 are needed"),
+        ("", COLUMNS, 2, "is empty"),
+    ],
+)
+def test_a_csv_that_is_wrong_is_named(
+    csv: str, toml: str, code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("data.csv").write_text(csv, encoding="utf-8")
+    Path("arm.toml").write_text(toml, encoding="utf-8")
+    assert hil("estimate", "data.csv", "--config", "arm.toml") == code
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (
+            lambda columns: columns | {"q1": np.degrees(columns["q1"])},
+            "if it did not, its positions are not in the unit",
+        ),
+        (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
+        (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),
+        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "encoder steps only"),
+    ],
+)
+def test_data_that_is_doubtful_comes_with_a_warning(
+    spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert estimate_pendulum(spoil) == 0
+    assert said in " ".join(json.loads(capsys.readouterr().out)["warnings"])
+
+
+def test_torque_of_the_wrong_sign_is_an_error_that_says_where_to_look(capsys: pytest.CaptureFixture[str]) -> None:
+    assert estimate_pendulum(lambda columns: columns | {"tau1": -columns["tau1"]}) == 1
+    assert "check the units, signs and directions of torque and angle" in capsys.readouterr().err
+
+
+def estimate_pendulum(spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> int:
+    """A pendulum swinging as 0.02 q'' + 0.5 cos q + 0.03 q' = tau; one column is then wrong. The exit code."""
+    time = 0.0025 * np.arange(2000)
+    torque = 0.25 * np.sin(2.0 * time) + 0.2 * np.sin(7.1 * time + 1.0)
+    angle, velocity = np.empty(2000), 0.0
+    angle[0] = -np.pi / 2
+    for k in range(1999):
+        velocity += 0.0025 * (torque[k] - 0.5 * np.cos(angle[k]) - 0.03 * velocity) / 0.02
+        angle[k + 1] = angle[k] + 0.0025 * velocity
+    columns = spoil({"t": time, "q1": angle, "tau1": torque})
+    rows = np.column_stack(list(columns.values())).tolist()
+    Path("data.csv").write_text(
+        "t,q1,tau1\n" + "".join(",".join(map(str, row)) + "\n" for row in rows), encoding="utf-8"
+    )
+    toml = '[model]\nfriction = "coulomb"\n[columns]\ntime = "t"\nposition = ["q1"]\ntorque = ["tau1"]\n'
+    Path("arm.toml").write_text(toml + "position_step = 0.0015\n", encoding="utf-8")
+    return hil("estimate", "data.csv", "--config", "arm.toml", "--json")
+
+
+def test_a_csv_needs_its_config_and_no_run_beside_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("estimate", "data.csv") == 2
+    assert "--config ARM.toml" in capsys.readouterr().err
+    assert hil("estimate", "data.csv", "some_run", "--config", "arm.toml") == 2
+
+
+def test_a_run_cut_short_still_tells_something(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    """Killed before the second period, a run holds no settled one; shooting needs none."""
+    assert hil("identify", arm_file(), "--out", "run", "--json") == 0
+    whole = json.loads(capsys.readouterr().out)
+    samples = load_samples(Path("run/samples.npy"), 2)
+    np.save("run/samples.npy", samples[:2000], allow_pickle=False)
+    assert hil("estimate", "run") == 1
+    assert "--all-samples" in capsys.readouterr().err
+    assert hil("estimate", "run", "--all-samples", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["method"].startswith("multiple shooting")
+    for name in ("inertia_1", "gravity_1", "gravity_2", "coulomb_1"):
+        assert result["parameters"][name]["value"] == pytest.approx(whole["truth"][name], rel=0.03)
+
+
+def test_compare_and_known_quantities_on_one_run(
+    arm_file: ArmFile, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(peers, "CUTOFFS", (10.0, 20.0))
+    monkeypatch.setattr(peers, "WIDTHS", (0.05,))
+    monkeypatch.setattr(peers, "VELOCITY_NOISES", (1e-3,))
+    known = "[known]\nmass_1 = 0.18\nmass_2 = 0.2\nmass_elbow = 0.082\n" + (
+        "rotor_inertia_1 = 8.0e-8\ngear_ratio_1 = 353.5\n\n[fake]\n"
+    )
+    assert hil("identify", arm_file(("[fake]\n", known)), "--out", "run") == 0
+    assert "centre_2" in capsys.readouterr().out
+    physical = json.loads(Path("run/result.json").read_text(encoding="utf-8"))["physical"]
+    assert physical["quantities"]["centre_2"]["value"] == pytest.approx(0.112, rel=0.005)
+    # A small difference of large numbers: what is promised is its error bar.
+    inertia = physical["quantities"]["link_inertia_2"]
+    assert abs(inertia["value"] - 2.9e-4) < 3.0 * inertia["std"] < 1.0e-4
+    assert physical["not_told_apart"] == []
+    assert hil("compare", "run", "--json") == 0
+    methods = json.loads(capsys.readouterr().out)["methods"]
+    assert set(methods) == {"hil", "idim_ls", "rls", "ekf", "ukf", "paper"}
+    others = [entry["worst_relative_error"] for name, entry in methods.items() if name != "hil"]
+    assert methods["hil"]["worst_relative_error"] < min(others) < 0.1, "the best, and not among straw men"
+    assert Path("run/compare.json").is_file()
+
+
+def test_a_known_mass_mends_a_torque_constant(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    """The TOML supposes 20 % too much at the shoulder and 10 % too little at the elbow."""
+    wrong = [("torque_constant = 1.80         #", "torque_constant = 2.16         #")]
+    wrong += [("torque_constant = 1.80\ntorque_constant_std", "torque_constant = 1.62\ntorque_constant_std")]
+    assert hil("identify", arm_file(*wrong), "--out", "bare", "--json") == 0
+    # 0.1 kg at 0.16 m on link 2 (0.2 kg, centre 0.112 m).
+    mass, centre = 0.3, (0.2 * 0.112 + 0.1 * 0.16) / 0.3
+    inertia = 2.9e-4 + 0.2 * (0.112 - centre) ** 2 + 0.1 * (0.16 - centre) ** 2
+    link = f"length = 0.180\nmass = {mass}\ncentre = {centre!r}\ninertia = {inertia!r}"
+    bare = "length = 0.180\nmass = 0.200\ncentre = 0.112\ninertia = 2.9e-4"
+    assert hil("identify", arm_file(*wrong, (bare, link)), "--out", "with_mass", "--json") == 0
+    capsys.readouterr()
+    asked = ("calibrate", "bare", "with_mass", "--mass", "0.1", "--distance", "0.16", "--length", "0.147")
+    assert hil(*asked, "--json") == 0
+    found = json.loads(capsys.readouterr().out)["torque_per_goal"]
+    assert found["shoulder"]["value"] == pytest.approx(1.8, rel=0.01)
+    assert found["elbow"]["value"] == pytest.approx(1.8, rel=0.01)
+    assert hil(*asked[:-2]) == 1
+    assert "--length" in capsys.readouterr().err

@@ -1,0 +1,129 @@
+"""The guard by itself: what each sample must not show, and what a look costs."""
+
+from collections.abc import Callable
+from math import inf, nan
+from timeit import timeit
+from typing import Any
+
+import pytest
+
+from hil.config.schema import Config
+from hil.drivers.state import Slow, State
+from hil.errors import Cause, SafetyStop
+from hil.experiment.guard import Guard
+
+Arm = Callable[..., Config]
+STILL = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (-1.57, 0.0), (0, 0), (False, False))
+MISSING = STILL._replace(current=(0.0, nan), velocity=(0.0, nan), position=(-1.57, nan), missing=(False, True))
+NOTHING_SLOW = Slow((nan, nan), (nan, nan), (nan, nan))
+
+
+def look(guard: Guard, *states: State) -> Cause:
+    """Show the states; the cause for which the guard stops, at the last one."""
+    for state in states[:-1]:
+        guard.look(state)
+    with pytest.raises(SafetyStop) as stop:
+        guard.look(states[-1])
+    assert "joint '" in str(stop.value).lower() and "ID " in str(stop.value)
+    return stop.value.cause
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"position": (1.07, 0.0)}, Cause.POSITION),
+        ({"position": (nan, 0.0)}, Cause.POSITION),
+        ({"velocity": (15.1, 0.0)}, Cause.VELOCITY),
+        ({"velocity": (nan, 0.0)}, Cause.VELOCITY),
+        ({"error": (0, 0x80)}, Cause.ALERT),
+        ({"error": (0, 0x80), "missing": (False, True)}, Cause.ALERT),
+        ({"slow": NOTHING_SLOW._replace(temperature=(71.0, nan))}, Cause.TEMPERATURE),
+        ({"slow": NOTHING_SLOW._replace(voltage=(nan, 31.0))}, Cause.VOLTAGE),
+    ],
+)
+def test_one_sample_that_stops(arm: Arm, change: dict[str, Any], cause: Cause) -> None:
+    assert look(Guard(arm()), STILL._replace(**change)) is cause
+
+
+def test_an_encoder_jump_stops_and_the_same_way_over_lost_samples_does_not(arm: Arm) -> None:
+    moved = STILL._replace(position=(-1.57, 0.16))
+    assert look(Guard(arm()), STILL, moved) is Cause.JUMP
+    guard = Guard(arm())
+    for state in (STILL, MISSING, MISSING, moved):
+        guard.look(state)
+
+
+def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
+    guard = Guard(arm())
+    for state in (*[MISSING] * 5, STILL, *[MISSING] * 5):
+        guard.look(state)
+    assert look(guard, MISSING) is Cause.MISSING
+
+
+def test_a_current_that_does_not_follow(arm: Arm) -> None:
+    off = STILL._replace(goal_current=(0.5, 0.0))
+    assert look(Guard(arm()), *[off] * 20) is Cause.NOT_FOLLOWING
+    guard = Guard(arm())
+    for state in [*[off] * 19, STILL] * 3:
+        guard.look(state)
+
+
+def test_a_motor_that_only_takes_work_out_turns_the_wrong_way(arm: Arm) -> None:
+    braking = STILL._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0))
+    assert look(Guard(arm()), *[braking] * 12) is Cause.WRONG_SIGN
+
+
+def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
+    guard = Guard(arm())
+    for _ in range(20):
+        guard.late()
+    with pytest.raises(SafetyStop, match="21 deadlines in a row"):
+        guard.late()
+    with pytest.raises(SafetyStop, match="120 ms passed between two commands"):
+        Guard(arm()).look(STILL, 0.12)
+
+
+def test_late_deadlines_stop_before_a_short_watchdog_acts(arm: Arm) -> None:
+    guard = Guard(arm(("[experiment]\n", "[safety]\nwatchdog = 0.04\n\n[experiment]\n")))
+    for _ in range(12):
+        guard.late()
+    with pytest.raises(SafetyStop, match="13 deadlines in a row were missed, 32 ms without a command"):
+        guard.late()
+
+
+def test_motion_before_the_start(arm: Arm) -> None:
+    guard = Guard(arm())
+    guard.look_at_rest(STILL)
+    with pytest.raises(SafetyStop, match=r"'elbow' \(ID 2.*moves before the start: \+0\.060") as stop:
+        guard.look_at_rest(STILL._replace(position=(-1.57, 0.06)))
+    assert stop.value.cause is Cause.EARLY_MOTION
+
+
+def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:
+    guard = Guard(arm())
+    first = guard.clamp([5.0, -0.1])
+    assert first == pytest.approx([100 / 400, -0.1]), "A: 100 A/s at 400 per second"
+    for _ in range(10):
+        last = guard.clamp([5.0, -5.0])
+    assert last == pytest.approx([1.2, -0.8])
+    for wrong in (nan, inf, -inf):
+        with pytest.raises(SafetyStop, match="is no number"):
+            guard.clamp([wrong, 0.0])
+
+
+def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
+    """The figure is benchmarks/guard.py's; here only what slows a look down shows, on a machine of any speed."""
+    guard = Guard(arm())
+    moving = STILL._replace(goal_current=(0.1, 0.1), current=(0.1, 0.1), velocity=(0.5, 0.5))
+
+    def look() -> None:
+        guard.clamp((0.1, 0.1))
+        guard.look(moving, 0.0025)
+
+    def add() -> None:
+        total = 0.0
+        for each in range(100):
+            total += each
+
+    rounds = [(timeit(look, number=500), timeit(add, number=500)) for _ in range(20)]
+    assert min(looked for looked, _ in rounds) < 3 * min(added for _, added in rounds)

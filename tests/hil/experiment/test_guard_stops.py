@@ -1,0 +1,347 @@
+"""Every cause for which the guard stops a run, brought about on the fake arm: whatever the driver believes, the servos
+that it emulates must end without torque.
+"""
+
+import os
+import re
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+
+from benchmarks.faults import SpiedPlant, Spy, call_at
+from hil.config.schema import Config, parse_config
+from hil.drivers.errors import TorqueNotOff, WrongModel
+from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
+from hil.experiment.run import run_experiment
+from hil.experiment.stream import Progress
+from hil.fakes.bus.faults import Fault, FaultKind
+from hil.plan.plan import Plan, make_plan
+from hil.runs.recording import Phase, load_samples
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
+
+Arm = Callable[..., Config]
+STIFF_GUARD = ("[experiment]\n", "[safety]\nmax_temperature = 40.0\nmin_voltage = 11.0\n\n[experiment]\n")
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    """What every run here plays: it takes longer to design than to play."""
+    text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
+    text = text.replace("period = 10.0 ", "period = 2.0 ").replace("band = [0.1, 5.0]", "band = [0.5, 6.0]")
+    return make_plan(parse_config(text, CONFIGS)).first_segment()
+
+
+def run_until_stopped(
+    config: Config, folder: Path, act: Callable[[Progress], None], plan: Plan
+) -> tuple[SafetyStop, np.ndarray]:
+    run = RunFolder.create(folder, config)
+    with pytest.raises(SafetyStop) as stop:
+        run_experiment(config, run, config.path, act, plan)
+    return stop.value, load_samples(run.samples_path, 2)
+
+
+def once(action: Callable[[], Any], phase: Phase = Phase.PERIODIC, after: int = 800) -> Callable[[Progress], None]:
+    done: list[bool] = []
+
+    def act(progress: Progress) -> None:
+        if progress.phase == phase and progress.taken >= after and not done:
+            done.append(True)
+            action()
+
+    return act
+
+
+def assert_stopped(port: Any) -> None:
+    """Both servos are without torque, or stopped by their watchdogs, and their motors carry nothing."""
+    port.clock.wait_until(port.clock.now() + 0.1)
+    servos = list(port.bus.servos.values())
+    assert len(servos) == 2
+    assert all(not servo.torque_enabled or servo.watchdog_tripped for servo in servos)
+    assert [servo.motor_current_a for servo in servos] == [0.0, 0.0]
+
+
+def fault(ports: list[Any], kind: FaultKind, **options: Any) -> None:
+    bus = ports[0].bus
+    bus.faults.add(Fault(kind=kind, at=bus.time, **options))
+
+
+def turn_round(ports: list[Any], joint: int) -> None:
+    bus = ports[0].bus
+    bus.plant = SpiedPlant(bus.plant, Spy(turned=joint))
+
+
+def stall(ports: list[Any], seconds: float) -> None:
+    ports[0].clock._now += seconds
+
+
+CAUSES: list[tuple[Cause, str, Callable[[list[Any]], None]]] = [
+    (Cause.TEMPERATURE, r"'shoulder'.*at 50 degrees C", lambda p: setattr(p[0].bus.servos[1], "temperature_c", 50.0)),
+    (Cause.VOLTAGE, r"'elbow'.*has 10\.5 V", lambda p: setattr(p[0].bus.servos[2], "input_voltage_v", 10.5)),
+    (Cause.ALERT, r"'elbow'.*overload", lambda p: fault(p, FaultKind.OVERLOAD, servo=2)),
+    (Cause.MISSING, r"'elbow'.*missed 6 replies", lambda p: fault(p, FaultKind.LOST_REPLY, servo=2, duration=0.1)),
+    (Cause.LATE, r"deadlines in a row", lambda p: stall(p, 0.06)),
+    (Cause.JUMP, r"'elbow'.*seems to have moved", lambda p: fault(p, FaultKind.ENCODER_JUMP, servo=2, amount=-120)),
+    (Cause.NOT_FOLLOWING, r"'shoulder'.*carries 0\.000", lambda p: p[0].bus.servos[1].write(64, b"\x00")),
+    (Cause.WRONG_SIGN, r"against its command", lambda p: turn_round(p, 0)),
+]
+
+
+@pytest.mark.parametrize(("cause", "said", "happens"), CAUSES, ids=[cause.name for cause, *_ in CAUSES])
+def test_what_goes_wrong_in_a_period_stops_the_arm_for_that_cause(
+    arm: Arm,
+    tmp_path: Path,
+    ports: list[Any],
+    plan: Plan,
+    cause: Cause,
+    said: str,
+    happens: Callable[[list[Any]], None],
+) -> None:
+    low = () if cause is not Cause.NOT_FOLLOWING else (("current_limit = 1.2", "current_limit = 0.5"),)
+    stop, samples = run_until_stopped(arm(STIFF_GUARD, *low), tmp_path / "run", once(lambda: happens(ports)), plan)
+    assert stop.cause is cause
+    assert re.search(said, str(stop))
+    assert_stopped(ports[0])
+    assert (Phase.BRAKING in samples["phase"]) == cause.allows_braking
+
+
+def test_a_computer_that_stalls_beyond_the_watchdogs_time_finds_the_arm_stopped(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    tripped: list[bool] = []
+
+    def sleep() -> None:
+        stall(ports, 0.3)
+        tripped.extend(servo.watchdog_tripped for servo in ports[0].bus.servos.values())
+
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", once(sleep), plan)
+    assert tripped == [True, True]
+    assert stop.cause is Cause.LATE
+    assert_stopped(ports[0])
+
+
+def test_commands_too_far_apart_for_the_watchdogs(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    config = arm(("rate = 400.0", "rate = 40.0"), ("[experiment]\n", "[safety]\nwatchdog = 0.02\n\n[experiment]\n"))
+    stop, samples = run_until_stopped(config, tmp_path / "run", lambda _: None, make_plan(config))
+    assert stop.cause is Cause.LATE and "25 ms passed between two commands" in str(stop)
+    assert len(samples) == 2
+    assert_stopped(ports[0])
+
+
+def test_an_arm_that_moves_before_the_start(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
+    def push() -> None:
+        ports[0].bus.plant._v2 = 1.5
+
+    stop, samples = run_until_stopped(arm(), tmp_path / "run", once(push, Phase.REST, 10), plan)
+    assert stop.cause is Cause.EARLY_MOTION
+    assert set(samples["phase"]) == {Phase.REST} and not samples["goal_current"].any()
+    assert_stopped(ports[0])
+
+
+def test_an_arm_that_is_still_moving_when_the_rest_is_over(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    config = arm()
+
+    def push() -> None:
+        ports[0].bus.plant._v2 = 0.6
+
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(ExperimentError, match=r"moves before the start: joint 'elbow' \(ID 2.* at 0\.\d\d rad/s"):
+        run_experiment(config, run, config.path, once(push, Phase.REST, 180), plan)
+    assert not load_samples(run.samples_path, 2)["goal_current"][:200].any()
+    assert_stopped(ports[0])
+
+
+def test_a_goal_that_is_no_number_is_never_sent(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
+    config = arm()
+    broken = plan.segments[0].period_current.copy()
+    broken[100, 1] = np.nan
+    plan = replace(plan, segments=(replace(plan.segments[0], period_current=broken),))
+    stop, samples = run_until_stopped(config, tmp_path / "run", lambda _: None, plan)
+    assert stop.cause is Cause.NOT_A_NUMBER
+    assert np.isfinite(samples["goal_current"]).all()
+    assert_stopped(ports[0])
+
+
+def test_a_jump_of_the_wanted_current_reaches_the_servos_in_steps(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    config = arm(("[experiment]\n", "[safety]\nslew = 20.0\n\n[experiment]\n"))
+    square = np.zeros_like(plan.segments[0].period_current)
+    square[::80, 0] = 0.2
+    plan = replace(plan, segments=(replace(plan.segments[0], period_current=square),))
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(ExperimentError):  # the elbow, which gets nothing, is found stuck
+        run_experiment(config, run, config.path, lambda _: None, plan)
+    sent = load_samples(run.samples_path, 2)["goal_current"]
+    assert 0 < np.abs(np.diff(sent, axis=0)).max() <= 20.0 / 400 + 2.7e-3
+
+
+# How it comes to rest
+
+
+def braked_samples(arm: Arm, folder: Path, ports: list[Any], plan: Plan, then: Callable[[], None] | None) -> int:
+    """Samples of braking after Ctrl-C, when `then` happens 12 ms later."""
+    config = arm(("[experiment]\n", "[safety]\ndamp_time = 0.06\n\n[experiment]\n"))
+
+    def act() -> None:
+        port = ports[-1]
+        os.kill(os.getpid(), signal.SIGINT)
+        if then is not None:
+            call_at(port, port.clock.now() + 0.012, then)
+
+    run = RunFolder.create(folder, config)
+    with pytest.raises(StopRequested):
+        run_experiment(config, run, config.path, once(act), plan)
+    assert_stopped(ports[-1])
+    return int(np.count_nonzero(load_samples(run.samples_path, 2)["phase"] == Phase.BRAKING))
+
+
+def test_braking_takes_its_time_and_no_more(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
+    assert braked_samples(arm, tmp_path / "run", ports, plan, None) == 24
+
+
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_second_signal_ends_the_braking_at_once(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, second: signal.Signals
+) -> None:
+    count = braked_samples(arm, tmp_path / "run", ports, plan, lambda: os.kill(os.getpid(), second))
+    assert 2 <= count <= 5
+
+
+def test_a_missed_deadline_ends_the_braking(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
+    assert 2 <= braked_samples(arm, tmp_path / "run", ports, plan, lambda: stall(ports, 0.03)) <= 5
+
+
+def test_a_joint_whose_replies_are_missing_is_not_taken_to_be_at_rest(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    config = arm(("[experiment]\n", "[safety]\nmax_missing = 1000\n\n[experiment]\n"))
+    run = RunFolder.create(tmp_path / "run", config)
+    lose = once(lambda: fault(ports, FaultKind.LOST_REPLY, servo=2, duration=1.1), Phase.COMING_TO_REST)
+    run_experiment(config, run, config.path, lose, plan)
+    samples = load_samples(run.samples_path, 2)
+    ending = samples[samples["phase"] == Phase.COMING_TO_REST]
+    unseen = np.flatnonzero(ending["missing"][:, 1])
+    assert len(unseen) > 200
+    assert np.isfinite(ending["velocity"][unseen[-1] + 1 :]).all() and len(ending) > unseen[-1] + 1
+    assert_stopped(ports[0])
+
+
+# The servos' own limit
+
+
+def test_the_servos_own_current_limit_is_lowered_for_the_run_and_restored_after_a_stop(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    seen: list[list[int]] = []
+
+    def limits() -> list[int]:
+        return [servo.value("Current Limit") for servo in ports[0].bus.servos.values()]
+
+    def look() -> None:
+        seen.append(limits())
+        fault(ports, FaultKind.ENCODER_JUMP, servo=2, amount=-120)
+
+    run_until_stopped(arm(), tmp_path / "run", once(look), plan)
+    assert seen == [[447, 298]], "1.2 and 0.8 A in ticks of 2.69 mA, rounded up"
+    assert limits() == [1193, 1193]
+
+
+# Watchdogs
+
+
+@pytest.fixture
+def as_found(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any], None]], None]:
+    """Says what is done to each servo before anybody opens its port."""
+
+    def prepare(change: Callable[[Any], None]) -> None:
+        opened = serial.serial_for_url
+
+        def open_changed(*args: Any, **kwargs: Any) -> Any:
+            port = opened(*args, **kwargs)
+            for servo in port.bus.servos.values():
+                change(servo)
+            return port
+
+        monkeypatch.setattr(serial, "serial_for_url", open_changed)
+
+    return prepare
+
+
+def has_old_firmware(servo: Any) -> None:
+    if servo.value("ID") == 2:
+        servo.memory.set("Firmware Version", 37)
+
+
+def was_left_by_a_killed_program(servo: Any) -> None:
+    """Torque on, watchdog tripped, Current Limit lowered."""
+    servo.write(11, b"\x00")  # Operating Mode: current
+    servo.write(38, (447).to_bytes(2, "little"))
+    servo.write(64, b"\x01")
+    servo.trip_watchdog()
+
+
+Found = Callable[[Callable[[Any], None]], None]
+
+
+def test_firmware_without_a_bus_watchdog_is_refused(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, as_found: Found
+) -> None:
+    as_found(has_old_firmware)
+    config = arm()
+    with pytest.raises(WrongModel, match=r"'elbow' \(ID 2.*firmware 37 has no Bus Watchdog.*allow_no_watchdog = true"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    assert_stopped(ports[0])
+    assert not any(servo.value("Bus Watchdog") for servo in ports[0].bus.servos.values())
+
+
+def test_firmware_without_a_bus_watchdog_runs_where_the_user_says_so(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, as_found: Found
+) -> None:
+    as_found(has_old_firmware)
+    armed: list[tuple[int, ...]] = []
+    config = arm(("[experiment]\n", "[safety]\nallow_no_watchdog = true\n\n[experiment]\n"))
+
+    def look() -> None:
+        armed.append(tuple(servo.value("Bus Watchdog") for servo in ports[0].bus.servos.values()))
+        os.kill(os.getpid(), signal.SIGINT)
+
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(StopRequested):
+        run_experiment(config, run, config.path, once(look), plan)
+    assert armed == [(4, 0)], "20 ms units: the servo that has a watchdog has it armed, the other is not written to"
+    assert_stopped(ports[0])
+
+
+def test_a_servo_without_a_watchdog_that_falls_silent_is_said_to_go_on(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, as_found: Found
+) -> None:
+    as_found(has_old_firmware)
+    config = arm(("[experiment]\n", "[safety]\nallow_no_watchdog = true\n\n[experiment]\n"))
+    pull = once(lambda: setattr(ports[0].bus.servos[2], "connected", False))
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(TorqueNotOff, match=r"NOTHING STOPS JOINT 'ELBOW' \(ID 2.*cut the supply now"):
+        run_experiment(config, run, config.path, pull, plan)
+    port = ports[0]
+    port.clock.wait_until(port.clock.now() + 1.0)
+    assert not port.bus.servos[1].torque_enabled
+    assert port.bus.servos[2].motor_current_a != 0.0, "and it does"
+
+
+def test_servos_that_a_killed_program_left_behind_are_taken_over(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, as_found: Found
+) -> None:
+    as_found(was_left_by_a_killed_program)
+    config = arm()
+    said = run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    assert said == "Torque is off on all 2 servos, read back."
+    servos = ports[0].bus.servos.values()
+    assert not any(servo.torque_enabled or servo.value("Bus Watchdog") for servo in servos)

@@ -1,0 +1,33 @@
+"""SIGKILL in the middle of an experiment: only the servos' own watchdogs are left. benchmarks/kills.py does fifty."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import kills
+from benchmarks.kills import Kill, kill_campaign
+from hil.config.schema import Config
+
+
+def test_a_killed_program_leaves_servos_that_stop_themselves(tmp_path: Path) -> None:
+    done = kill_campaign(2, tmp_path)
+    assert sum(kill.counts for kill in done) == 2
+    assert all(kill.safe for kill in done), done
+
+
+def test_a_kill_that_finds_current_or_an_armed_watchdog_is_not_safe() -> None:
+    assert Kill([255, -1], [1, 1], [0, 0], 0.106).safe
+    assert not Kill([255, 4], [1, 1], [0, 0], 0.106).safe
+    assert not Kill([255, 255], [1, 1], [0, 3], 0.106).safe
+    assert not Kill([255, 255], [1, 1], [0, 0], 0.130).counts
+
+
+def test_the_campaign_says_why_an_experiment_would_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong_pose(link: Path) -> Config:
+        config = pty_config(link)
+        return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_pose": [0.0, 0.0]})})
+
+    pty_config = kills.pty_config
+    monkeypatch.setattr(kills, "pty_config", wrong_pose)
+    with pytest.raises(RuntimeError, match=r"0 of 3 kills count(.|\n)*'shoulder'.*arm\.rest_pose says 0\.000"):
+        kill_campaign(1, tmp_path)

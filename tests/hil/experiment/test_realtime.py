@@ -1,0 +1,47 @@
+"""Real-time measures: whatever was given, everything is as before afterwards."""
+
+import gc
+import os
+import sys
+from contextlib import suppress
+
+import pytest
+
+from hil.experiment.realtime import real_time
+
+
+def settings() -> tuple[object, ...]:
+    parameter = os.sched_getparam(0).sched_priority
+    return os.sched_getscheduler(0), parameter, os.sched_getaffinity(0), gc.isenabled(), sys.getswitchinterval()
+
+
+@pytest.mark.parametrize("fail", [False, True])
+def test_everything_is_taken_back(fail: bool) -> None:
+    before, frozen = settings(), gc.get_freeze_count()
+    with suppress(ZeroDivisionError), real_time() as granted:
+        assert not gc.isenabled()
+        assert sys.getswitchinterval() < 1e-3
+        assert [each.name for each in granted] == [
+            "real-time scheduling",
+            "own core",
+            "locked memory",
+            "timer slack",
+            "no garbage collection",
+            "short thread turns",
+        ]
+        assert all(each.given or each.note for each in granted)
+        1 / (not fail)
+    assert settings() == before
+    assert gc.get_freeze_count() <= frozen
+
+
+def test_what_is_not_permitted_is_said_and_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with real_time() as granted:
+        fifo, core, *_ = granted
+        assert str(fifo) == "real-time scheduling: no (Operation not permitted; needs `ulimit -r 20` or root)"
+        # Without it a pinned loop would wait for whoever holds its core.
+        assert not core.given

@@ -1,0 +1,224 @@
+"""The experiment on the fake bus. Whatever happens, the emulated servos themselves must end without torque, or stopped
+by their watchdog, and what was recorded must be readable.
+"""
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+
+from hil.config.schema import Config
+from hil.drivers.errors import DriverError, NoReply, PortLost, ServoFault, TorqueNotOff, WrongModel, WrongSetting
+from hil.errors import ExperimentError, NotSettled, RunFolderError, SafetyStop, StopRequested
+from hil.experiment.run import run_experiment
+from hil.experiment.stream import Progress, Watch
+from hil.fakes.protocol_fake import FakeSerial
+from hil.runs.recording import Phase, load_samples
+from hil.runs.run_folder import RunFolder
+
+Arm = Callable[..., Config]
+
+
+SERVO_1 = 'id = 1\nmodel = "XM430-W350"\nzero_ticks = 3072\n'
+
+
+def ignore(_: Progress) -> None:
+    """Watch nothing."""
+
+
+def run(config: Config, folder: Path, watch: Watch = ignore) -> RunFolder:
+    made = RunFolder.create(folder, config)
+    run_experiment(config, made, config.path, watch)
+    return made
+
+
+def at_sample(count: int, action: Callable[[], Any]) -> Watch:
+    """A watch that acts once, when `count` samples have been taken."""
+    done: list[bool] = []
+
+    def watch(progress: Progress) -> None:
+        if progress.taken >= count and not done:
+            done.append(True)
+            action()
+
+    return watch
+
+
+def assert_no_torque(port: Any) -> None:
+    servos = port.bus.servos
+    assert servos, "the bus has servos"
+    assert not any(servo.torque_enabled for servo in servos.values())
+
+
+def test_a_whole_experiment_is_recorded_in_order_and_ends_without_torque(
+    arm: Arm, tmp_path: Path, ports: list[Any]
+) -> None:
+    config = arm()
+    made = run(config, tmp_path / "run")
+    assert_no_torque(ports[0])
+    samples = load_samples(made.samples_path, 2)
+    changes = np.flatnonzero(np.diff(samples["phase"], prepend=0))
+    order = [int(phase) for phase in samples["phase"][changes]]
+    twice = [Phase.RAMP_IN, Phase.PERIODIC, Phase.RAMP_OUT]
+    assert order == [Phase.REST, *twice, *twice, Phase.COMING_TO_REST]
+    assert not samples["missing"].any()
+    assert np.allclose(np.diff(samples["deadline"]), 1 / 400)
+    assert np.abs(samples["goal_current"]).max(axis=0) == pytest.approx([0.80 / 1.8, 0.42 / 1.8], abs=2.7e-3)
+    assert np.abs(samples["velocity"][-40:]).max() < 0.1
+
+
+def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: Path) -> None:
+    config = arm()
+    first = load_samples(run(config, tmp_path / "a").samples_path, 2)
+    second = load_samples(run(config, tmp_path / "b").samples_path, 2)
+    assert first.tobytes() == second.tobytes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_arm(arm: Arm, tmp_path: Path, ports: list[Any], number: signal.Signals) -> None:
+    handler = signal.getsignal(number)
+    with pytest.raises(StopRequested) as caught:
+        run(arm(), tmp_path / "run", at_sample(900, lambda: os.kill(os.getpid(), number)))
+    assert_no_torque(ports[0])
+    assert caught.value.__notes__ == ["Torque is off on all 2 servos, read back."]
+    assert 900 <= len(load_samples(tmp_path / "run" / "samples.npy", 2)) < 1000
+    assert signal.getsignal(number) is handler
+
+
+def test_a_fault_of_the_program_stops_the_arm(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run(arm(), tmp_path / "run", at_sample(900, fail))
+    assert_no_torque(ports[0])
+    assert len(load_samples(tmp_path / "run" / "samples.npy", 2)) >= 900
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("[-3.1, 3.1]", "[-0.5, 0.5]"), r"'elbow' \(ID 2.*outside its position limit \[-0\.5, 0\.5\]"),
+        (("velocity_limit = 15.0", "velocity_limit = 2.0"), r"'shoulder' \(ID 1.*velocity limit 2"),
+    ],
+)
+def test_a_limit_stops_the_arm_at_the_sample_that_passed_it(
+    arm: Arm, tmp_path: Path, ports: list[Any], change: tuple[str, str], said: str
+) -> None:
+    with pytest.raises(SafetyStop, match=said):
+        run(arm(change), tmp_path / "run")
+    assert_no_torque(ports[0])
+    samples = load_samples(tmp_path / "run" / "samples.npy", 2)
+    over = (np.abs(samples["position"][:, 1]) > 0.5) | (np.abs(samples["velocity"][:, 0]) > 2.0)
+    looked_at = np.flatnonzero(samples["phase"] != Phase.BRAKING)
+    assert over[looked_at[-1]]
+    assert np.count_nonzero(samples["phase"] == Phase.BRAKING) <= 0.06 * 400
+
+
+def test_a_servo_that_falls_silent_is_named_and_the_other_is_without_torque(
+    arm: Arm, tmp_path: Path, ports: list[Any]
+) -> None:
+    def pull() -> None:
+        ports[0].bus.servos[2].connected = False
+
+    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for JOINT 'ELBOW' \(ID 2") as caught:
+        run(arm(), tmp_path / "run", at_sample(900, pull))
+    assert isinstance(caught.value.__context__, SafetyStop)
+    assert "missed 6 replies" in str(caught.value.__context__)
+    port = ports[0]
+    port.clock.wait_until(port.clock.now() + 0.2)
+    servos = port.bus.servos
+    assert not servos[1].torque_enabled
+    assert servos[2].watchdog_tripped
+    assert servos[2].goal_current_ticks == 0
+
+
+def test_a_pulled_cable_leaves_the_servos_to_their_watchdogs(
+    arm: Arm, tmp_path: Path, ports: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: Any) -> None:
+        raise serial.SerialException("device disconnected")
+
+    def pull() -> None:
+        for method in ("read", "write", "reset_input_buffer"):
+            monkeypatch.setattr(FakeSerial, method, gone)
+
+    with pytest.raises(TorqueNotOff, match=r"NOT CONFIRMED for JOINT 'SHOULDER'.*'ELBOW'.*cut the supply") as caught:
+        run(arm(), tmp_path / "run", at_sample(900, pull))
+    assert isinstance(caught.value.__context__, PortLost)
+    port = ports[0]
+    port.clock.wait_until(port.clock.now() + 0.1)
+    assert all(servo.watchdog_tripped and servo.goal_current_ticks == 0 for servo in port.bus.servos.values())
+    assert len(load_samples(tmp_path / "run" / "samples.npy", 2)) >= 900
+
+
+def test_an_alert_stops_the_arm(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    def overheat() -> None:
+        ports[0].bus.servos[1].temperature_c = 95.0
+
+    with pytest.raises(SafetyStop, match=r"'shoulder' \(ID 1.*alert"):
+        run(arm(), tmp_path / "run", at_sample(900, overheat))
+    assert_no_torque(ports[0])
+
+
+def test_a_motion_that_never_settles_is_said(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    never = ("seed = 1\n", "seed = 1\nsettle_within = 1e-9\nmax_settling_periods = 2\n")
+    with pytest.raises(NotSettled, match=r"After 2 periods of 2 s"):
+        run(arm(never), tmp_path / "run")
+    assert_no_torque(ports[0])
+
+
+# Before torque is ever on
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "said"),
+    [
+        (("id = 2", "id = 7"), NoReply, r"'elbow' \(ID 7, XM430-W350\) does not answer at 1000000 baud"),
+        (("baud = 1_000_000", "baud = 57600"), NoReply, r"'shoulder' \(ID 1.*at 57600 baud"),
+        (('model = "XM430-W350"', 'model = "XM540-W270"'), WrongModel, r"a XM430-W350 answers at ID 1"),
+        (("rest_pose = [-1.5707963, 0.0]", "rest_pose = [-1.5707963, 0.5]"), ExperimentError, r"set zero_ticks = 1722"),
+        ((SERVO_1, SERVO_1 + 'registers = { "Drive Mode" = 8 }\n'), WrongSetting, r"'shoulder'.*Drive Mode is 8"),
+        ((SERVO_1, SERVO_1 + "input_voltage_v = 5.0\n"), ServoFault, r"'shoulder' \(ID 1.*input voltage"),
+    ],
+)
+def test_what_forbids_an_experiment_is_found_before_torque(
+    arm: Arm, tmp_path: Path, ports: list[Any], change: tuple[str, str], kind: type[Exception], said: str
+) -> None:
+    with pytest.raises(kind, match=said):
+        run(arm(change), tmp_path / "run")
+    assert_no_torque(ports[0])
+    assert ports[0].bus.plant.position == pytest.approx([-np.pi / 2, 0.0], abs=1e-3), "the arm did not move"
+
+
+def test_a_servo_in_another_mode_is_brought_into_current_mode(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    run(arm(), tmp_path / "run")  # the fake, as servos from the factory, starts in position mode
+    assert [servo.operating_mode for servo in ports[0].bus.servos.values()] == [0, 0]
+
+
+def test_factory_return_delay_is_waited_for(arm: Arm, tmp_path: Path) -> None:
+    slow = ("zero_ticks = 2048\n\n[fake.arm]", "zero_ticks = 2048\nreturn_delay_us = 500\n\n[fake.arm]")
+    samples = load_samples(run(arm(slow), tmp_path / "run").samples_path, 2)
+    assert not samples["missing"].any()
+
+
+def test_a_run_folder_that_is_taken_or_not_writable(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
+    config = arm()
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "something").touch()
+    with pytest.raises(RunFolderError, match="not empty"):
+        RunFolder.create(taken, config)
+    with pytest.raises(RunFolderError, match="cannot be written"):
+        RunFolder.create(taken / "something" / "run", config)
+    assert ports == []
+
+
+def test_driver_errors_are_one_family() -> None:
+    assert issubclass(TorqueNotOff, DriverError)
+    assert not issubclass(TorqueNotOff, ExperimentError)

@@ -1,0 +1,250 @@
+"""scan, check and setup on the fake bus: what they find, what they change, and what they leave alone."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+from typer.testing import CliRunner
+
+from hil import fakes
+from hil.cli.app import app
+from hil.config.schema import Config
+from hil.drivers.errors import NoReply, WrongSetting
+from hil.drivers.port import Port, open_port
+from hil.fakes.bus.bus import FakeBus
+from hil.setup.preflight import Finding, Level, check_arm
+from hil.setup.scan import scan
+from hil.setup.servo_settings import open_servo, set_up
+
+Arm = Callable[..., Config]
+ArmFile = Callable[..., Path]
+
+SERVO_2 = 'id = 2\nmodel = "XM430-W350"\nzero_ticks = 2048\n'
+
+
+@pytest.fixture
+def port(arm_file: ArmFile) -> Iterator[Callable[..., Port]]:
+    """Opens the port of the fake arm with changes to its TOML; `._serial.bus` are its servos."""
+    opened = []
+    fakes.register()
+
+    def make(*changes: tuple[str, str], baud: int = 1_000_000) -> Port:
+        opened.append(open_port(f"fake://{arm_file(*changes)}", baud))
+        return opened[-1]
+
+    yield make
+    for each in opened:
+        each.close()
+
+
+def invoke(*words: object, answer: str = "") -> Any:
+    return CliRunner().invoke(app, [str(word) for word in words], input=answer)
+
+
+# scan
+
+
+def test_scan_finds_servos_at_every_baud(port: Callable[..., Port]) -> None:
+    heard = list(scan(port((SERVO_2, SERVO_2 + "baud = 57600\ninput_voltage_v = 11.5\n"))))
+    found = {(servo.baud, servo.id): servo for each in heard for servo in each.servos}
+    assert set(found) == {(57_600, 2), (1_000_000, 1)}
+    elbow = found[57_600, 2]
+    assert (elbow.model, elbow.firmware, elbow.temperature, elbow.trouble) == ("XM430-W350", 48, 35.0, "")
+    assert elbow.voltage == pytest.approx(11.5)
+    assert len(heard) == 8
+
+
+def test_scan_says_what_ails_a_servo(port: Callable[..., Port]) -> None:
+    (heard,) = scan(port((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n")), [1_000_000])
+    assert heard.servos[1].trouble == "hardware error: input voltage; reboot it"
+
+
+def test_scan_hears_that_answers_are_damaged(port: Callable[..., Port], monkeypatch: pytest.MonkeyPatch) -> None:
+    read = FakeBus.read
+    monkeypatch.setattr(FakeBus, "read", lambda bus, *a: read(bus, *a).replace(b"\x55", b"\x54"))
+    (heard,) = scan(port(), [1_000_000])
+    assert heard.servos == ()
+    assert "same ID" in heard.trouble
+
+
+def test_scan_goes_past_a_baud_that_the_adapter_cannot_do(
+    port: Callable[..., Port], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = port()
+    reconfigure = opened._serial._reconfigure_port
+
+    def refuse(*words: Any) -> None:
+        if opened._serial.baudrate == 4_500_000:
+            raise ValueError("Invalid baud rate")
+        reconfigure(*words)
+
+    monkeypatch.setattr(opened._serial, "_reconfigure_port", refuse)
+    refused, fine = scan(opened, [4_500_000, 1_000_000])
+    assert "4500000 baud" in refused.trouble
+    assert len(fine.servos) == 2
+
+
+def test_scan_command(arm_file: ArmFile) -> None:
+    result = invoke("scan", arm_file(), "--baud", 1_000_000, "--json")
+    assert result.exit_code == 0
+    assert [servo["id"] for servo in json.loads(result.stdout)["servos"]] == [1, 2]
+    result = invoke("scan", arm_file(), "--baud", 9600)
+    assert result.exit_code == 1
+    assert "No servo answers" in result.stdout
+
+
+# check
+
+
+def look(config: Config) -> dict[tuple[str, str], Finding]:
+    fakes.register()
+    return {(finding.where.split(" (")[0], finding.what): finding for finding in check_arm(config)}
+
+
+def test_a_healthy_arm_is_ready(arm: Arm) -> None:
+    found = look(arm())
+    assert {finding.level for finding in found.values()} == {Level.OK}
+    assert "400 Hz wanted, 900 Hz possible with Fast Sync Read, one write" in found["bus", "rate"].found
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "level", "mend"),
+    [
+        ((SERVO_2, SERVO_2 + "return_delay_us = 500\n"), "return delay", Level.WARNING, "--return-delay-us 0"),
+        ((SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 8 }\n'), "drive mode", Level.STOP, "torque on"),
+        ((SERVO_2, SERVO_2 + 'registers = { "Current Limit" = 100 }\n'), "current limit", Level.STOP, "is 0.8 A"),
+        ((SERVO_2, SERVO_2 + 'registers = { "Shutdown" = 0 }\n'), "shuts down on", Level.WARNING, "factory value"),
+        ((SERVO_2, SERVO_2 + "temperature_c = 79.0\n"), "temperature", Level.WARNING, "cool down"),
+        ((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n"), "voltage", Level.STOP, "supply"),
+        ((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n"), "hardware error", Level.STOP, "rebooted"),
+        ((SERVO_2, SERVO_2 + "firmware = 38\n"), "firmware", Level.OK, ""),
+        ((SERVO_2, SERVO_2.replace("2048", "3000")), "pose", Level.STOP, "zero_ticks = 3000"),
+        (("id = 2", "id = 7"), "answers", Level.STOP, "hil scan"),
+        (('model = "XM430-W350"', 'model = "XM540-W270"'), "model", Level.STOP, "Correct `model`"),
+    ],
+)
+def test_what_would_stop_an_experiment_is_found_with_how_to_mend_it(
+    arm: Arm, change: tuple[str, str], what: str, level: Level, mend: str
+) -> None:
+    found = look(arm(change))
+    finding = next(finding for (where, each), finding in found.items() if each == what and finding.level is level)
+    assert mend in finding.mend
+    if level is Level.STOP:
+        assert "Mend what stops the servos first" in found["bus", "rate"].mend
+
+
+def test_a_rate_that_the_bus_cannot_hold_is_a_stop_with_the_rate_that_it_can(arm: Arm) -> None:
+    found = look(arm(("rate = 400.0", "rate = 1200.0")))
+    assert found["bus", "rate"].level is Level.STOP
+    assert found["bus", "rate"].mend.startswith("Set experiment.rate to at most 900")
+
+
+def test_an_arm_that_needs_two_writes_is_found(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bus that hears only the first packet of a write."""
+    write = FakeBus.write
+    monkeypatch.setattr(FakeBus, "write", lambda bus, data: write(bus, data[: 7 + (data[5] | data[6] << 8)]))
+    finding = look(arm())["bus", "rate"]
+    assert finding.level is Level.STOP
+    assert finding.mend == "Set port.one_write = false and port.fast_sync_read = true."
+
+
+def test_check_changes_nothing(arm: Arm, ports: list[Any]) -> None:
+    look(arm())
+    servos = ports[0].bus.servos.values()
+    assert all(servo.read(11, 1)[1] == b"\x03" for servo in servos), "still in position mode"
+    assert not any(servo.torque_enabled for servo in servos)
+
+
+def test_check_does_not_touch_an_arm_that_somebody_drives(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    open_port = serial.serial_for_url
+
+    def driven(*args: Any, **kwargs: Any) -> Any:
+        port = open_port(*args, **kwargs)
+        for servo in port.bus.servos.values():
+            servo.write(64, b"\1")
+        return port
+
+    monkeypatch.setattr(serial, "serial_for_url", driven)
+    found = look(arm())
+    assert found["joint 'elbow'", "torque"].level is Level.STOP
+    assert found["bus", "rate"].found == "not measured"
+
+
+def test_a_port_that_does_not_open_is_a_finding(arm: Arm) -> None:
+    found = look(arm(('url = "fake://"', 'url = "/dev/no-such-port"')))
+    assert found["/dev/no-such-port", "port"].level is Level.STOP
+
+
+def test_check_command(arm_file: ArmFile) -> None:
+    result = invoke("check", arm_file())
+    assert result.exit_code == 0
+    assert "Next: hil identify" in result.stdout
+    result = invoke("check", arm_file((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n")), "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["ready"] is False
+
+
+# setup
+
+
+def test_everything_is_set_after_a_question_each_and_read_back(port: Callable[..., Port]) -> None:
+    asked: list[str] = []
+
+    def yes(question: str) -> bool:
+        asked.append(question)
+        return True
+
+    opened = port()
+    changes = set_up(open_servo(opened, 2), yes, new_id=9, new_baud=57_600, return_delay_us=20)
+    assert [(change.register, change.written) for change in changes] == [
+        ("Return Delay Time", True),
+        ("ID", True),
+        ("Baud Rate", True),
+    ]
+    assert len(asked) == 3
+    assert opened.baud == 57_600
+    assert open_servo(opened, 9).read("Return Delay Time") == 10
+
+
+def test_nothing_is_written_without_a_yes(port: Callable[..., Port]) -> None:
+    opened = port()
+    changes = set_up(open_servo(opened, 2), lambda _: False, new_id=9, new_baud=57_600, return_delay_us=20)
+    assert not any(change.written for change in changes)
+    assert open_servo(opened, 2).read("Return Delay Time") == 0
+
+
+def test_what_is_so_already_is_not_asked_for(port: Callable[..., Port]) -> None:
+    def never(question: str) -> bool:
+        raise AssertionError(question)
+
+    changes = set_up(open_servo(port(), 2), never, new_id=2, new_baud=1_000_000, return_delay_us=0)
+    assert not any(change.written for change in changes)
+
+
+def test_an_id_that_is_taken_is_not_given_twice(port: Callable[..., Port]) -> None:
+    with pytest.raises(WrongSetting, match="ID 1 is taken"):
+        set_up(open_servo(port(), 2), lambda _: True, new_id=1, new_baud=None, return_delay_us=None)
+
+
+def test_a_servo_with_torque_is_left_alone(port: Callable[..., Port]) -> None:
+    opened = port()
+    open_servo(opened, 2).write("Torque Enable", 1)
+    with pytest.raises(WrongSetting, match="torque on"):
+        open_servo(opened, 2)
+
+
+def test_a_servo_that_is_not_there(port: Callable[..., Port]) -> None:
+    with pytest.raises(NoReply, match="The servo with ID 5 does not answer"):
+        open_servo(port(), 5)
+
+
+def test_setup_command_asks(arm_file: ArmFile) -> None:
+    words = ("setup", arm_file(), "--id", 2, "--new-id", 9)
+    assert "left at 2" in invoke(*words, answer="n\n").stdout
+    assert "2 -> 9, read back" in invoke(*words, answer="y\n").stdout
+    assert json.loads(invoke(*words, "--yes", "--json").stdout)["changes"][0]["written"] is True
+    assert invoke(*words, "--json").exit_code == 2
+    assert invoke("setup", arm_file(), "--id", 2, "--new-baud", 12345).exit_code == 2

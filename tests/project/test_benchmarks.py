@@ -1,0 +1,20 @@
+"""The scripts behind the printed figures still start: each one's --help imports all that it measures."""
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.support.paths import ROOT
+
+BENCHMARKS = ROOT / "benchmarks"
+SHARED = ("__init__", "elastic_slip", "machine", "pty", "recorded_arm")
+SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if path.stem not in SHARED)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_benchmark_starts(name: str) -> None:
+    command = [sys.executable, str(BENCHMARKS / f"{name}.py"), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=BENCHMARKS.parent, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr[-500:]
+    assert "--json" in done.stdout

@@ -1,0 +1,173 @@
+"""Every command in the README and the docs, run as a reader would, on the fake bus; and what they say of the code."""
+
+import ast
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hil.cli.app import main
+from tests.support.paths import ROOT
+
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SHORT = (("period = 10.0 ", "period = 5.0 "), ("band = [0.1, 5.0]", "band = [0.2, 5.0]"))
+
+RUN_ELSEWHERE = {
+    "sudo": "changes the machine",
+    "git": "needs the repository's address",
+    "make": "test_make_targets_exist; CI runs make test",
+    "pip": "test_packaging installs into a clean environment",
+    "python3": "test_packaging makes a clean environment",
+    ".venv/bin/python": "test_packaging, CI",
+    "mkdocs": "test_the_site_builds",
+}
+"""Commands that these tests do not run as they stand, and why or where they are run."""
+
+
+def commands(document: Path) -> Iterator[str]:
+    """Shell lines in fenced `sh` blocks, indented blocks and workflow steps."""
+    text = document.read_text(encoding="utf-8")
+    for block in re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        yield from filter(None, map(str.strip, block.splitlines()))
+    unfenced = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    for line in re.findall(r"^ {4}((?:hil|make|python3?|pip|sudo|git|\.venv/bin/\S+) .*)$", unfenced, re.MULTILINE):
+        yield line.split("  #")[0].strip()
+    yield from re.findall(r"^- run: (.*)$", text, re.MULTILINE)
+
+
+@pytest.fixture
+def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that looks like a checkout, with the fake arms' periods cut short, and a finished run."""
+    here = tmp_path / "place"
+    (here / "configs").mkdir(parents=True)
+    for path in (ROOT / "configs").glob("*.toml"):
+        text = path.read_text(encoding="utf-8")
+        if path.stem.startswith("fake"):
+            text = cut_short(text)
+            (here / path.stem).write_text(text, encoding="utf-8")  # found before the bundled one of that name
+        (here / "configs" / path.name).write_text(text, encoding="utf-8")
+    new = text_of_new_servos((here / "configs" / "fake_two_link.toml").read_text(encoding="utf-8"))
+    (here / "configs" / "new.toml").write_text(new, encoding="utf-8")
+    (here / "examples").symlink_to(ROOT / "examples")
+    (here / "runs").mkdir()
+    identified.rename(here / "runs" / "finished")
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    return here
+
+
+def text_of_new_servos(text: str) -> str:
+    """The same arm with servos as they come from the factory, at 57600 baud, and with ID 2 still free."""
+    new = text.replace("[[fake.servos]]\n", "[[fake.servos]]\nbaud = 57600\n")
+    return new.replace("baud = 57600\nid = 2", "baud = 57600\nid = 9")
+
+
+def cut_short(text: str) -> str:
+    for old, new in SHORT:
+        text = text.replace(old, new, 1)
+    return text
+
+
+def as_here(command: str) -> list[str]:
+    """The command's words for the fake bus: a real port becomes the fake arm, a question is answered with yes."""
+    words = shlex.split(re.sub(r" > \S+$", "", command))
+    port = "configs/new.toml" if "57600" in words else "configs/fake_two_link.toml"
+    words = [re.sub(r"^/dev/tty\w+$", port, word) for word in words]
+    words = [re.sub(r"^runs/\d{8}-\d{6}-\w+$", "runs/finished", word) for word in words]
+    if words[0] == ".venv/bin/hil":
+        words[0] = "hil"
+    if words[:2] in (["hil", "setup"], ["hil", "init"]):
+        words.append("--yes")
+    return words
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_commands_run(document: Path, place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if not Path("my_arm.toml").exists() and document.name != "first_evening.md":
+        Path("my_arm.toml").write_text(Path("configs/fake_two_link.toml").read_text("utf-8"), "utf-8")
+        Path("first_run").symlink_to("runs/finished")
+    for command in commands(document):
+        words = as_here(command)
+        if words[0] == "hil" and words[1] != "fake":
+            sys.argv = words
+            with pytest.raises(SystemExit) as caught:
+                main()
+            printed = capsys.readouterr()
+            assert not caught.value.code, f"{command}: {printed.out[-500:]}{printed.err[-1000:]}"
+            if words[1] == "init":
+                mine = Path("my_arm.toml")
+                mine.write_text(cut_short(mine.read_text(encoding="utf-8")), encoding="utf-8")
+        elif words[0] == "hil":
+            serve(words)
+        elif words[0] == "python" and words[1].startswith("examples/"):
+            environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+            command_line = [sys.executable, *words[1:], "runs/finished"]
+            subprocess.run(command_line, check=True, capture_output=True, env=environment)
+        elif words[0] == "python":
+            ast.parse((ROOT / words[1]).read_text(encoding="utf-8"))  # a benchmark: run by hand, it takes minutes
+        else:
+            assert words[0] in RUN_ELSEWHERE, f"{document.name}: nothing runs {command!r}"
+
+
+def serve(words: list[str]) -> None:
+    """A command that goes on until it is stopped must still be there after a moment, and end when asked to."""
+    with subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        try:
+            process.wait(timeout=2)
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            return
+        assert process.stdout is not None
+        assert process.returncode == 0, process.stdout.read()
+
+
+def test_make_targets_exist() -> None:
+    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for document in DOCUMENTS:
+        wanted = {command.split()[1] for command in commands(document) if command.startswith("make ")}
+        assert wanted <= targets, document.name
+
+
+def test_python_blocks_are_python() -> None:
+    for document in DOCUMENTS:
+        for block in re.findall(r"^```python\n(.*?)^```", document.read_text(encoding="utf-8"), re.M | re.S):
+            ast.parse(block)
+
+
+def test_every_subcommand_is_described() -> None:
+    text = "\n".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
+    source = (ROOT / "hil" / "cli" / "app.py").read_text(encoding="utf-8")
+    for name in re.findall(r'epilog="Example: hil (\S+)', source):
+        assert f"hil {name}" in text, f"hil {name} is in no document"
+
+
+def test_every_core_dependency_has_a_reason() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    page = (ROOT / "docs" / "dependencies.md").read_text(encoding="utf-8")
+    for requirement in project["dependencies"]:
+        name = re.match(r"[\w-]+", requirement)
+        assert name and f"| `{name[0]}` |" in page, requirement
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    for document in DOCUMENTS:
+        for link in re.findall(r"\]\(([^)#:]+)(?:#[\w-]+)?\)", document.read_text(encoding="utf-8")):
+            assert (document.parent / link).exists(), f"{document.name}: {link}"
+
+
+def test_the_site_builds(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed: pip install 'hil[docs]'")
+    pytest.importorskip("mkdocstrings", reason="mkdocstrings is not installed: pip install 'hil[docs]'")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "site" / "commands" / "index.html").read_text(encoding="utf-8")
+    assert "hil identify" in page and "hil export" in page
+    outside = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="(https?://[^"]+)"', page)
+    assert not [url for url in outside if "canonical" not in url], outside

@@ -1,0 +1,41 @@
+"""The examples, on the realistic fake arm: what they print must show that the model helps."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil.config.bundled import bundled_configs
+from hil.config.schema import load_config
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import ROOT
+
+EXAMPLES = ROOT / "examples"
+LEAST_IMPROVEMENT = 3.0
+
+
+@pytest.fixture(scope="module")
+def realistic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of the realistic fake arm with a shorter period."""
+    folder = tmp_path_factory.mktemp("realistic")
+    text = bundled_configs()["fake_two_link"].read_text(encoding="utf-8")
+    path = folder / "arm.toml"
+    path.write_text(text.replace("period = 10.0 ", "period = 4.0 ").replace("[0.1, 5.0]", "[0.25, 5.0]"), "utf-8")
+    config = load_config(path)
+    run = RunFolder.create(folder / "run", config)
+    run_experiment(config, run, path, lambda _: None)
+    estimate_run(run)
+    return run.path
+
+
+@pytest.mark.parametrize("name", ["feed_forward", "gravity_compensation"])
+def test_the_model_makes_errors_several_times_smaller(name: str, realistic: Path, tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(realistic)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    times = [float(found) for found in re.findall(r"([\d.]+) times smaller", done.stdout)]
+    assert len(times) == 2
+    assert min(times) >= LEAST_IMPROVEMENT, done.stdout

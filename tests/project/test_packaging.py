@@ -1,0 +1,94 @@
+"""The wheel as a stranger gets it: small, whole, and running without a checkout; imports that stay quick."""
+
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import hil
+from hil.config.bundled import bundled_configs, find_config
+from hil.config.schema import load_config
+from tests.support.paths import ROOT
+
+MOST_BYTES = 1_000_000
+MOST_IMPORT_SECONDS = 0.3
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("hatchling", reason="hatchling is not installed: pip install hatchling")
+    folder = tmp_path_factory.mktemp("wheel")
+    code = f"import hatchling.build; print(hatchling.build.build_wheel({str(folder)!r}))"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def test_the_wheel_is_small_and_whole(wheel: Path) -> None:
+    assert wheel.stat().st_size < MOST_BYTES
+    assert hil.__version__ in wheel.name
+    names = zipfile.ZipFile(wheel).namelist()
+    for needed in ("hil/configs/fake_two_link.toml", "hil/report/page.js", "hil/py.typed", "hil/estimator/identify.py"):
+        assert needed in names
+    assert not [name for name in names if name.startswith("tests") or "/runs/" in name]
+
+
+def test_a_bundled_arm_is_checked_by_name_without_a_checkout(wheel: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
+    code = (
+        "import sys, hil.cli.app; print(hil.__file__); sys.argv = ['hil', 'check', 'fake_two_link']; hil.cli.app.main()"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True)
+    assert done.stdout.startswith(str(tmp_path / "installed"))
+
+
+@pytest.mark.slow
+def test_a_clean_environment_identifies_a_bundled_arm(wheel: Path, tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    subprocess.run([python, "-m", "pip", "install", "--quiet", wheel], check=True, cwd=tmp_path)
+    command = [tmp_path / "venv" / "bin" / "hil", "identify", "fake_two_link", "--out", "run"]
+    subprocess.run(command, check=True, cwd=tmp_path)
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_a_bare_name_is_a_file_first_and_a_bundled_arm_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_config(Path("fake_two_link")) == bundled_configs()["fake_two_link"]
+    assert find_config(Path("no_such_arm")) == Path("no_such_arm")
+    assert find_config(Path("fake_two_link.toml")) == Path("fake_two_link.toml")
+    Path("fake_two_link").touch()
+    assert find_config(Path("fake_two_link")) == Path("fake_two_link")
+
+
+def test_import_is_quick() -> None:
+    code = "import time; start = time.perf_counter(); import hil; print(time.perf_counter() - start)"
+    seconds = min(float(subprocess.check_output([sys.executable, "-c", code])) for _ in range(3))
+    assert seconds < MOST_IMPORT_SECONDS
+
+
+def test_every_bundled_configuration_is_valid() -> None:
+    assert bundled_configs()
+    for path in bundled_configs().values():
+        config = load_config(path)
+        said = "not tested on hardware" in path.read_text(encoding="utf-8")
+        assert said != config.is_fake, f"{path.name} must say whether it was tested on hardware"
+
+
+def test_version_changelog_and_citation_agree() -> None:
+    assert f"## {hil.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    cited = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    assert cited and cited[1] == hil.__version__
+
+
+def test_shell_completion_is_offered() -> None:
+    environment = {**os.environ, "_HIL_COMPLETE": "complete_bash", "COMP_WORDS": "hil exp", "COMP_CWORD": "1"}
+    hil_command = Path(sys.executable).with_name("hil")
+    done = subprocess.run([hil_command], env=environment, capture_output=True, text=True, check=False)
+    assert "export" in done.stdout
