@@ -6,11 +6,8 @@ from random import Random
 from struct import Struct
 
 from hil.drivers.packet import StatusError
-<<<<<<< HEAD
-from hil.fakes.servo.encoder import Reading
-=======
 from hil.fakes.servo.controller import POSITION_MODE
->>>>>>> fakebus
+from hil.fakes.servo.encoder import Reading
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
 

@@ -18,7 +18,7 @@ module decides as follows, choosing what asks more of a client:
 - When torque comes on, Goal Position becomes Present Position.
 - Reverse mode (Drive Mode bit 0) mirrors positions about half a turn, on the 540 series and XW430 velocity, current and
   PWM too.
-- Through the Secondary ID nothing of the EEPROM changes (e-Manual): writes to it, Factory Reset and Restore are ignored.
+- Through the Secondary ID nothing of the EEPROM changes (e-Manual): writes, Factory Reset and Restore are ignored.
 
 A model without a current sensor (XL430-W250) has no current mode and reads a Present Load of 0.
 """
@@ -28,12 +28,8 @@ from random import Random
 
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.fakes.servo.backup import Backup, factory_reset
-<<<<<<< HEAD
-from hil.fakes.servo.controller import CURRENT_MODE, Controller, Goals
-from hil.fakes.servo.encoder import PERFECT, Encoder, Reading
-=======
 from hil.fakes.servo.controller import CURRENT_MODE, POSITION_MODE, POSITION_MODES, Controller, Goals
->>>>>>> fakebus
+from hil.fakes.servo.encoder import PERFECT, Encoder, Reading
 from hil.fakes.servo.health import Health, Overload, Thermal
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.power import Powered
@@ -96,11 +92,6 @@ class Servo(Powered):
         """When the last instruction packet reached it [s]; the Bus Watchdog counts from here."""
         self.ready_at = 0.0
         """When it has booted [s]; deaf before."""
-<<<<<<< HEAD
-        self.memory = Memory(model)
-=======
-        noise = Random(f"current {seed} {servo_id}") if current_noise_a else None
->>>>>>> fakebus
         self.present = Present(
             *(self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a),
             Random(f"current {seed} {servo_id}") if current_noise_a else None,
