@@ -9,6 +9,7 @@ from hil.config.schema import Config
 from hil.dry_run.prior import base_draws
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import term_of
 from hil.results.result import Result
 
 Array = NDArray[np.float64]
@@ -21,7 +22,6 @@ many times farther than it was identified the model is to be trusted.
 _LEAST_SHARE = 0.05  # of its value, below which no draw of a positive parameter may fall
 _LEAST_WIDTH = 0.01  # rad/s of friction's step: narrower ones move the arm alike and take longer to simulate
 _MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2)
-_EITHER_SIGN = ("offset", "gravity", "delay", "coupling")
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ def nominal(result: Result) -> Physics:
 def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, float]:
     """A draw moved into the range of real arms."""
     for name, value in drawn.items():
-        if not name.startswith(_EITHER_SIGN):
+        if term_of(name).range in {"positive", "floor"}:
             centre = abs(known[name])
-            least = _LEAST_WIDTH if name.startswith("coulomb_width") else 1e-9
+            least = _LEAST_WIDTH if term_of(name).range == "floor" else 1e-9
             drawn[name] = max(value, _LEAST_SHARE * centre, least)
     if "coupling" in drawn:
         most = _MOST_COUPLING * float(np.sqrt(drawn["inertia_1"] * drawn["inertia_2"]))

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hil.estimator.models.physical_parameters import UNITS, Known, physical_quantities
-from hil.estimator.models.regressor import RIGID_BODY
+from hil.estimator.models.physical_parameters import QUANTITY_UNITS, Known, physical_quantities
+from hil.estimator.models.terms import RIGID_BODY
 from hil.results.parts import Physical, PhysicalQuantity
 from hil.results.result import Result
 
@@ -28,7 +28,7 @@ def physical_of(result: Result, known: Mapping[str, Known], gravity: float) -> P
 
 def unit_of(name: str) -> str:
     """SI unit of a quantity by its name."""
-    return UNITS[name.rsplit("_", 1)[0]]
+    return QUANTITY_UNITS[name.rsplit("_", 1)[0]]
 
 
 def physical_lines(physical: Physical) -> list[str]:

@@ -80,7 +80,7 @@ def _estimate(
         estimate = choice.estimate
     else:
         # The encoders' zeros are each recording's own here.
-        model = replace(wanted_model(wanted, recordings[0].joints), zeros=False)
+        model = wanted_model(wanted, recordings[0].joints).without("zeros")
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3))
     result = replace(result, warnings=tuple(any_warnings(recordings, estimate)))
