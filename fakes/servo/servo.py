@@ -18,7 +18,7 @@ module decides as follows, choosing what asks more of a client:
 - When torque comes on, Goal Position becomes Present Position.
 - Reverse mode (Drive Mode bit 0) mirrors positions about half a turn, on the 540 series and XW430 velocity, current and
   PWM too.
-- Through the Secondary ID nothing of the EEPROM changes (e-Manual): writes to it, Factory Reset and Restore are ignored.
+- Nothing of the EEPROM changes through the Secondary ID (e-Manual): writes to it, Factory Reset, Restore are ignored.
 
 A model without a current sensor (XL430-W250) has no current mode and reads a Present Load of 0.
 """

@@ -1,5 +1,6 @@
 """Bytes heard at another baud than they were sent at."""
 
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -26,14 +27,14 @@ def test_two_per_cent_off_is_still_understood(data: bytes, off: float) -> None:
 
 def test_a_faster_receiver_hears_one_byte_in_many_pieces() -> None:
     # 0x00 at 9600 is low for 9 bits: at 115200 that is 108 bits of break, received as zeros with broken stop bits.
-    assert set(byte for byte, _ in heard(b"\x00", 9_600, 115_200)) <= {0x00}
+    assert {byte for byte, _ in heard(b"\x00", 9_600, 115_200)} <= {0x00}
     assert heard(b"\xff", 9_600, 115_200)[0][0] == 0x00  # the start bit alone lasts for a byte
 
 
 @given(st.binary(max_size=60), st.sampled_from(RATES), st.sampled_from(RATES))
 def test_what_is_heard_is_over_with_the_line(data: bytes, sent: int, at: int) -> None:
     received = heard(data, sent, at)
-    assert all(later > earlier for (_, earlier), (_, later) in zip(received, received[1:], strict=False))
+    assert all(later > earlier for (_, earlier), (_, later) in pairwise(received))
     assert len(received) <= max(1, 10 * len(data) * at / sent)
 
 
