@@ -14,6 +14,7 @@ from hil.fakes.bus.hand import Move
 from hil.fakes.bus.supply import Supply
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_plant
+from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import Servo
@@ -47,6 +48,11 @@ class FakeServo(BaseModel):
     ] = None
     temperature_c: Annotated[float, Field(ge=0, le=255, description="inside the servo [C]")] = 35.0
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
+    senses_supply: Annotated[
+        bool | None,
+        Field(description="whether Present Current is the supply's and not the motor's; as its model has it if absent"),
+    ] = None
+    encoder: Annotated[Encoder, Field(description="errors of Present Position; none unless given")] = PERFECT
     clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="how much too fast its clock runs")] = 0.0
     voltage_limited: Annotated[
         bool, Field(description="whether supply voltage and back-EMF limit the current in current mode too")
@@ -196,6 +202,8 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
             temperature_c=servo.temperature_c,
             registers=servo.registers,
             current_noise_a=servo.current_noise_a,
+            encoder=servo.encoder,
+            senses_supply=servo.senses_supply,
             clock_error_ppm=servo.clock_error_ppm,
             voltage_limited=servo.voltage_limited,
             thermal=servo.thermal,

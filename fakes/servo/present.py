@@ -7,6 +7,7 @@ from struct import Struct
 
 from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE
+from hil.fakes.servo.encoder import Reading
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
 
@@ -46,6 +47,8 @@ class Present:
         clock_rate: float,
         current_noise_a: float,
         noise: Random | None,
+        encoder: Reading,
+        senses_supply: bool,
     ) -> None:
         self.zero_ticks = zero_ticks
         self.direction = direction
@@ -61,7 +64,10 @@ class Present:
         self._noise_a = current_noise_a
         self._noise = noise
         self._unit = model.current_unit_a
-        self._imperfect = noise is not None or model.senses_supply
+        self._encoder = encoder
+        self._encoder_is_perfect = encoder.is_perfect
+        self._senses_supply = senses_supply
+        self._imperfect = noise is not None or senses_supply
         self._booted_at = 0.0
         self._turn_ticks = 0
         self._shift = 0
@@ -97,8 +103,8 @@ class Present:
         return StatusError.NONE
 
     def ticks(self, position: float) -> float:
-        """Present Position at a joint angle [rad], before rounding."""
-        ticks = self.zero_ticks + self.direction * position * _TICKS_PER_RAD
+        """Present Position at a joint angle [rad], before rounding and without noise."""
+        ticks = self._encoder.steady(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
         return (TICKS_PER_TURN - ticks if self._reversed else ticks) + self._shift
 
     def angle(self, ticks: float) -> float:
@@ -127,7 +133,8 @@ class Present:
             ticks = round(sign * current / unit)
             if ticks > 32_767 or ticks < -32_768:
                 ticks = -32_768 if ticks < 0 else 32_767
-        encoder = round(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
+        angle = self.zero_ticks + self.direction * position * _TICKS_PER_RAD
+        encoder = round(angle if self._encoder_is_perfect else self._encoder.sample(angle))
         if self._reversed:
             encoder = TICKS_PER_TURN - encoder
         return _STATE.pack(ticks, round(sign * velocity * _TICKS_PER_RAD_S), encoder + self._shift + self.jump_ticks)
@@ -154,7 +161,7 @@ class Present:
         """What the current sensor makes of the motor's current [A]."""
         if self._noise is not None:
             current += self._noise.gauss(0.0, self._noise_a)
-        if self._model.senses_supply:
+        if self._senses_supply:
             current *= abs(self._share(current, velocity))
         return current
 

@@ -18,7 +18,7 @@ module decides as follows, choosing what asks more of a client:
 - When torque comes on, Goal Position becomes Present Position.
 - Reverse mode (Drive Mode bit 0) mirrors positions about half a turn, on the 540 series and XW430 velocity, current and
   PWM too.
-- Nothing of the EEPROM changes through the Secondary ID (e-Manual): writes to it, Factory Reset, Restore are ignored.
+- Through the Secondary ID nothing of the EEPROM changes (e-Manual): writes, Factory Reset and Restore are ignored.
 
 A model without a current sensor (XL430-W250) has no current mode and reads a Present Load of 0.
 """
@@ -29,6 +29,7 @@ from random import Random
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.fakes.servo.backup import Backup, factory_reset
 from hil.fakes.servo.controller import CURRENT_MODE, POSITION_MODE, POSITION_MODES, Controller, Goals
+from hil.fakes.servo.encoder import PERFECT, Encoder, Reading
 from hil.fakes.servo.health import Health, Overload, Thermal
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.power import Powered
@@ -54,10 +55,7 @@ _RESTORE_AT_BOOT = 0x02
 class Servo(Powered):
     """A servo on its own: registers, what may be done to them, and what the motor is told to do.
 
-    Times are seconds on the bus's clock. `direction` is -1 where the servo turns against its joint; `zero_ticks` is the
-    Present Position (Homing Offset 0) at which the joint's angle is 0. `current_noise_a` is the standard deviation of
-    Present Current [A], `clock_error_ppm` how much too fast its own clock runs, `voltage_limited` whether the supply
-    limits the current in current mode too. `seed` is of the noise.
+    Times are seconds on the bus's clock; what it is made with is said in `hil.fakes.description.FakeServo`.
     """
 
     def __init__(
@@ -74,6 +72,8 @@ class Servo(Powered):
         temperature_c: float = 35.0,
         registers: Mapping[str, int] | None = None,
         current_noise_a: float = 0.0,
+        encoder: Encoder = PERFECT,
+        senses_supply: bool | None = None,
         clock_error_ppm: float = 0.0,
         voltage_limited: bool = False,
         thermal: Thermal | None = None,
@@ -92,9 +92,11 @@ class Servo(Powered):
         """When the last instruction packet reached it [s]; the Bus Watchdog counts from here."""
         self.ready_at = 0.0
         """When it has booted [s]; deaf before."""
-        noise = Random(f"current {seed} {servo_id}") if current_noise_a else None
         self.present = Present(
-            self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a, noise
+            *(self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a),
+            Random(f"current {seed} {servo_id}") if current_noise_a else None,
+            Reading(encoder, f"encoder {seed} {servo_id}"),
+            model.senses_supply if senses_supply is None else senses_supply,
         )
         self.controller = Controller()
         self.motor_current_a = 0.0

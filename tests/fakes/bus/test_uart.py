@@ -1,6 +1,6 @@
 """Bytes heard at another baud than they were sent at."""
 
-from itertools import pairwise
+import itertools
 from typing import Any
 
 import pytest
@@ -34,7 +34,7 @@ def test_a_faster_receiver_hears_one_byte_in_many_pieces() -> None:
 @given(st.binary(max_size=60), st.sampled_from(RATES), st.sampled_from(RATES))
 def test_what_is_heard_is_over_with_the_line(data: bytes, sent: int, at: int) -> None:
     received = heard(data, sent, at)
-    assert all(later > earlier for (_, earlier), (_, later) in pairwise(received))
+    assert all(later > earlier for (_, earlier), (_, later) in itertools.pairwise(received))
     assert len(received) <= max(1, 10 * len(data) * at / sent)
 
 
