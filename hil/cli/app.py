@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -17,9 +17,11 @@ from hil.cli import data as cli_data
 from hil.cli import dry_run as cli_dry_run
 from hil.cli import init as cli_init
 from hil.cli import results as cli_results
+from hil.cli import runs as cli_runs
 
 if TYPE_CHECKING:
     from hil.config.schema import Config
+    from hil.results.result import SettledResult
 
 app = typer.Typer(
     name="hil",
@@ -87,6 +89,7 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
     from hil.config.schema import load_config
     from hil.errors import ConfigError
     from hil.experiment.run import run_experiment
+    from hil.results.json_form import to_json
     from hil.runs.recording import load_samples
     from hil.runs.run_folder import RunFolder
     from hil.runs.timing import timing
@@ -103,7 +106,11 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
         torque = run_experiment(checked, run, config, watch)
     terminal.say(torque)
     samples = load_samples(run.samples_path, len(checked.joints))
-    recorded = {"run": str(run.path), "samples": len(samples), "timing": timing(samples, checked.experiment.rate)}
+    recorded = {
+        "run": str(run.path),
+        "samples": len(samples),
+        "timing": to_json(timing(samples, checked.experiment.rate)),
+    }
     if json_only:
         print(strict_json.dumps(recorded))
         return
@@ -233,6 +240,9 @@ app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --for
 )
 app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.init)
 app.command("dry-run", epilog="Example: hil dry-run configs/first_time.toml --picture dry_run.png")(cli_dry_run.dry_run)
+app.command(epilog="Example: hil runs runs")(cli_runs.runs)
+app.command(epilog='Example: hil note runs/20261121-153000-fake_two_link --text "new gearbox"')(cli_runs.note)
+app.command(epilog="Example: hil diff runs/before runs/after --png wear.png")(cli_runs.diff)
 app.command(epilog="Example: hil compare runs/20261121-153000-fake_two_link")(cli_data.compare)
 app.command(epilog="Example: hil calibrate runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147")(
     cli_data.calibrate
@@ -285,9 +295,9 @@ def main() -> NoReturn:
     sys.exit(0)
 
 
-def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool) -> None:
+def _show(result: "SettledResult", config: "Config", path: Path, json_only: bool) -> None:
     if json_only:
-        print(strict_json.dumps(result))
+        print(strict_json.dumps(result.to_json()))
         return
     from rich.console import Console
 
