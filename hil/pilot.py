@@ -23,6 +23,7 @@ from hil.estimation.settled_estimate import estimate_run
 from hil.estimator.errors import EstimationError
 from hil.estimator.models.parameters import Physics
 from hil.experiment.run import run_experiment
+from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
 from hil.plan.plan import Plan
 from hil.results.parts import PlayedStep
@@ -93,6 +94,11 @@ def identify_in_steps(
 
     Raises what a run raises, and ExperimentError when the pilot cannot be identified at any safe torque.
     """
+    with StopRequest():  # a request to stop that comes in one step, however late, is for all that would follow
+        return _all_steps(config, run, shown_path, watch, say)
+
+
+def _all_steps(config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> tuple[str, Any]:
     steps: list[Step] = []
     result, full = _pilot(config, run, shown_path, watch, say, steps)
     while True:
