@@ -20,6 +20,7 @@ from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_mod
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm
+from hil.fakes.names import find_arm
 from hil.fakes.table_errors import describe
 
 FAKE_URL = "fake://"
@@ -395,8 +396,14 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 
 
 def port_url(port: str) -> str:
-    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
+    one, or the fake arm of that name; raises ConfigError.
+    """
     fakes.register()
-    if port.endswith(".toml") and "://" not in port:
-        return load_config(Path(port)).url
-    return port
+    if "://" in port:
+        return port
+    config = find_config(Path(port))
+    if config.suffix == ".toml":
+        return load_config(config).url
+    arm = find_arm(port)
+    return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port
