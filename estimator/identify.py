@@ -14,6 +14,7 @@ from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
+from hil.estimator.simulation.encoder import measured
 
 MOST_PERIODS = 50  # simulated until the motion is periodic
 PERIODIC = 1e-7  # rad and rad/s, from one period's end to the next
@@ -145,7 +146,7 @@ def predict(
         position, end = simulate(physics, state, motor, step)
         change = float(np.abs(end - state).max())
         if change < (PERIODIC if period < MOST_PERIODS - 1 else NEARLY):
-            return position
+            return measured(physics, position)
         state = end
     raise PeriodicityError(
         f"after {MOST_PERIODS} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "

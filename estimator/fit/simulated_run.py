@@ -10,6 +10,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import MOST_PIECES, simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque, torque_and_slopes
+from hil.estimator.simulation.encoder import by_motion, measured, measured_and_slopes
 from hil.estimator.simulation.presliding_sensitivity import sensitive
 
 ROUGH_STEP, ROUGH_PIECES = 2.6e-3, 16  # s
@@ -42,10 +43,10 @@ class SimulatedRun:
         return replace(self, steps=steps_per_sample(self.rate, ROUGH_STEP), most_pieces=ROUGH_PIECES)
 
     def position(self, physics: Physics, start: Array) -> Array:
-        """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
         times = {"delay": physics.delay, "lag": physics.lag}
         torque = motor_torque(self.command, self.rate, self.command_to_sample, self.steps, **times)
-        return simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0]
+        return measured(physics, simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0])
 
     def pieces(
         self, physics: Physics, start: Array, names: tuple[str, ...], pull: Array | None = None, share: float = 1.0
@@ -57,14 +58,12 @@ class SimulatedRun:
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
         motion = sensitive(physics)(
-            physics, start, (*names, *state), 1.0 / (self.rate * self.steps), self.most_pieces, pull
+            physics, start, (*by_motion(names), *state), 1.0 / (self.rate * self.steps), self.most_pieces, pull
         )
         times = {"delay": physics.delay, "lag": physics.lag}
         torque, slopes = torque_and_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
         samples = round(share * samples)
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
-            yield (
-                part,
-                *motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], self.measured[:, part]),
-            )
+            true = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], self.measured[:, part])
+            yield part, *measured_and_slopes(physics, names, *true)

@@ -28,7 +28,7 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import LEAST_DAMPING, Minimum
 from hil.estimator.fit.objective import Problem, Run
-from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.fit.reparametrisation import Coordinates, Prior, Sizes, scales_of
 from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
@@ -307,12 +307,14 @@ def _problem(periods: Sequence[SettledPeriod], model: Model, linear: LinearEstim
     """The problem with every sample weighed by the noise that is known beforehand, and the states to start from."""
     velocity = float(np.sqrt(np.mean([np.mean(motion.velocity**2) for motion in linear.motions])))
     torque = float(np.sqrt(np.mean([np.mean(period.torque**2) for period in periods])))
-    scales = scales_of(model.names, torque, velocity, abs(float(linear.value[0])))
+    sizes = Sizes(torque, velocity, abs(float(linear.value[0])))
+    scales = scales_of(model.names, sizes)
     state_scale = np.repeat([ANGLE_SCALE, velocity], model.joints)
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
     weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0) for period in periods)
     runs = tuple(_simulated(period) for period in periods)
-    return Problem(runs, Coordinates(model.names, scales, WIDTH_FLOOR), state_scale, weights), np.concatenate(states)
+    coordinates, prior = Coordinates(model.names, scales, WIDTH_FLOOR), Prior.of(model.names, scales, sizes)
+    return Problem(runs, coordinates, state_scale, weights, prior), np.concatenate(states)
 
 
 def _simulated(period: SettledPeriod) -> Run:

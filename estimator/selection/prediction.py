@@ -13,6 +13,7 @@ from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
+from hil.estimator.simulation.encoder import measured
 
 LEAST_WIDTH = 1e-3  # rad/s of a Coulomb step, where a method knows none
 MOST_PERIODS = 20  # simulated until the motion is periodic
@@ -84,7 +85,8 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
     for _ in range(MOST_PERIODS):
         position, end = simulate(physics, state, motor, step)
         if float(np.abs(end - state).max()) < PERIODIC:
-            error: Array = np.sqrt(np.nanmean((period.position - position) ** 2, axis=1)) / filled.std(axis=1)
+            read = measured(physics, position)
+            error: Array = np.sqrt(np.nanmean((period.position - read) ** 2, axis=1)) / filled.std(axis=1)
             return error
         state = end
     raise PeriodicityError(f"under these parameters the arm does not settle within {MOST_PERIODS} periods")
