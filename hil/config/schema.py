@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from hil import fakes
 from hil.config.bundled import find_config
 from hil.config.known_quantities import KnownConfig
+from hil.config.plausible import implausible
 from hil.drivers.bus import BusConfig
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
@@ -275,6 +276,9 @@ class Config(_Table):
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
         for key, values in self._per_joint():
             _same_length(key, values, count)
+        slips = list(implausible(self))
+        if slips:
+            raise ValueError("; ".join(slips))
         if self.experiment.lines is not None:
             _same_length("experiment.lines", self.experiment.lines, count)
             excited = [line for lines in self.experiment.lines for line in lines]
