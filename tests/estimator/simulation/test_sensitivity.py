@@ -63,10 +63,10 @@ def test_what_the_encoders_get_wrong_is_differentiated_too(joints: int) -> None:
     each = dict(zip(ENCODER, (0.01, -0.02, 0.015, 0.005), strict=True))
     values = {**ARM, **{f"{name}_{joint}": value for name, value in each.items() for joint in range(1, joints + 1)}}
     start = np.array(list(START.values())).reshape(2, 2)[:, :joints]
-    run = SimulatedRun(torque()[:joints], np.zeros((joints, SAMPLES)), RATE, 3e-4, STEPS)
+    run = SimulatedRun(torque()[:joints], np.zeros((joints, SAMPLES)), RATE, 3e-4, STEPS, 64)
     names = ("encoder_cos_twice_1", "inertia_1", "encoder_sin_once_1", "coulomb_1")
     ((_, read, derivative),) = run.pieces(Physics.of(values), start, names)
-    true = SimulatedRun(torque()[:joints], run.measured, RATE, 3e-4, STEPS).position(Physics.of(ARM), start)
+    true = SimulatedRun(torque()[:joints], run.measured, RATE, 3e-4, STEPS, 64).position(Physics.of(ARM), start)
     q = true[0]
     wrong = 0.01 * np.sin(q) - 0.02 * np.cos(q) + 0.015 * np.sin(2 * q) + 0.005 * np.cos(2 * q)
     assert np.allclose(read[0], q + wrong, atol=1e-12)
@@ -84,7 +84,8 @@ def test_pulled_motion_keeps_to_its_target_and_has_its_own_derivatives() -> None
     target = np.tile([[-1.5], [0.1]], SAMPLES)
 
     def pulled(values: dict[str, float], pull: float) -> tuple[np.ndarray, np.ndarray]:
-        motion = Sensitive(Physics.of(values), start, ("inertia_1",), 1.0 / (RATE * STEPS), pull=np.full(2, pull))
+        physics, step = Physics.of(values), 1.0 / (RATE * STEPS)
+        motion = Sensitive(physics, start, ("inertia_1",), step, tracking_stiffness=np.full(2, pull))
         return motion.advance(motor, slopes, target)
 
     free, held = (pulled(ARM, pull)[0] for pull in (0.0, 20.0))
