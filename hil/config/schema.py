@@ -196,6 +196,9 @@ class ModelConfig(_Table):
     ripple: bool = Field(False, description=OPTIONS["ripple"])
     zeros: bool = Field(False, description=OPTIONS["zeros"])
     torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
+    saturation: bool = Field(False, description=OPTIONS["saturation"])
+    cable: bool = Field(False, description=OPTIONS["cable"])
+    encoder: bool = Field(False, description=OPTIONS["encoder"])
 
     @property
     def fixed_friction(self) -> Friction:
