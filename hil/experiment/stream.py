@@ -17,7 +17,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, ServoFault
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
-from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.estimation.settled_period import settling_difference
 from hil.experiment.guard import Guard
 from hil.experiment.stop_request import StopRequest
@@ -126,7 +126,7 @@ class Stream:
             self._bus.joints, np.nanmax(position, axis=1) - np.nanmin(position, axis=1), strict=True
         ):
             if moved <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
-                raise ExperimentError(
+                raise DidNotMove(
                     f"{joint.title} moved by {moved:.4f} rad in a whole period: it is stuck, or friction holds it. "
                     "Move it by hand with torque off; if it is free, raise experiment.peak_torque."
                 )
