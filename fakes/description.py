@@ -13,6 +13,7 @@ from hil.fakes.bus.faults import Fault
 from hil.fakes.bus.supply import Supply
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_plant
+from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import Servo
@@ -42,6 +43,11 @@ class FakeServo(BaseModel):
     ] = None
     temperature_c: Annotated[float, Field(ge=0, le=255, description="inside the servo [C]")] = 35.0
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
+    senses_supply: Annotated[
+        bool | None,
+        Field(description="whether Present Current is the supply's and not the motor's; as its model has it if absent"),
+    ] = None
+    encoder: Annotated[Encoder, Field(description="errors of Present Position; none unless given")] = PERFECT
     clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="how much too fast its clock runs")] = 0.0
     voltage_limited: Annotated[
         bool, Field(description="whether supply voltage and back-EMF limit the current in current mode too")
@@ -76,7 +82,7 @@ class FakeServo(BaseModel):
 
     @model_validator(mode="after")
     def _known_registers(self) -> Self:
-        table = load_model(self.model).registers
+        table = load_model(self.model, self.firmware).registers
         for name, value in self.registers.items():
             register = table.get(name)
             if register is None or not register.eeprom or not register.writable:
@@ -158,7 +164,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     """
     servos = [
         Servo(
-            load_model(servo.model),
+            load_model(servo.model, servo.firmware),
             servo.id,
             zero_ticks=servo.zero_ticks,
             direction=servo.direction,
@@ -169,6 +175,8 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
             temperature_c=servo.temperature_c,
             registers=servo.registers,
             current_noise_a=servo.current_noise_a,
+            encoder=servo.encoder,
+            senses_supply=servo.senses_supply,
             clock_error_ppm=servo.clock_error_ppm,
             voltage_limited=servo.voltage_limited,
             thermal=servo.thermal,

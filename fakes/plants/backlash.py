@@ -53,6 +53,8 @@ class GearedArm:
         remaining = until - self._time
         if remaining <= 0.0:
             return
+        for rotor in self._rotors:
+            rotor.motor.warm_up(self._time)
         self._time = until
         links = self._links
         steps = ceil(remaining / STEP)

@@ -44,6 +44,7 @@ class Pendulum:
         remaining = until - self._time
         if remaining <= 0.0:
             return
+        self._motor.warm_up(self._time)
         self._time = until
         (command,) = current
         steps = ceil(remaining / self._motor.longest_step)

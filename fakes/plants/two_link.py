@@ -68,6 +68,8 @@ class TwoLink:
         remaining = until - self._time
         if remaining <= 0.0:
             return
+        for motor in self._motors:
+            motor.warm_up(self._time)
         self._time = until
         self._run(remaining, remaining / ceil(remaining / self._longest_step), *current)
 

@@ -17,6 +17,7 @@ from hil.cli import data as cli_data
 from hil.cli import dry_run as cli_dry_run
 from hil.cli import init as cli_init
 from hil.cli import results as cli_results
+from hil.cli import runs as cli_runs
 
 if TYPE_CHECKING:
     from hil.config.schema import Config
@@ -233,6 +234,9 @@ app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --for
 )
 app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.init)
 app.command("dry-run", epilog="Example: hil dry-run configs/first_time.toml --picture dry_run.png")(cli_dry_run.dry_run)
+app.command(epilog="Example: hil runs runs")(cli_runs.runs)
+app.command(epilog='Example: hil note runs/20261121-153000-fake_two_link --text "new gearbox"')(cli_runs.note)
+app.command(epilog="Example: hil diff runs/before runs/after --png wear.png")(cli_runs.diff)
 app.command(epilog="Example: hil compare runs/20261121-153000-fake_two_link")(cli_data.compare)
 app.command(epilog="Example: hil calibrate runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147")(
     cli_data.calibrate

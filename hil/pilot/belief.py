@@ -7,7 +7,6 @@ no motion that tells all parameters apart: what a motion says nothing of keeps t
 move tells too: arms that would have moved are moved towards more friction.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,14 +16,13 @@ from hil.config.schema import Config
 from hil.dry_run.ensemble import Ensemble, scale_draws, within_range
 from hil.dry_run.prior import base_draws
 from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import term_of
 from hil.estimator.simulation.many_arms import ManyArms
 from hil.pilot.seen import Seen
 from hil.plan.stabiliser import feedback_of
 
 Array = NDArray[np.float64]
 
-_TORQUES = ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb", "offset")
-"""What doubles when all torques are twice as large as supposed."""
 _LINEAR = ("offset", "zero")
 """Of either sign: not by their logarithms."""
 
@@ -116,10 +114,10 @@ class Belief:
         x = self.coordinates
         parts, data = x - x.mean(axis=0), foreseen - foreseen.mean(axis=0)
         goal = measured + np.sqrt(inflation) * random.standard_normal(foreseen.shape)
-        # (D'D + c I)^-1 in the space of the arms, which are fewer than the data.
-        U, size, Vt = np.linalg.svd(data, full_matrices=False)
-        gain = (parts.T @ U * (size / (size**2 + inflation * (len(x) - 1)))) @ Vt
-        change = np.clip((goal - foreseen) @ gain.T, -_LONGEST_MOVE, _LONGEST_MOVE)
+        # P'D (D'D + c I)^-1 = P' (DD' + c I)^-1 D: there are fewer arms than data.
+        regularised = data @ data.T + inflation * (len(x) - 1) * np.eye(len(x))
+        change = (goal - foreseen) @ data.T @ np.linalg.solve(regularised, parts)
+        change = np.clip(change, -_LONGEST_MOVE, _LONGEST_MOVE)
         return replace(self, coordinates=x + change)
 
     def _without_strays(self, left: Array, random: np.random.Generator) -> "Belief":
@@ -145,7 +143,7 @@ class Belief:
 def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
     """From link lengths and `[arm.prior]`. Raises ConfigError."""
     base, scale = base_draws(config, arms, seed), scale_draws(config, arms, seed)
-    supposed = {name: v / scale[:, 0] if name.startswith(_TORQUES) else v for name, v in base.items()}
+    supposed = {name: v / scale[:, 0] if term_of(name).of_torque else v for name, v in base.items()}
     if scale.shape[1] == 2:
         supposed["torque_scale_2"] = scale[:, 1] / scale[:, 0]
     return _of_draws(supposed, seed)
@@ -164,8 +162,3 @@ def _of_draws(draws: dict[str, Array], seed: int) -> Belief:
 def _compressed(displacement: Array) -> Array:
     """Linear near zero, a logarithm far from it: how far an arm moved counts by its ratio."""
     return np.asarray(np.arcsinh(displacement / _LINEAR_RANGE))
-
-
-def mean_parameters(parameters: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Means by name."""
-    return {name: float(np.mean([each[name] for each in parameters])) for name in parameters[0]}
