@@ -3,6 +3,7 @@
 Two joints cost 1 to 4 us a sample: plain floats, one pass over the joints, everything known beforehand worked out once.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, NoReturn
 
@@ -55,7 +56,8 @@ class Guard:
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit / rate,
                 joint.goal_limit,
-                safety.follow_share * joint.goal_limit,
+                # A sensor in the supply says little of the motor's current.
+                math.inf if joint.joint.servo.senses_supply else safety.follow_share * joint.goal_limit,
                 joint.torque_per_goal / rate,
                 -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )

@@ -3,7 +3,7 @@
 A run that moved nothing, passed a limit or never settled is a run to learn from like any other.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,8 @@ _PILOT_SETTLING = 1
 _AFTER_LIMIT = 0.85
 """Of the torque under which a limit was passed: the most of what follows."""
 _AT_LIMIT = 0.99
+_MORE = 1.15
+"""Times the torque of the run before: where one more would add less, it is not made."""
 
 
 @dataclass
@@ -131,10 +133,11 @@ class Search:
         while not self._certain(config, found) and len(self.steps) < MOST_STEPS - 1:
             self.player.say("What is known so far is too uncertain to go to the limits at once: one more run on the way.")
             number = len(self.steps) + 1
-            between = without_held_out(config)
-            self._play(between, f"step-{number}", f"Step {number}", only_first(found))
-            config = self.held
+            self._play(step_config(config), f"step-{number}", f"Step {number}", only_first(found))
+            former, config = found.peak_torque, self.held
             found = self.amplitude(config, 1.0, self._waves(config) if config.stabiliser is not None else plan)
+            if (found.peak_torque <= _MORE * former).all():
+                break  # what was learned lets it go no farther
         return config, found
 
     def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
@@ -181,7 +184,8 @@ def pilot_config(config: Config) -> Config:
 
 def only_first(found: Amplitude) -> Amplitude:
     """The same with its first multisine alone."""
-    return Amplitude(found.plan.first_segment(), found.peak_torque, found.prediction)
+    plan = replace(found.plan.first_segment(), max_settling_periods=_PILOT_SETTLING, periods=1)
+    return Amplitude(plan, found.peak_torque, found.prediction)
 
 
 def with_torque(config: Config, peak_torque: Array) -> Config:
@@ -190,9 +194,11 @@ def with_torque(config: Config, peak_torque: Array) -> Config:
     return config.model_copy(update={"experiment": experiment})
 
 
-def without_held_out(config: Config) -> Config:
-    """The configuration without its second multisine."""
-    return config.model_copy(update={"experiment": config.experiment.model_copy(update={"held_out": False})})
+def step_config(config: Config) -> Config:
+    """The configuration without its second multisine, and without waiting for a steady motion."""
+    settling = min(config.experiment.max_settling_periods, _PILOT_SETTLING)
+    update = {"held_out": False, "max_settling_periods": settling, "periods": 1}
+    return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
 
 
 def _is_base(name: str) -> bool:

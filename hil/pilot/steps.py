@@ -105,7 +105,7 @@ class Player:
         prediction = found.prediction
         step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks, str(error or ""))
         self.say(str(step))
-        if error is not None:
+        if isinstance(error, SafetyStop):
             self.say(f"{name} ended early: {error}")
         if not step.within:
             self.say(f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed.")
