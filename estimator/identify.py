@@ -16,6 +16,7 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.options import LikelihoodOptions, SettlingOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
+from hil.estimator.simulation.encoder import measured
 
 LIKELIHOOD = LikelihoodOptions()
 SETTLING = SettlingOptions()
@@ -168,7 +169,7 @@ def predict(
         position, end = simulate(physics, state, motor, step)
         change = float(np.abs(end - state).max())
         if change < (settling.atol if period < settling.max_periods - 1 else settling.acceptable):
-            return position
+            return measured(physics, position)
         state = end
     raise PeriodicityError(
         f"after {settling.max_periods} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "

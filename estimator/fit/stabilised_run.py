@@ -10,6 +10,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.closed_loop import Stabilised
+from hil.estimator.simulation.encoder import by_motion, measured, measured_and_slopes
 
 RTOL, ATOL = 1e-5, 1e-7
 """A difference is taken over this much of a parameter's value, and this much of its unit."""
@@ -35,7 +36,10 @@ class StabilisedRun:
         return self
 
     def position(self, physics: Physics, start: Array) -> Array:
-        """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        return measured(physics, self._true(physics, start))
+
+    def _true(self, physics: Physics, start: Array) -> Array:
         return self.stabiliser.positions(physics, start, self.rate, self.command_to_sample)
 
     def pieces(
@@ -50,17 +54,18 @@ class StabilisedRun:
 
         Its stabiliser keeps it near the measured motion: it needs no springs.
         """
-        position = self.position(physics, start)
+        position = self._true(physics, start)
         derivatives = []
-        for name in names:
+        for name in by_motion(names):
             step = ATOL + RTOL * abs(_value(physics, name))
-            derivatives.append((self.position(_nudged(physics, name, step), start) - position) / step)
+            derivatives.append((self._true(_nudged(physics, name, step), start) - position) / step)
         for index in np.ndindex(*start.shape):
             nudged = start.copy()
             nudged[index] += ATOL
-            derivatives.append((self.position(physics, nudged) - position) / ATOL)
+            derivatives.append((self._true(physics, nudged) - position) / ATOL)
         count = round(horizon * self.measured.shape[1])
-        yield slice(0, count), position[:, :count], np.stack(derivatives, axis=-1)[:, :count]
+        slopes = np.stack(derivatives, axis=-1)[:, :count]
+        yield slice(0, count), *measured_and_slopes(physics, names, position[:, :count], slopes)
 
 
 def _value(physics: Physics, name: str) -> float:
