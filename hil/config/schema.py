@@ -21,7 +21,7 @@ from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm
 from hil.fakes.names import find_arm
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
 
@@ -404,7 +404,12 @@ def port_url(port: str) -> str:
     """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
     one, or the fake arm of that name; raises ConfigError.
     """
-    fakes.register()
+    url = _url_of(port)
+    fakes.register_for(url)
+    return url
+
+
+def _url_of(port: str) -> str:
     if "://" in port:
         return port
     config = find_config(Path(port))

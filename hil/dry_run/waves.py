@@ -73,11 +73,6 @@ def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> 
     return Problem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
 
 
-def plain_wave(config: Config, seed: int) -> Multisine:
-    """The low-crest multisine of this seed, at the torque limits."""
-    return _plain_segment(config, seed).multisine
-
-
 def _plain_segment(config: Config, seed: int) -> Segment:
     experiment = config.experiment.model_copy(update={"seed": seed, "held_out": False})
     return with_peaks(config.model_copy(update={"experiment": experiment}), _torque_limits(config)).segments[0]
