@@ -30,6 +30,9 @@ class SimulatedRun:
     """Integration steps in a sample."""
     most_pieces: int = MOST_PIECES
     """Into which a step is cut near standstill."""
+    pulled_to: Array | None = None
+    """Where springs end that draw the arm, held from sample to sample (joints, samples) [rad]; `measured` unless given.
+    """
 
     @classmethod
     def of(cls, period: SettledPeriod) -> "SimulatedRun":
@@ -62,9 +65,10 @@ class SimulatedRun:
         times = {"delay": physics.delay, "lag": physics.lag}
         torque, slopes = torque_and_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
         samples = round(share * samples)
+        ends = self.measured if self.pulled_to is None else self.pulled_to
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
             yield (
                 part,
-                *motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], self.measured[:, part]),
+                *motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part]),
             )
