@@ -20,7 +20,8 @@ from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_mod
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm
-from hil.fakes.table_errors import describe
+from hil.fakes.names import find_arm
+from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
 
@@ -120,7 +121,9 @@ class PriorConfig(_Table):
     """
 
     spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
-    rough_spread: PositiveFloat = Field(0.5, le=1, description="of each value guessed from length and model")
+    rough_spread: PositiveFloat | None = Field(
+        None, le=1, description="of each value guessed; each its own unless given"
+    )
     link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
     link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
     link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
@@ -195,6 +198,9 @@ class ModelConfig(_Table):
     ripple: bool = Field(False, description=OPTIONS["ripple"])
     zeros: bool = Field(False, description=OPTIONS["zeros"])
     torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
+    saturation: bool = Field(False, description=OPTIONS["saturation"])
+    cable: bool = Field(False, description=OPTIONS["cable"])
+    encoder: bool = Field(False, description=OPTIONS["encoder"])
 
     @property
     def fixed_friction(self) -> Friction:
@@ -395,8 +401,19 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 
 
 def port_url(port: str) -> str:
-    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
-    fakes.register()
-    if port.endswith(".toml") and "://" not in port:
-        return load_config(Path(port)).url
-    return port
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
+    one, or the fake arm of that name; raises ConfigError.
+    """
+    url = _url_of(port)
+    fakes.register_for(url)
+    return url
+
+
+def _url_of(port: str) -> str:
+    if "://" in port:
+        return port
+    config = find_config(Path(port))
+    if config.suffix == ".toml":
+        return load_config(config).url
+    arm = find_arm(port)
+    return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port
