@@ -19,6 +19,7 @@ from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
+from hil.setup.servo_session import servo_session
 
 _LAST_SAMPLES = 100
 """How many samples an error carries with it."""
@@ -32,7 +33,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
     """
     plan = make_plan(config) if plan is None else plan
     fakes.register()
-    with StopRequest() as stop, ServoBus.open(config.bus) as bus:
+    with StopRequest() as stop, servo_session(config, run.path) as bus:
         clock = bus.port.clock
         run.event(clock.now(), f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
