@@ -74,6 +74,8 @@ class ServoModel:
     min_voltage: the supply below which it shuts down from the factory (Min Voltage Limit) [V].
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that answers Fast Sync Read; None where no firmware does.
+    senses_supply: whether Present Current is the supply's, which is the motor's times the share of time in which its
+    bridge is on: far less than what is commanded while the joint is slow.
     """
 
     name: str
@@ -84,6 +86,7 @@ class ServoModel:
     min_voltage: float = 9.5
     watchdog_firmware: int = 38
     fast_sync_read_firmware: int | None = 45
+    senses_supply: bool = False
 
     @property
     def position_unit(self) -> float:
@@ -156,6 +159,7 @@ _MODELS = (
         (Stall(9.0, 0.61, 0.76), Stall(11.1, 0.80, 0.92), Stall(12.0, 0.88, 1.00)),
         min_voltage=5.5,
         fast_sync_read_firmware=46,
+        senses_supply=True,
     ),
     ServoModel(
         "XL430-W250", None, (Stall(9.0, 1.0, 1.0), Stall(11.1, 1.3, 1.4), Stall(12.0, 1.4, 1.5)), min_voltage=6.0

@@ -8,10 +8,12 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.models.parameters import CONSTANTS, Physics
+from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.closed_loop import Stabilised
+from hil.estimator.simulation.encoder import by_motion, measured, measured_and_slopes
 
-RELATIVE, LEAST = 1e-5, 1e-7
-"""A difference is taken over this much of a parameter's value, and at least so much of its unit."""
+RTOL, ATOL = 1e-5, 1e-7
+"""A difference is taken over this much of a parameter's value, and this much of its unit."""
 
 
 @dataclass(frozen=True)
@@ -29,32 +31,41 @@ class StabilisedRun:
         """Of this period, during which `stabiliser` gave part of the torque."""
         return cls(stabiliser, period.filled(), period.rate, period.command_to_sample)
 
-    def roughly(self) -> "StabilisedRun":
+    def integrated(self, _: IntegrationOptions) -> "StabilisedRun":
         """Itself: it has one step only."""
         return self
 
     def position(self, physics: Physics, start: Array) -> Array:
-        """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        return measured(physics, self._true(physics, start))
+
+    def _true(self, physics: Physics, start: Array) -> Array:
         return self.stabiliser.positions(physics, start, self.rate, self.command_to_sample)
 
     def pieces(
-        self, physics: Physics, start: Array, names: tuple[str, ...], pull: Array | None = None, share: float = 1.0
+        self,
+        physics: Physics,
+        start: Array,
+        names: tuple[str, ...],
+        _tracking_stiffness: Array | None = None,
+        horizon: float = 1.0,
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """The whole run, or the first `share` of it, as one piece, as `SimulatedRun.pieces` gives them.
+        """The whole run, or the share `horizon` from its beginning, as one piece, as `SimulatedRun.pieces` gives them.
 
-        Its stabiliser is `pull` enough.
+        Its stabiliser keeps it near the measured motion: it needs no springs.
         """
-        position = self.position(physics, start)
+        position = self._true(physics, start)
         derivatives = []
-        for name in names:
-            step = LEAST + RELATIVE * abs(_value(physics, name))
-            derivatives.append((self.position(_nudged(physics, name, step), start) - position) / step)
+        for name in by_motion(names):
+            step = ATOL + RTOL * abs(_value(physics, name))
+            derivatives.append((self._true(_nudged(physics, name, step), start) - position) / step)
         for index in np.ndindex(*start.shape):
             nudged = start.copy()
-            nudged[index] += LEAST
-            derivatives.append((self.position(physics, nudged) - position) / LEAST)
-        count = round(share * self.measured.shape[1])
-        yield slice(0, count), position[:, :count], np.stack(derivatives, axis=-1)[:, :count]
+            nudged[index] += ATOL
+            derivatives.append((self._true(physics, nudged) - position) / ATOL)
+        count = round(horizon * self.measured.shape[1])
+        slopes = np.stack(derivatives, axis=-1)[:, :count]
+        yield slice(0, count), *measured_and_slopes(physics, names, position[:, :count], slopes)
 
 
 def _value(physics: Physics, name: str) -> float:

@@ -232,7 +232,7 @@ def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: 
     needed = joint_config.goal_limit * joint.servo.resistance if joint.mode is Mode.CURRENT else joint_config.goal_limit
     found = f"{pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply"
     mend = (
-        f"It bounds the motor's voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
+        f"It bounds the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
         "rest and more at speed: raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
     )
     if volts < needed:
@@ -314,8 +314,8 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
             )
             continue
         mend = (
-            "A goal sent by Sync Write did not arrive, though it answers reads: try port.one_write = false; look for an "
-            "adapter or hub that swallows bytes, and for a second servo with this ID."
+            "A goal sent by Sync Write did not arrive though reads are answered: try port.one_write = false; look for "
+            "an adapter or hub that swallows bytes, and for a second servo with this ID."
         )
         yield Finding(Level.STOP, str(joint), "goals", "not taken", mend)
 

@@ -19,6 +19,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
 from hil.drivers.settings import put_back, read_settings
+from hil.drivers.shield import signals_held_back
 from hil.errors import RunFolderError
 from hil.setup import settings_file
 from hil.setup.current_limit import current_limit_ticks
@@ -123,7 +124,8 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             yield bus
         finally:
             _outermost.reset(token)
-            session.end()
+            with signals_held_back():
+                session.end()
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:
