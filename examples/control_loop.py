@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import fakes, load_model
+from hil import load_model
 from hil.arm_model import ArmModel
 from hil.config.schema import Config, load_config
 from hil.drivers.rate import FixedRate
@@ -38,7 +38,6 @@ def identified_arm() -> tuple[Config, ArmModel]:
 
 def play(config: Config, model: ArmModel, controller: Controller, samples: int) -> Array:
     """Run the controller for so many samples; measured angles (samples, joints) [rad]. Torque is off afterwards."""
-    fakes.register()
     guard = Guard(config)
     measured = np.empty((samples, len(model.joints)))
     goals = [0.0] * len(model.joints)

@@ -72,10 +72,8 @@ def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = Fals
     terminal = Terminal(quiet=json_only)
     if checked.experiment.pilot:
         from hil.pilot import identify_in_steps
-        from hil.setup.servo_session import servo_session
 
-        # One session over all steps: what the servos were set to is written once, and put back once.
-        with terminal.streaming(checked) as watch, servo_session(checked, run.path):
+        with terminal.streaming(checked) as watch:
             torque, result = identify_in_steps(checked, run, config, watch, terminal.say)
         terminal.say(torque)
         cli_results.write_report(run.path)

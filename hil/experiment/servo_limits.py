@@ -51,7 +51,7 @@ def _check_pwm_limit(bus: ServoBus, joint: Joint, limit: float) -> None:
     needed = limit * joint.servo.resistance
     if volts < needed:
         raise WrongSetting(
-            f"{joint.title}: its PWM Limit is {pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply, but "
-            f"current_limit = {limit:g} A needs {needed:.1f} V: the motor would not carry what it is told. Raise PWM Limit with "
+            f"{joint.title}: its PWM Limit is {pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply; current_limit = "
+            f"{limit:g} A needs {needed:.1f} V, so the motor would not carry what it is told. Raise PWM Limit with "
             "DYNAMIXEL Wizard 2.0, or lower current_limit."
         )

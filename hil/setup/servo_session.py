@@ -12,6 +12,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
@@ -115,6 +116,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
         outer.bus.prepare()
         yield outer.bus
         return
+    fakes.register_for(config.url)
     with ServoBus.connect(config.bus) as bus:
         session = ServoSession(bus, say)
         token = _outermost.set(session)
