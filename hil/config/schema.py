@@ -121,7 +121,9 @@ class PriorConfig(_Table):
     """
 
     spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
-    rough_spread: PositiveFloat = Field(0.5, le=1, description="of each value guessed from length and model")
+    rough_spread: PositiveFloat | None = Field(
+        None, le=1, description="of each value guessed; each its own unless given"
+    )
     link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
     link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
     link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")

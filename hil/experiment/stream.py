@@ -17,7 +17,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
-from hil.errors import ExperimentError, NotSettled
+from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.experiment.guard import Guard
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
@@ -134,7 +134,7 @@ class Stream:
         """A joint that friction or something harder holds shows after one period, before minutes are spent on it."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
-                raise ExperimentError(
+                raise DidNotMove(
                     f"{joint.title} moved by {way:.4f} rad in a whole period: it is stuck, or friction holds it. "
                     "Move it by hand with torque off; if it is free, raise experiment.peak_torque."
                 )
