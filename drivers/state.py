@@ -23,12 +23,29 @@ class Slow(NamedTuple):
     temperature: tuple[float, ...]
 
 
+class Status(NamedTuple):
+    """What one servo told of itself beside its state, in its turn.
+
+    joint: its index. torque: whether Torque Enable is on. hardware_error: Hardware Error Status. The others are None
+    where the cycle has no time for them: watchdog, Bus Watchdog [20 ms], 255 when it acted; goal: the register of the
+    goal [A, or V under PWM]; tick: the servo's own clock [s], which wraps at 32.768 s.
+    """
+
+    joint: int
+    torque: bool
+    hardware_error: int
+    watchdog: int | None = None
+    goal: float | None = None
+    tick: float | None = None
+
+
 class State(NamedTuple):
     """One sample of the arm; NaN where a servo did not answer.
 
     time_before_write, time_after_read: s on the port's clock. goal_current: what was sent, a whole number of ticks,
     and current: what the servo measured [A] (under PWM both are voltages [V], sent and applied); velocity [rad/s];
-    position [rad]; error: the ERR bytes, 0 where missing; missing: no values from this servo; slow: in turn, else None.
+    position [rad]; error: the ERR bytes, 0 where missing; missing: no values from this servo; slow, status: in
+    turn, else None.
     """
 
     time_before_write: float
@@ -40,6 +57,7 @@ class State(NamedTuple):
     error: tuple[int, ...]
     missing: tuple[bool, ...]
     slow: Slow | None = None
+    status: Status | None = None
 
 
 _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
@@ -53,6 +71,26 @@ def spans(mode: Mode, tables: Sequence[ControlTable]) -> tuple[Span, Span, Span]
         Span.of(tables, ("Realtime Tick", *always)),
         Span.of(tables, (*always, "Present Input Voltage", "Present Temperature")),
     )
+
+
+SLOW_SPANS = 2
+"""How many of `spans` are read now and then."""
+
+_SHORT_STATUS = ("Torque Enable", "Hardware Error Status")
+
+
+def status_span(mode: Mode, tables: Sequence[ControlTable], *, short: bool = False) -> Span:
+    """What one servo is asked for in its turn: whether it is still driven, and its state.
+
+    short: without the state, which that cycle then lacks, where a cycle has no time for both.
+    """
+    goal = "Goal Current" if mode is Mode.CURRENT else "Goal PWM"
+    more = ("Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position")
+    return Span.of(tables, _SHORT_STATUS if short else (*_SHORT_STATUS, *more))
+
+
+_STATE_IN_STATUS = 6
+"""Where the state begins in the answer of a status: behind ERR and five registers."""
 
 
 class Converter:
@@ -75,10 +113,12 @@ class Converter:
 
     def state(self, ticks: Sequence[int], reply: Reply) -> State:
         sent = tuple([unit * tick for unit, tick in zip(self._drive_units, ticks, strict=True)])
+        told = reply.span - SLOW_SPANS - 1
         # The tick stands in front of the three that are always read, voltage and temperature behind them.
         at = 2 if reply.span == 1 else 1
         drive, velocity, position, error, missing = [], [], [], [], []
-        for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True):
+        answers = reply.servos if told < 0 else _states(reply.servos, told)
+        for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(answers, self._scales, strict=True):
             if answer is None or len(answer) == 1:
                 drive.append(NAN)
                 velocity.append(NAN)
@@ -100,8 +140,17 @@ class Converter:
             tuple(position),
             tuple(error),
             tuple(missing),
-            _slow(reply) if reply.span else None,
+            _slow(reply) if 0 < reply.span <= SLOW_SPANS else None,
+            self._status(told, reply.servos[told]) if told >= 0 else None,
         )
+
+    def _status(self, joint: int, answer: Answer) -> Status | None:
+        if answer is None or len(answer) == 1:
+            return None
+        if len(answer) <= _STATE_IN_STATUS:
+            return Status(joint, bool(answer[1]), answer[2])
+        _, torque, error, watchdog, goal, tick, *_ = answer
+        return Status(joint, bool(torque), error, watchdog, goal * self._drive_units[joint], tick * 1e-3)
 
     def _wrong(self, goals: Sequence[float]) -> ValueError:
         if len(goals) != len(self._joints):
@@ -112,6 +161,15 @@ class Converter:
                     f"{joint.title} was given a goal of {goal} {joint.mode.goal_unit}: that is no number."
                 )
         return ValueError(f"goals {list(goals)} cannot be sent.")
+
+
+def _states(answers: Sequence[Answer], told: int) -> list[Answer]:
+    """The answers with the state alone, or nothing, left of the one that told its status."""
+    states = list(answers)
+    status = answers[told]
+    if status is not None:
+        states[told] = status[:1] + status[_STATE_IN_STATUS:]
+    return states
 
 
 def _slow(reply: Reply) -> Slow:

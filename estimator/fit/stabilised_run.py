@@ -16,6 +16,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.models.parameters import Physics
+from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.closed_loop import Stabilised
 
 
@@ -29,9 +30,9 @@ class StabilisedRun:
     """Of the stabiliser's springs (joints,) [N m/rad]."""
 
     @classmethod
-    def of(cls, period: SettledPeriod, stabiliser: Stabilised) -> "StabilisedRun":
+    def of(cls, period: SettledPeriod, stabiliser: Stabilised, integration: IntegrationOptions) -> "StabilisedRun":
         """Of this period, during which `stabiliser` gave part of the torque."""
-        run = SimulatedRun.of(period)
+        run = SimulatedRun.of(period, integration)
         # Held from sample to sample, an end must stand where the arm is in between: half a sample late is a torque in
         # proportion to velocity.
         between = 0.5 * (run.measured + np.roll(run.measured, -1, axis=1))
@@ -43,17 +44,23 @@ class StabilisedRun:
         """Angles (joints, samples) [rad], the missing ones interpolated."""
         return self.run.measured
 
-    def roughly(self) -> "StabilisedRun":
-        """The same in long steps."""
-        return replace(self, run=self.run.roughly())
+    def integrated(self, integration: IntegrationOptions) -> "StabilisedRun":
+        """The same in other steps."""
+        return replace(self, run=self.run.integrated(integration))
 
     def position(self, physics: Physics, start: Array) -> Array:
-        """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
         return np.concatenate([position for _, position, _ in self.pieces(physics, start, ())], axis=1)
 
     def pieces(
-        self, physics: Physics, start: Array, names: tuple[str, ...], pull: Array | None = None, share: float = 1.0
+        self,
+        physics: Physics,
+        start: Array,
+        names: tuple[str, ...],
+        tracking_stiffness: Array | None = None,
+        horizon: float = 1.0,
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """Piece after piece, as `SimulatedRun.pieces` gives them; springs stiffer than the stabiliser's with `pull`."""
-        stiffness = self.stiffness if pull is None else np.maximum(self.stiffness, pull)
-        return self.run.pieces(physics, start, names, stiffness, share)
+        """Piece after piece, as `SimulatedRun.pieces` gives them; with springs stiffer than the stabiliser's where
+        `tracking_stiffness` is."""
+        stiffness = self.stiffness if tracking_stiffness is None else np.maximum(self.stiffness, tracking_stiffness)
+        return self.run.pieces(physics, start, names, stiffness, horizon)

@@ -2,13 +2,15 @@
 
 The equations are those of `hil.estimator.models.regressor` with a friction law that is smooth:
 
-    motor torque = torque_scale torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
+    given torque = torque_scale torque (1 - saturation (torque_scale torque)^2)
+    motor torque = given torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
     friction(v) = viscous v + viscous_asymmetry |v| + level(v) tanh(v / width)
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
 
-with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb level itself is the offset. With
-presliding the term level(v) tanh(v / width) makes way for the bristles of `hil.estimator.simulation.bristles`.
-`hil.estimator.simulation.sensitivity` differentiates these equations and this scheme.
+and cable_stiffness q beside friction, with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb
+level itself is the offset. With presliding the term level(v) tanh(v / width) makes way for the bristles of
+`hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these equations and this
+scheme.
 
 Each step is the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999): L-stable for the
 slope of the friction, which its Jacobian holds, and of second order whatever else that Jacobian leaves out.
@@ -26,6 +28,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import Physics, place_of
+from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
 
 # Of joint 1 in `Physics.vector`; joint 2 follows.
@@ -35,14 +38,15 @@ VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING = map(
 LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
     place_of, ("load", "viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale")
 )
+SATURATION, CABLE = map(place_of, ("saturation", "cable_stiffness"))
 
-LONGEST_STEP = 0.85e-3  # s
-MOST_PIECES = 64
+INTEGRATION = IntegrationOptions()
+MAX_SUBSTEPS = INTEGRATION.max_substeps
 FADED = 40.0  # e to minus this is lost beside 1, and takes a library longer than any other power
 GAMMA = 1.0 - math.sqrt(0.5)
 
 
-def steps_per_sample(rate: float, longest: float = LONGEST_STEP) -> int:
+def steps_per_sample(rate: float, longest: float = INTEGRATION.max_step) -> int:
     """Integration steps of at most `longest` [s] in one sample at `rate` [1/s]."""
     return math.ceil(1.0 / (rate * longest))
 
@@ -69,7 +73,7 @@ def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tupl
     return position[:joints], state[:, :joints]
 
 
-def finer_pieces(physics: Physics, step: float, most: int = MOST_PIECES) -> int:
+def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> int:
     """Finer steps in place of one of `step` [s] near standstill, at most `most`.
 
     Dry friction turned round may carry a joint across a quarter of its step's width in one of them. A power of
@@ -100,11 +104,12 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, flo
     """Torque that a drive leaves its joint after friction, and the slope of that friction."""
     viscous, cycles = p[VISCOUS + joint], p[CYCLES + joint]
     t *= p[SCALE + joint]
+    t -= p[SATURATION + joint] * t * t * t
     if cycles != 0.0:
         t *= 1.0 + p[SINE + joint] * math.sin(cycles * q) + p[COSINE + joint] * math.cos(cycles * q)
     level = p[COULOMB + joint] * (1.0 + p[RISE + joint] * bump_at(v / p[FADING + joint])) + p[LOAD + joint] * abs(t)
     bend, bent = bend_at(v, 1.0 / p[WIDTH + joint])
-    left = t - p[OFFSET + joint] - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
+    left = t - p[OFFSET + joint] - p[CABLE + joint] * q - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
     return left, viscous + level * bent
 
 

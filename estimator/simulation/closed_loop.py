@@ -18,6 +18,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import finer_pieces, pieces_now, step_bent, steps_per_sample
 from hil.estimator.simulation.bristles import first_bend, has_bristles, without_dry_friction
+from hil.estimator.simulation.encoder import measured
 
 SETTLING_PERIODS = 4
 
@@ -78,12 +79,12 @@ class Stabilised:
         return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
 
     def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
-        """The same when nothing of the motion is known: from rest in `pose`, after some periods."""
+        """What encoders read when nothing of the motion is known: from rest in `pose`, after some periods."""
         state = resting(pose)
         for _ in range(SETTLING_PERIODS):
             response = respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback)
             state = response.state
-        return response.position
+        return measured(physics, response.position)
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:

@@ -20,6 +20,7 @@ from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_mod
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm
+from hil.fakes.names import find_arm
 from hil.fakes.table_errors import describe
 
 FAKE_URL = "fake://"
@@ -195,6 +196,9 @@ class ModelConfig(_Table):
     ripple: bool = Field(False, description=OPTIONS["ripple"])
     zeros: bool = Field(False, description=OPTIONS["zeros"])
     torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
+    saturation: bool = Field(False, description=OPTIONS["saturation"])
+    cable: bool = Field(False, description=OPTIONS["cable"])
+    encoder: bool = Field(False, description=OPTIONS["encoder"])
 
     @property
     def fixed_friction(self) -> Friction:
@@ -216,8 +220,10 @@ class SafetyConfig(_Table):
     watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
     allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
-    max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")
-    max_late: int = Field(20, ge=1, le=1000, description="deadlines in a row that may be missed")
+    missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may give no reply")
+    late_time: PositiveFloat = Field(0.05, le=2, description="s for which deadlines may be missed")
+    max_missing: int | None = Field(None, ge=1, le=1000, description="replies in a row; in place of missing_time")
+    max_late: int | None = Field(None, ge=1, le=1000, description="deadlines in a row; in place of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
@@ -225,7 +231,9 @@ class SafetyConfig(_Table):
     min_voltage: float = Field(0.0, ge=0, description="V; the servos' own limits hold beside it")
     max_voltage: PositiveFloat = Field(30.0, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
-    follow_share: PositiveFloat = Field(0.3, le=1, description="of current_limit, by how much it may differ for longer")
+    follow_share: PositiveFloat = Field(
+        0.3, le=1, description="of the planned peak, by how much it may differ for longer"
+    )
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
     damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
     limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
@@ -334,6 +342,7 @@ class Config(_Table):
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
             watchdog_required=not self.safety.allow_no_watchdog,
+            interval=1 / self.experiment.rate,
         )
 
     @property
@@ -390,8 +399,14 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 
 
 def port_url(port: str) -> str:
-    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
+    one, or the fake arm of that name; raises ConfigError.
+    """
     fakes.register()
-    if port.endswith(".toml") and "://" not in port:
-        return load_config(Path(port)).url
-    return port
+    if "://" in port:
+        return port
+    config = find_config(Path(port))
+    if config.suffix == ".toml":
+        return load_config(config).url
+    arm = find_arm(port)
+    return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port

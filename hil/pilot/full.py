@@ -1,14 +1,16 @@
 """The whole way from link lengths to the result: the search, the full run, its estimate."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
 from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player, Say
+from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 
 MOST_TRIES = 3
@@ -18,16 +20,18 @@ _BACK_OFF = 0.85
 """Of the torque of a run that never settled: large motion of little friction need not settle at all."""
 
 
-def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> tuple[str, Any]:
+def identify_in_steps(
+    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
+) -> tuple[str, SettledResult]:
     """The whole way from link lengths to the result; the sentence about torque and the result.
 
     Raises what a run raises, and ExperimentError when a joint does not move at its current limit.
     """
     search = Search.of(config, run, Player(shown_path, watch, say))
-    played = _full(search, *search.find())
+    with StopRequest():  # a request to stop that comes in one step, however late, is for all that would follow
+        played = _full(search, *search.find())
     run.write_starts([search.belief.middle])
-    result = estimate_run(run)
-    result["steps"] = [step.as_json() for step in search.steps]
+    result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
     run.write_result(result)
     return played.torque, result
 

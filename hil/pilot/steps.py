@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetySto
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
 from hil.pilot.seen import Seen, seen_of
+from hil.results.parts import PlayedStep
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
@@ -25,7 +25,7 @@ Say = Callable[[str], None]
 @dataclass(frozen=True)
 class Step:
     """One run on the way: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
-    (quantities, joints), in hil.dry_run.prediction.QUANTITIES. ended: why it ended early, empty where it did not.
+    (quantities, joints), in hil.dry_run.prediction.QUANTITIES.
     """
 
     name: str
@@ -33,7 +33,6 @@ class Step:
     median: Array
     quantile: Array
     seen: Array
-    ended: str = ""
 
     @property
     def within(self) -> bool:
@@ -51,16 +50,10 @@ class Step:
         )
         return f"{self.name}, peak torque {torque} N m: {each}."
 
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "peak_torque": self.peak_torque.tolist(),
-            "predicted_median": self.median.tolist(),
-            "predicted_quantile_99": self.quantile.tolist(),
-            "seen": self.seen.tolist(),
-            "within_quantile": self.within,
-            **({"ended": self.ended} if self.ended else {}),
-        }
+    def played(self) -> PlayedStep:
+        """As the result keeps it."""
+        median, quantile, seen = (tuple(map(tuple, rows.tolist())) for rows in (self.median, self.quantile, self.seen))
+        return PlayedStep(self.name, tuple(self.peak_torque.tolist()), median, quantile, seen, self.within)
 
 
 @dataclass(frozen=True)
@@ -103,7 +96,7 @@ class Player:
         samples = load_samples(folder.samples_path, len(config.joints))
         peaks = peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
         prediction = found.prediction
-        step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks, str(error or ""))
+        step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks)
         self.say(str(step))
         if isinstance(error, SafetyStop):
             self.say(f"{name} ended early: {error}")
