@@ -19,11 +19,11 @@ from hil.drivers.sync_read import Span
 _PROBES = 3
 """How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
 
-STATUS_S = 0.04
-"""From one status of a servo to its next [s]."""
+STATUS_S = 0.035
+"""From one status of the servos to the next [s]."""
 
-SHORT_STATUS_S = 0.08
-"""The same where each costs a sample of the servo's state [s]."""
+_SHARE, _MOST_SHARE = 0.6, 0.9
+"""Of a cycle that a status may take on the wire; adapter and computer need the rest."""
 
 _INTERRUPTS_BORNE = 5
 """How often confirming that a servo is off is begun again after an interrupt."""
@@ -211,20 +211,17 @@ class ServoBus:
         )
 
     def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Span | None, int]:
-        """What each servo tells of itself in its turn, and the cycles between two turns; None where there is no time.
-
-        Where a cycle is too short for it beside the state, servos that measure their motor's current go without: that
-        they are driven shows in every sample. The others give it in place of their state.
-        """
+        """What the servos tell of themselves and the cycles from one time to the next; None where there is no time."""
         interval, mode, count = self.config.interval, self.joints[0].mode, len(self.joints)
         if not interval:
             return None, 0
-        state, whole = spans(mode, tables)[0], status_span(mode, tables)
-        taken = 24 + 8 * count + (count - 1) * (11 + state.size) + 11 + whole.size  # bytes of goals, request, replies
-        if self.port.wire_time(taken) + return_delay * count + self.port.latency < interval:
-            return whole, max(1, round(STATUS_S / count / interval))
-        if any(joint.servo.senses_supply for joint in self.joints):
-            return status_span(mode, tables, short=True), max(2, round(SHORT_STATUS_S / count / interval))
+        # Without a sensor in the motor lost torque shows in Torque Enable first, so that is worth a late sample.
+        share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
+        for whole in (True, False):
+            span = status_span(mode, tables, whole=whole)
+            taken = self.port.wire_time(28 + 4 * count + count * (11 + span.size))  # goals, request, replies
+            if taken + return_delay * count < share * interval:
+                return span, max(1, round(STATUS_S / interval))
         return None, 0
 
     @property

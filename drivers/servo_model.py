@@ -73,7 +73,8 @@ class ServoModel:
     position_steps: ticks of Present Position per turn.
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that answers Fast Sync Read; None where no firmware does.
-    senses_supply: whether Present Current is what the supply gives and not what the motor carries.
+    senses_supply: whether Present Current is the supply's, which is the motor's times the share of time in which its
+    bridge is on: far less than what is commanded while the joint is slow.
     """
 
     name: str

@@ -19,7 +19,7 @@ from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import Servo
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 
 class DescriptionError(ValueError):

@@ -57,9 +57,11 @@ class ManyArms:
 
     @property
     def joints(self) -> int:
-        return self.scale.shape[1]
+        return int(self.scale.shape[1])
 
-    def peaks(self, multisines: Sequence[Commands], rate: float, settling: Settling) -> tuple[Array, npt.NDArray[np.int64]]:
+    def peaks(
+        self, multisines: Sequence[Commands], rate: float, settling: Settling
+    ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Extreme values of every arm (arms, 5, joints): lowest and highest angle [rad], speed [rad/s], supposed torque
         [N m], supposed torque times speed [W]; and after how many periods of the first multisine it was settled, 0
         where it never was, which ends its experiment.

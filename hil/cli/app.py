@@ -193,7 +193,7 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
     from hil.setup.preflight import Level, check_arm
 
     checked = load_config(config)
-    fakes.register()
+    fakes.register_for(checked.url)
     with Terminal(quiet=json_only).busy("Looking"):
         findings = list(check_arm(checked))
     print(json.dumps(found(findings))) if json_only else print_findings(findings, config)

@@ -21,7 +21,7 @@ from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm
 from hil.fakes.names import find_arm
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
 
@@ -121,7 +121,9 @@ class PriorConfig(_Table):
     """
 
     spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
-    rough_spread: PositiveFloat | None = Field(None, le=1, description="of each value guessed; each its own unless given")
+    rough_spread: PositiveFloat | None = Field(
+        None, le=1, description="of each value guessed; each its own unless given"
+    )
     link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
     link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
     link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
@@ -155,6 +157,9 @@ class ExperimentConfig(_Table):
     ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
     settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
+    drift_within: float = Field(
+        0.05, ge=0, lt=1, description="the same, of a motion that still drifts after max_settling_periods"
+    )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="settled periods used")
     held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")
@@ -402,7 +407,12 @@ def port_url(port: str) -> str:
     """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
     one, or the fake arm of that name; raises ConfigError.
     """
-    fakes.register()
+    url = _url_of(port)
+    fakes.register_for(url)
+    return url
+
+
+def _url_of(port: str) -> str:
     if "://" in port:
         return port
     config = find_config(Path(port))

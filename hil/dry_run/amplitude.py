@@ -78,9 +78,7 @@ def with_peaks(config: Config, peak_torque: Array) -> Plan:
     return make_plan(config.model_copy(update={"experiment": experiment}))
 
 
-def _search(
-    config: Config, base: Plan, ensemble: Ensemble, share: float, pose: Array | None, most: Array
-) -> Array:
+def _search(config: Config, base: Plan, ensemble: Ensemble, share: float, pose: Array | None, most: Array) -> Array:
     """Joint by joint towards the limits; the joints pull at each other, so it takes some rounds."""
     torque = base.segments[0].peak_torque
     first = base.first_segment() if ensemble.source == "prior" else base

@@ -77,7 +77,9 @@ def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
         known = getattr(given, name, None)
         if known is not None:
             return Quantity(np.array(known), np.full(len(models), given.spread))
-        return Quantity(value, np.broadcast_to(spread if given.rough_spread is None else given.rough_spread, len(models)))
+        return Quantity(
+            value, np.broadcast_to(spread if given.rough_spread is None else given.rough_spread, len(models))
+        )
 
     def of_servo(name: str, more: Array | float = 0.0) -> Quantity:
         guesses = [getattr(prior, name) for prior in priors]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
-from hil.estimation.settled_period import settling_difference
+from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
 from hil.estimator.simulation.many_arms import Commands

@@ -14,6 +14,7 @@ from hil.estimator.models.parameters import Physics
 from hil.plan.plan import Plan, Segment, period_current
 from hil.plan.stabiliser import feedback_of
 
+
 def roomy_plan(config: Config, physics: Physics) -> Plan:
     """The configuration's plan, each multisine played the way that uses most of the position range on `physics`.
 
@@ -70,11 +71,6 @@ def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> 
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])
     limits = Limits(low, high, velocity, _torque_limits(config))
     return Problem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
-
-
-def plain_wave(config: Config, seed: int) -> Multisine:
-    """The low-crest multisine of this seed, at the torque limits."""
-    return _plain_segment(config, seed).multisine
 
 
 def _plain_segment(config: Config, seed: int) -> Segment:

@@ -40,7 +40,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
     plan = make_plan(config) if plan is None else plan
-    fakes.register()
+    fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, ServoBus.open(config.bus) as bus:
         clock = bus.port.clock
 

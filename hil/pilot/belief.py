@@ -153,9 +153,7 @@ def _of_draws(draws: dict[str, Array], seed: int) -> Belief:
     fixed = {name: float(values[0]) for name, values in draws.items() if np.ptp(values) == 0.0}
     names = tuple(name for name in draws if name not in fixed)
     scale = np.array([draws[name].std() for name in names])
-    columns = [
-        draws[name] / draws[name].std() if name.startswith(_LINEAR) else np.log(draws[name]) for name in names
-    ]
+    columns = [draws[name] / draws[name].std() if name.startswith(_LINEAR) else np.log(draws[name]) for name in names]
     return Belief(names, np.stack(columns, axis=1), scale, fixed, seed=seed)
 
 

@@ -27,11 +27,11 @@ def identify_in_steps(
 
     Raises what a run raises, and ExperimentError when a joint does not move at its current limit.
     """
-    search = Search.of(config, run, Player(shown_path, watch, say))
     with StopRequest():  # a request to stop that comes in one step, however late, is for all that would follow
+        search = Search.of(config, run, Player(shown_path, watch, say))
         played = _full(search, *search.find())
-    run.write_starts([search.belief.middle])
-    result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
+        run.write_starts([search.belief.middle])
+        result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
     run.write_result(result)
     return played.torque, result
 

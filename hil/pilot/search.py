@@ -100,8 +100,7 @@ class Search:
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
         """The largest safe one for the arms that could be this one. Raises NoSafeTorque."""
-        found = largest_amplitude(config, self.belief.ensemble(self._farther), share, plan, self.pose, self.cap)
-        return found
+        return largest_amplitude(config, self.belief.ensemble(self._farther), share, plan, self.pose, self.cap)
 
     @property
     def _farther(self) -> float:
@@ -148,7 +147,9 @@ class Search:
         plan = self._waves(config)
         found = self.amplitude(config, 1.0, plan)
         while not self._certain(config, found) and len(self.steps) < MOST_STEPS:
-            self.player.say("What is known so far is too uncertain to go to the limits at once: one more run on the way.")
+            self.player.say(
+                "What is known so far is too uncertain to go to the limits at once: one more run on the way."
+            )
             number = len(self.steps) + 1
             self._play(step_config(config), f"step-{number}", f"Step {number}", only_first(found))
             former, config = found.peak_torque, self.held
@@ -219,7 +220,9 @@ def step_config(config: Config) -> Config:
 
 
 def _is_base(name: str) -> bool:
-    return name.startswith(("inertia", "coupling", "armature", "gravity", "viscous", "coulomb_1", "coulomb_2", "offset"))
+    return name.startswith(
+        ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb_1", "coulomb_2", "offset")
+    )
 
 
 def _and(names: list[str]) -> str:

@@ -25,7 +25,7 @@ Say = Callable[[str], None]
 @dataclass(frozen=True)
 class Step:
     """One run on the way: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
-    (quantities, joints), in hil.dry_run.prediction.QUANTITIES.
+    (quantities, joints), in hil.dry_run.prediction.QUANTITIES. ended: why it ended early, empty where it did not.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Step:
     median: Array
     quantile: Array
     seen: Array
+    ended: str = ""
 
     @property
     def within(self) -> bool:
@@ -53,7 +54,8 @@ class Step:
     def played(self) -> PlayedStep:
         """As the result keeps it."""
         median, quantile, seen = (tuple(map(tuple, rows.tolist())) for rows in (self.median, self.quantile, self.seen))
-        return PlayedStep(self.name, tuple(self.peak_torque.tolist()), median, quantile, seen, self.within)
+        torque = tuple(self.peak_torque.tolist())
+        return PlayedStep(self.name, torque, median, quantile, seen, self.within, self.ended or None)
 
 
 @dataclass(frozen=True)
@@ -96,12 +98,14 @@ class Player:
         samples = load_samples(folder.samples_path, len(config.joints))
         peaks = peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
         prediction = found.prediction
-        step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks)
+        step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks, str(error or ""))
         self.say(str(step))
         if isinstance(error, SafetyStop):
             self.say(f"{name} ended early: {error}")
         if not step.within:
-            self.say(f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed.")
+            self.say(
+                f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed."
+            )
         return Played(step, seen_of(config, samples), torque, error)
 
 
