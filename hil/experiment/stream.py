@@ -126,10 +126,14 @@ class Stream:
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                 return
+        if difference <= self._plan.drift_within:
+            self._note(f"{segment.role}: still changes by {difference:.2%} a period, slowly; the last ones are used")
+            return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}. Look for play, a dragging cable or a slipping joint; or raise "
+            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} of what only "
+            "drifts. Look for play, a dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 
