@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError, PeriodicityError, ShapeError
 from hil.estimator.fit.stage1 import fit_lines
@@ -15,6 +16,7 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.options import LikelihoodOptions, SettlingOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
+from hil.estimator.simulation.encoder import measured
 
 LIKELIHOOD = LikelihoodOptions()
 SETTLING = SettlingOptions()
@@ -75,6 +77,7 @@ class Estimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
+@one_blas_thread
 def identify(
     periods: SettledPeriod | Sequence[SettledPeriod],
     model: Model,
@@ -166,7 +169,7 @@ def predict(
         position, end = simulate(physics, state, motor, step)
         change = float(np.abs(end - state).max())
         if change < (settling.atol if period < settling.max_periods - 1 else settling.acceptable):
-            return position
+            return measured(physics, position)
         state = end
     raise PeriodicityError(
         f"after {settling.max_periods} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "

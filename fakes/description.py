@@ -12,13 +12,14 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
 from hil.fakes.bus.hand import Move
 from hil.fakes.bus.supply import Supply
+from hil.fakes.names import arm_names, find_arm
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_plant
 from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import Servo
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 
 class DescriptionError(ValueError):
@@ -166,11 +167,15 @@ class FakeArm(BaseModel):
 
 
 def load_fake(path: Path | str) -> FakeArm:
-    """The [fake] table of a TOML file; the file's other tables are not looked at. Raises `DescriptionError`."""
+    """The [fake] table of a TOML file, or of the arm of that bare name (`hil.fakes.names`); raises `DescriptionError`.
+
+    The file's other tables are not looked at.
+    """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = find_arm(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        known = "" if "." in str(path) or "/" in str(path) else f"; arms known by name: {', '.join(arm_names())}"
+        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}{known}") from error
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

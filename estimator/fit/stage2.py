@@ -17,7 +17,7 @@ from hil.estimator.fit.covariance import by_parameters, correlation_time, robust
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
-from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.fit.reparametrisation import Coordinates, Prior, Sizes, scales_of
 from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
@@ -99,20 +99,22 @@ def _objective(
     """What is minimised, samples weighted by the noise known beforehand, and guesses of the first states."""
     velocity = float(np.sqrt(np.mean([np.mean(motion.velocity**2) for motion in linear.motions])))
     torque = float(np.sqrt(np.mean([np.mean(period.torque**2) for period in periods])))
-    scales = scales_of(model.names, torque, velocity, abs(float(linear.value[0])))
+    sizes = Sizes(torque, velocity, abs(float(linear.value[0])))
+    scales = scales_of(model.names, sizes)
     state_scale = np.repeat([options.angle_scale, velocity], model.joints)
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
     weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0) for period in periods)
     runs = tuple(_simulated(period, options) for period in periods)
     coordinates = Coordinates(model.names, scales, options.coordinates)
     steps = options.minimiser, options.max_relative_decrease
-    return Objective(runs, coordinates, state_scale, weights, *steps), np.concatenate(states)
+    prior = Prior.of(model.names, scales, sizes)
+    return Objective(runs, coordinates, state_scale, weights, prior, *steps), np.concatenate(states)
 
 
 def _simulated(period: SettledPeriod, options: LikelihoodOptions) -> Run:
     if period.stabiliser is None:
         return SimulatedRun.of(period, options.integration)
-    return StabilisedRun.of(period, period.stabiliser)
+    return StabilisedRun.of(period, period.stabiliser, options.integration)
 
 
 def _initial_guesses(

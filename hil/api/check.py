@@ -63,6 +63,6 @@ def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckRepor
         ConfigError: the configuration is wrong.
     """
     checked, shown = loaded(config)
-    fakes.register()
+    fakes.register_for(checked.url)
     on_progress(Progress("check", "Looking"))
     return CheckReport(shown, tuple(check_arm(checked)))

@@ -50,7 +50,8 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "diff": (runs.diff, "runs/before runs/after --png wear.png"),
     "compare": (data.compare, "runs/20261121-153000-fake_two_link"),
     "calibrate": (data.calibrate, "runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147"),
-    "fake": (fake_command.fake, "configs/fake_two_link.toml --pty --link /tmp/arm"),
+    "fake": (fake_command.fake, "koch --pty --link /tmp/arm"),
+    "hand": (fake_command.hand, "/tmp/arm 2:to=0.5 3:ticks=2500,duration=2"),
     "schema": (schema.schema, "--out hil.schema.json"),
 }
 """Every subcommand by name, with the arguments of its example."""

@@ -4,16 +4,20 @@ The modules that do the work are imported inside the commands, so that `hil --he
 """
 
 import json
+import sys
 from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
-from hil.cli.options import ConfigPath, Json
+from hil.cli.options import ConfigPath, Json, PortOrFile
 
 PortOrConfig = Annotated[
     str | None,
-    typer.Argument(metavar="[PORT]", help="Serial port or pyserial URL, or a TOML file; without it: list the ports."),
+    typer.Argument(
+        metavar="[PORT]",
+        help="Serial port or pyserial URL, a TOML file, or a bundled name; without it: list the ports.",
+    ),
 ]
 
 
@@ -62,7 +66,7 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
 
 
 def setup(
-    port: Annotated[str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, or a TOML file.")],
+    port: PortOrFile,
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
     baud: Annotated[int, typer.Option("--baud", help="Its present baud.")] = 1_000_000,
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
@@ -78,6 +82,7 @@ def setup(
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
+    from hil.setup.servo_session import recover
     from hil.setup.servo_settings import open_servo, set_up
 
     if new_baud is not None and new_baud not in BAUD_RATES:
@@ -87,6 +92,8 @@ def setup(
     opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)
+        if written := recover(servo, opened.url):
+            print(f"What an earlier run could not put back is put back: {', '.join(written)}.", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
         changes = set_up(servo, confirm, new_id=new_id, new_baud=new_baud, return_delay_us=return_delay_us)
     finally:

@@ -15,6 +15,9 @@ from hil.cli.options import ConfigPath, Json, OutPath
 if TYPE_CHECKING:
     from hil.api.run import Estimation, Identification
 
+TakeOver = Annotated[
+    bool, typer.Option("--take-over", help="Let an arm that is held sink slowly and take it over. Hold it by hand.")
+]
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="RUN | FILE.csv ..", help="Run folder, or CSV files of one arm with --config.")
 ]
@@ -26,24 +29,24 @@ AllSamples = Annotated[
 ]
 
 
-def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> None:
+def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
     """Excite the arm, take one settled period, print its parameters with error bars."""
     from hil.api.experiment import identify as identify_arm
     from hil.cli.terminal import Terminal
 
     with Terminal(quiet=json_only).following(config) as follow:
-        result = identify_arm(config, out=out, on_progress=follow)
+        result = identify_arm(config, out=out, take_over=take_over, on_progress=follow)
     _show(result, json_only)
 
 
-def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> None:
+def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
     """Play the experiment and keep its recording, for `hil estimate`."""
     from hil.api.experiment import record as record_arm
     from hil.cli.terminal import Terminal
     from hil.results.json_form import to_json
 
     with Terminal(quiet=json_only).following(config) as follow:
-        run = record_arm(config, out=out, on_progress=follow)
+        run = record_arm(config, out=out, take_over=take_over, on_progress=follow)
     if json_only:
         recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
         print(strict_json.dumps(recorded))
