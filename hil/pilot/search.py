@@ -182,8 +182,8 @@ class Search:
         most = ", ".join(f"{torque:.3g}" for torque in most_torque(config))
         raise ExperimentError(
             f"{_and(still)} did not move by {MOVED_STEPS} encoder steps. Tried: {tried}; the current limits allow "
-            f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, look "
-            "at the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
+            f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
+            "look at the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
         )
 
 
