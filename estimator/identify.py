@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError, PeriodicityError, ShapeError
 from hil.estimator.fit.stage1 import fit_lines
@@ -76,6 +77,7 @@ class Estimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
+@one_blas_thread
 def identify(
     periods: SettledPeriod | Sequence[SettledPeriod],
     model: Model,

@@ -18,6 +18,7 @@ from functools import partial
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.recording import Recording
 from hil.estimator.data.segments import Grid, RecordingSegment, cut, grid_torque, grid_torque_slopes
 from hil.estimator.errors import ConvergenceError
@@ -205,6 +206,7 @@ class Shooting:
         return torque[:, part], slopes[:, :, part]
 
 
+@one_blas_thread
 def estimate_by_shooting(
     recordings: Sequence[Recording],
     model: Model,

@@ -100,7 +100,11 @@ def linearised(
     every = (*estimate.names, *added)
     values = {name: known.get(name, term_of(name).absent) for name in added} | estimate.parameters
     physics = Physics.of({**known, **values})
-    run = SimulatedRun.of(used, INTEGRATION) if used.stabiliser is None else StabilisedRun.of(used, used.stabiliser)
+    run = (
+        SimulatedRun.of(used, INTEGRATION)
+        if used.stabiliser is None
+        else StabilisedRun.of(used, used.stabiliser, INTEGRATION)
+    )
     rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
     weight = np.where(np.isfinite(estimate.residual), 1.0 / np.maximum(rms, 1e-300), 0.0)
     causes = len(every) + 2 * period.joints

@@ -117,7 +117,7 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
     lag = physics.lag + max(physics.delay, 0.0)
     moving = without_dry_friction(physics.vector)
-    _respond(
+    respond_compiled(
         *(physics.vector, has_bristles(physics), moving, full, both, gains),
         *(lag, step, steps, finer_pieces(physics, step), position, velocity, torque),
     )
@@ -176,4 +176,4 @@ def _loop(
     state[3, 0], state[3, 1], state[4, 0], state[4, 1] = s1, s2, w1, w2
 
 
-_respond: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)
+respond_compiled: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)
