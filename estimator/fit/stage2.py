@@ -114,7 +114,7 @@ def _objective(
 def _simulated(period: SettledPeriod, options: LikelihoodOptions) -> Run:
     if period.stabiliser is None:
         return SimulatedRun.of(period, options.integration)
-    return StabilisedRun.of(period, period.stabiliser)
+    return StabilisedRun.of(period, period.stabiliser, options.integration)
 
 
 def _initial_guesses(

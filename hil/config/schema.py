@@ -157,6 +157,9 @@ class ExperimentConfig(_Table):
     ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
     settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
+    drift_within: float = Field(
+        0.05, ge=0, lt=1, description="the same, of a motion that still drifts after max_settling_periods"
+    )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="settled periods used")
     held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")

@@ -1,5 +1,6 @@
 """From a run folder to its result: settled period, both stages, the check on a multisine that was not used."""
 
+import logging
 import time
 from dataclasses import replace
 
@@ -27,6 +28,8 @@ from hil.runs.period_file import PlayedPeriod, save_periods
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
 from hil.runs.timing import timing
+
+log = logging.getLogger(__name__)
 
 
 def estimate_run(run: RunFolder) -> SettledResult:
@@ -57,6 +60,9 @@ def estimate_run(run: RunFolder) -> SettledResult:
     if config.stabiliser is not None:
         chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(IDENTIFY))
         result = replace(result, stabiliser=stabiliser_share(config, samples[chosen]))
+    log.info("%s: %s, %d parameters, %.3g s", run.path, result.method, len(result.quantities), seconds)
+    for warning in result.warnings:
+        log.warning("%s: %s", run.path, warning)
     save_periods(run.path, played)
     run.write_result(result)
     return result
