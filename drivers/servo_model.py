@@ -73,6 +73,8 @@ class ServoModel:
     position_steps: ticks of Present Position per turn.
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that answers Fast Sync Read; None where no firmware does.
+    senses_supply: whether Present Current is the supply's, which is the motor's times the share of time in which its
+    bridge is on: far less than what is commanded while the joint is slow.
     """
 
     name: str
@@ -82,6 +84,7 @@ class ServoModel:
     position_steps: int = 4096
     watchdog_firmware: int = 38
     fast_sync_read_firmware: int | None = 45
+    senses_supply: bool = False
 
     @property
     def position_unit(self) -> float:
@@ -146,6 +149,7 @@ _MODELS = (
         1.0e-3,
         (Stall(9.0, 0.61, 0.76), Stall(11.1, 0.80, 0.92), Stall(12.0, 0.88, 1.00)),
         fast_sync_read_firmware=46,
+        senses_supply=True,
     ),
     ServoModel("XL430-W250", None, (Stall(9.0, 1.0, 1.0), Stall(11.1, 1.3, 1.4), Stall(12.0, 1.4, 1.5))),
 )

@@ -10,14 +10,17 @@ from hil.drivers.clock import Clock
 from hil.drivers.packet import MAX_ID
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
+from hil.fakes.bus.hand import Move
 from hil.fakes.bus.supply import Supply
+from hil.fakes.names import arm_names, find_arm
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.chain_arm import ChainArm
 from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_chain, make_plant
+from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import Servo
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 
 class DescriptionError(ValueError):
@@ -33,6 +36,10 @@ class FakeServo(BaseModel):
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
     zero_ticks: Annotated[int, Field(description="Present Position at which the joint's angle is 0")]
     direction: Annotated[int, Field(description="-1 where the servo turns against the joint")] = 1
+    joint: Annotated[
+        int | None,
+        Field(ge=1, description="which joint it moves, from 1; the one behind the last servo's unless given"),
+    ] = None
     firmware: Annotated[int, Field(ge=38, le=255, description="Firmware Version")] = 48
     baud: Annotated[int, Field(description="baud rate the servo is set to")] = 1_000_000
     return_delay_us: Annotated[
@@ -43,6 +50,11 @@ class FakeServo(BaseModel):
     ] = None
     temperature_c: Annotated[float, Field(ge=0, le=255, description="inside the servo [C]")] = 35.0
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
+    senses_supply: Annotated[
+        bool | None,
+        Field(description="whether Present Current is the supply's and not the motor's; as its model has it if absent"),
+    ] = None
+    encoder: Annotated[Encoder, Field(description="errors of Present Position; none unless given")] = PERFECT
     clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="how much too fast its clock runs")] = 0.0
     voltage_limited: Annotated[
         bool, Field(description="whether supply voltage and back-EMF limit the current in current mode too")
@@ -77,7 +89,7 @@ class FakeServo(BaseModel):
 
     @model_validator(mode="after")
     def _known_registers(self) -> Self:
-        table = load_model(self.model).registers
+        table = load_model(self.model, self.firmware).registers
         for name, value in self.registers.items():
             register = table.get(name)
             if register is None or not register.eeprom or not register.writable:
@@ -108,21 +120,41 @@ class FakeArm(BaseModel):
     plant_options: Annotated[dict[str, Any], Field(description="what the factory is called with")] = {}
     supply: Annotated[Supply | None, Field(description="resistance of the supply; none unless given")] = None
     faults: Annotated[tuple[Fault, ...], Field(strict=False, description="what goes wrong, and when")] = ()
+    moves: Annotated[
+        tuple[Move, ...], Field(strict=False, description="what a hand does to limp joints, and when")
+    ] = ()
 
     @model_validator(mode="after")
-    def _one_servo_per_joint(self) -> Self:
+    def _a_servo_for_each_joint(self) -> Self:
         ids = [servo.id for servo in self.servos]
         if len(set(ids)) < len(ids):
             raise ValueError(f"servos: IDs {', '.join(map(str, ids))}: each servo on a bus needs an ID of its own")
         if sum(each is not None for each in (self.arm, self.chain, self.plant)) != 1:
             raise ValueError('give one of the table arm, the table chain and plant = "module:factory"')
         arm = self.arm or self.chain
-        if arm is not None and len(ids) != len(arm.drives):
-            raise ValueError(f"{len(ids)} servos for {len(arm.drives)} drives of the arm: one servo per drive")
+        count = max(self.joints) + 1
+        if set(self.joints) != set(range(count)):
+            moved = ", ".join(str(joint + 1) for joint in self.joints)
+            raise ValueError(f"servos: they move the joints {moved}: each joint from 1 on needs a servo")
+        if arm is not None and count != len(arm.drives):
+            servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")
+            raise ValueError(f"{servos} for {len(arm.drives)} drives of the arm: one servo per drive")
         for fault in self.faults:
             if fault.servo is not None and fault.servo not in ids:
                 raise ValueError(f"faults: {fault.kind} of servo {fault.servo}: the IDs are {', '.join(map(str, ids))}")
+        for move in self.moves:
+            if move.servo not in ids:
+                raise ValueError(f"moves: servo {move.servo}: the IDs are {', '.join(map(str, ids))}")
         return self
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Which joint each servo moves, counted from 0."""
+        moved: list[int] = []
+        for servo in self.servos:
+            behind = moved[-1] + 1 if moved else 0
+            moved.append(behind if servo.joint is None else servo.joint - 1)
+        return tuple(moved)
 
     def make_plant(self) -> Plant:
         """The mechanism, at its start at time 0; raises PlantError."""
@@ -132,8 +164,10 @@ class FakeArm(BaseModel):
             return make_chain(self.chain)
         name = self.plant or ""
         plant = load_plant(name, self.plant_options)
-        if plant.joints != len(self.servos):
-            raise PlantError(f'plant = "{name}" has {plant.joints} joints for {len(self.servos)} servos')
+        count = max(self.joints) + 1
+        if plant.joints != count:
+            servos = f"{len(self.servos)} servos" + (f" on {count}" if count != len(self.servos) else "")
+            raise PlantError(f'plant = "{name}" has {plant.joints} joints for {servos}')
         return plant
 
 
@@ -155,11 +189,15 @@ def found_beside(folder: Path, name: str) -> Path:
 
 
 def load_fake(path: Path | str) -> FakeArm:
-    """The [fake] table of a TOML file; the file's other tables are not looked at. Raises `DescriptionError`."""
+    """The [fake] table of a TOML file, or of the arm of that bare name (`hil.fakes.names`); raises `DescriptionError`.
+
+    The file's other tables are not looked at.
+    """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = find_arm(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        known = "" if "." in str(path) or "/" in str(path) else f"; arms known by name: {', '.join(arm_names())}"
+        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}{known}") from error
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -180,7 +218,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     """
     servos = [
         Servo(
-            load_model(servo.model),
+            load_model(servo.model, servo.firmware),
             servo.id,
             zero_ticks=servo.zero_ticks,
             direction=servo.direction,
@@ -191,6 +229,8 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
             temperature_c=servo.temperature_c,
             registers=servo.registers,
             current_noise_a=servo.current_noise_a,
+            encoder=servo.encoder,
+            senses_supply=servo.senses_supply,
             clock_error_ppm=servo.clock_error_ppm,
             voltage_limited=servo.voltage_limited,
             thermal=servo.thermal,
@@ -203,9 +243,11 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         servos,
         fake.make_plant(),
         clock,
+        joints=fake.joints,
         adapter_latency_us=fake.adapter_latency_us,
         supply=fake.supply,
         seed=fake.seed,
     )
     bus.faults.add(*fake.faults)
+    bus.hand.move(*fake.moves)
     return bus

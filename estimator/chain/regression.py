@@ -15,7 +15,7 @@ from hil.estimator.baselines.idim import ORDER, PER_CYCLE, TRIM, uniform
 from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.prior import Prior
 from hil.estimator.chain.stage1 import PASSES, columns_of, solve
-from hil.estimator.data.fourier import Motion
+from hil.estimator.data.fourier import PeriodicMotion
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 
@@ -49,7 +49,7 @@ def _rows(recording: Recording, model: ChainModel, cutoff: float, delay: float) 
     sos = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
     smooth = sosfiltfilt(sos, position, axis=1)
     velocity = np.gradient(smooth, dt, axis=1)
-    motion = Motion(smooth, velocity, np.gradient(velocity, dt, axis=1))
+    motion = PeriodicMotion(smooth, velocity, np.gradient(velocity, dt, axis=1))
     Y = sosfiltfilt(sos, columns_of(model, motion), axis=1)
     tau = sosfiltfilt(sos, torque, axis=1)
     return Y[:, trim:-trim:keep], tau[:, trim:-trim:keep]

@@ -12,7 +12,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.prior import Prior
-from hil.estimator.data.fourier import Lines, Motion, cut_off, held_lines, lines_of, motion_of
+from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 
 COULOMB_WIDTH = 0.05  # rad/s: about the velocity that the dropped lines leave in a sticking joint
@@ -29,7 +29,7 @@ class ChainLinear:
     """Standard errors if the residual were white."""
     delay: float
     """Of the motors' torque [s]."""
-    motions: tuple[Motion, ...]
+    motions: tuple[PeriodicMotion, ...]
     """Each period's motion from its lines."""
     relative_residual: Array
     """RMS of the torque left over that of the torque (joints,)."""
@@ -54,7 +54,7 @@ def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior)
     return ChainLinear(theta[:-1], std[:-1], float(theta[-1]), motions, left / np.maximum(level, 1e-12))
 
 
-def columns_of(model: ChainModel, motion: Motion) -> Array:
+def columns_of(model: ChainModel, motion: PeriodicMotion) -> Array:
     """The regressor of `ChainModel.linear_names` (joints, samples, names)."""
     rigid = model.base.regressor(motion.position, motion.velocity, motion.acceleration)
     joints, samples, count = rigid.shape
@@ -87,7 +87,7 @@ def solve(columns: Array | Lines, torque: Array | Lines, weight: Array, prior: P
     return theta / norm, spread / norm
 
 
-def _equations(period: SettledPeriod, motion: Motion, highest: int, model: ChainModel) -> tuple[Lines, Lines]:
+def _equations(period: SettledPeriod, motion: PeriodicMotion, highest: int, model: ChainModel) -> tuple[Lines, Lines]:
     """One period's columns (joints, lines, unknowns) and torques (joints, lines), line by line."""
     Y = columns_of(model, motion)
     columns = np.stack([np.fft.rfft(rows, axis=0)[: highest + 1] for rows in Y]) / period.samples

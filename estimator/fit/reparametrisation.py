@@ -1,27 +1,22 @@
 """Unconstrained coordinates for the likelihood: no step of it can leave the physical parameters.
 
-Positive parameters are exponentials. Coupling is sqrt(inertia_1 inertia_2) tanh(z), which every arm of
-positive masses obeys and which keeps the mass matrix positive definite; the asymmetry of viscous friction is
+What range a parameter has, its scale and its longest step is declared in `hil.estimator.models.terms`. Positive
+parameters are exponentials. Coupling is a share of its bound, sqrt(inertia_1 inertia_2) tanh(z), which every arm of
+positive masses obeys and which keeps the mass matrix positive definite; so is the asymmetry of viscous friction,
 viscous tanh(z), which keeps friction positive both ways. The width of the Coulomb step stays above a floor.
-Gravity, offsets, ripple, the joints' zeros and delay may have either sign.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.models.terms import Scale, joint_of, term_of
+from hil.estimator.options import CoordinateOptions
 
-LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
-MOST_COUPLING = 0.95  # of its bound, at the start
-BEND = 0.01  # rad: much of it, for friction that yields before it slides
-NEAREST = 1e-3  # of a width's floor: what always stays above it, or no step would lead back
-WIDENING = 2.0  # of a width, in one step
-STRIBECK = ("stribeck_rise", "stribeck_velocity")
-RESHAPING = 1.0  # of the logarithms of these, in one step
-EITHER_SIGN = ("gravity", "offset", "delay", "ripple_sin", "ripple_cos", "ripple_cycles", "zero")
+TYPICAL_SATURATION = 0.02  # of the RMS torque: much to lose; only a scale
+TYPICAL_BEND = 0.01  # rad: much, for friction that yields before it slides; only a scale
 
 
 @dataclass(frozen=True)
@@ -32,8 +27,7 @@ class Coordinates:
     """Parameters, as in `Model.names`."""
     scales: Array
     """Scale of each parameter (parameters,) [its unit], by `scales_of`."""
-    width_floor: float
-    """What the width of every Coulomb step stays above [rad/s]."""
+    options: CoordinateOptions
 
     def values(self, x: Array) -> Array:
         """Parameters (parameters,) at the coordinates `x` (parameters,)."""
@@ -45,11 +39,12 @@ class Coordinates:
 
     def coordinates(self, value: Array) -> Array:
         """Coordinates of the parameters `value` (parameters,), moved into the physical range."""
-        above = np.maximum(value - self._floors, LEAST_SHARE * self.scales)
+        above = np.maximum(value - self._floors, self.options.min_initial * self.scales)
         x = np.where(self._either_sign, value / self.scales, np.log(above))
         for share, first, second in self._shares:
             part = value[share] / np.sqrt(above[first] * above[second])
-            x[share] = np.arctanh(np.clip(part, -MOST_COUPLING, MOST_COUPLING))
+            most = self.options.max_initial_share
+            x[share] = np.arctanh(np.clip(part, -most, most))
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
@@ -60,19 +55,22 @@ class Coordinates:
         """
         y = x + step
         widths = np.flatnonzero(self._floors)
-        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), NEAREST * self.width_floor))
+        least = self.options.min_width * self.options.width_floor
+        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), least))
         return y
 
-    def limit(self, x: Array, least: Array, most: Array, narrowing: float) -> None:
-        """Lower in place what coordinates may change by in one step from `x` (coordinates,), if it is the shape of
-        friction near standstill: a width by no more than its share `narrowing` and by WIDENING, others by RESHAPING.
+    def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
+        """Lower in place what coordinates may change by in one step from `x` (coordinates,), where less is declared of
+        them: a width relative to itself, others by their `Term.max_step`.
 
         One that shrinks to nothing in a single step leaves no trace in the motion that would bring it back.
         """
-        least[self._shapes], most[self._shapes] = -RESHAPING, RESHAPING
+        least[: x.size] = np.maximum(least[: x.size], -self._longest)
+        most[: x.size] = np.minimum(most[: x.size], self._longest)
         widths = np.flatnonzero(self._floors)
-        share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
-        least[widths], most[widths] = np.maximum(-1.0, -narrowing * share), WIDENING * share
+        share = 1.0 + self.options.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
+        least[widths] = np.maximum(-1.0, -max_relative_decrease * share)
+        most[widths] = self.options.max_relative_increase * share
 
     def slopes(self, x: Array) -> Array:
         """Derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
@@ -86,45 +84,78 @@ class Coordinates:
 
     @cached_property
     def _either_sign(self) -> Array:
-        return np.array([_kind(name) in EITHER_SIGN for name in self.names])
+        return np.array([term_of(name).range == "any" for name in self.names])
 
     @cached_property
     def _floors(self) -> Array:
-        return np.array([self.width_floor if _kind(name) == "coulomb_width" else 0.0 for name in self.names])
+        return np.array([self.options.width_floor if term_of(name).range == "floor" else 0.0 for name in self.names])
 
     @cached_property
-    def _shapes(self) -> list[int]:
-        return [i for i, name in enumerate(self.names) if _kind(name) in STRIBECK]
+    def _longest(self) -> Array:
+        return np.array([term_of(name).max_step or np.inf for name in self.names])
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
         """Indices of what is bounded by the geometric mean of two others, and of the two."""
-        bounds = {"coupling": ("inertia_1", "inertia_2")}
-        for joint in (1, 2):
-            bounds[f"viscous_asymmetry_{joint}"] = (f"viscous_{joint}", f"viscous_{joint}")
-        index = self.names.index
-        return [(index(name), index(a), index(b)) for name, (a, b) in bounds.items() if name in self.names]
+        shares = []
+        for share, name in enumerate(self.names):
+            bounds, joint = term_of(name).share_of, joint_of(name)
+            if bounds is not None:
+                first, second = (bound if joint is None else f"{bound}_{joint}" for bound in bounds)
+                shares.append((share, self.names.index(first), self.names.index(second)))
+        return shares
 
 
-def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: float) -> Array:
-    """Scale of each parameter (parameters,).
+@dataclass(frozen=True)
+class Prior:
+    """What is expected of the parameters before any measurement: normal distributions of independent coordinates."""
 
-    From RMS torque [N m], RMS velocity [rad/s] and an inertia [kg m^2] of the arm and its motion.
-    """
-    scale: Mapping[str, float] = {
-        **dict.fromkeys(("inertia", "coupling", "armature"), inertia),
-        **dict.fromkeys(("gravity", "coulomb", "offset"), torque),
-        **dict.fromkeys(("viscous", "viscous_asymmetry", "presliding_damping"), torque / velocity),
-        "presliding_stiffness": torque / BEND,
-        **dict.fromkeys(("ripple_sin", "ripple_cos", "ripple_cycles", "zero"), 0.02),
-        "stribeck_velocity": velocity,
-        "coulomb_width": 0.05,
-        **dict.fromkeys(("stribeck_rise", "load", "torque_scale"), 1.0),
-        **dict.fromkeys(("delay", "lag"), 1e-3),
-    }
-    return np.array([scale[_kind(name)] for name in names])
+    centre: Array
+    """(parameters,) [coordinates]."""
+    precision: Array
+    """Inverse variances (parameters,), 0 where nothing is expected."""
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], scales: Array, sizes: "Sizes") -> "Prior":
+        """As `Term.spread` declares it, of coordinates with these scales."""
+        terms = [term_of(name) for name in names]
+        spread = np.array([np.inf if term.spread is None else sizes.of(term.spread) for term in terms])
+        signed = np.array([term.range == "any" for term in terms])
+        absent = np.array([term.absent for term in terms])
+        # Around its absent value the logarithm of a factor changes as the factor itself does.
+        centre = np.where(signed, absent / scales, np.log(np.where(signed | (absent <= 0.0), 1.0, absent)))
+        return cls(centre, (np.where(signed, scales, absent) / spread) ** 2)
+
+    def cost(self, x: Array) -> float:
+        """What the coordinates `x` (parameters,) add to the sum of squares."""
+        return float(np.sum(self.precision * (x - self.centre) ** 2))
 
 
-@cache
-def _kind(name: str) -> str:
-    return name.rstrip("_12")
+@dataclass(frozen=True)
+class Sizes:
+    """Scales of an arm and its motion."""
+
+    torque: float
+    """RMS [N m]."""
+    velocity: float
+    """RMS [rad/s]."""
+    inertia: float
+    """[kg m^2]."""
+
+    def of(self, scale: Scale | float) -> float:
+        """The number that a declared scale means here."""
+        if not isinstance(scale, str):
+            return scale
+        return {
+            "inertia": self.inertia,
+            "torque": self.torque,
+            "velocity": self.velocity,
+            "damping": self.torque / self.velocity,
+            "stiffness": self.torque / TYPICAL_BEND,
+            "saturation": TYPICAL_SATURATION / self.torque**2,
+        }[scale]
+
+
+def scales_of(names: tuple[str, ...], sizes: Sizes) -> Array:
+    """Scale of each parameter (parameters,)."""
+    return np.array([sizes.of(term_of(name).scale) for name in names])

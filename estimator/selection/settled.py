@@ -8,7 +8,7 @@ without meaning would. Without another motion the Bayesian information criterion
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -17,10 +17,11 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.identify import Estimate, identify, predict
-from hil.estimator.models.model import Drive, Model
+from hil.estimator.models.model import Model
+from hil.estimator.models.terms import Drive
+from hil.estimator.options import SelectionOptions
 
-WORTH = 0.98  # of the score of the best so far: what another term must reach to be kept
-EXPLAINED = 1.05  # error of prediction in units of the noise: nothing is left for another term
+DEFAULTS = SelectionOptions()
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def choose(
     *,
     torque_scale: bool = False,
     starts: Sequence[Mapping[str, float]] = (),
+    options: SelectionOptions = DEFAULTS,
 ) -> Choice:
     """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
 
@@ -91,17 +93,19 @@ def choose(
     tried = partial(_try, periods, held_out, starts)
     joints = periods[0].joints
     for step in _ladder(joints, drive):
-        model = replace(step, torque_scale=torque_scale)
-        trial = tried(model if best is None else _on_top(model, best.model), hasty=True)
+        model = step.having("torque_scale") if torque_scale else step
+        trial = tried(model if best is None else _on_top(model, best.model), coarse=True)
         trials.append(trial)
-        if best is None or (trial.score < WORTH * best.score and _beyond_chance(trial.estimate, best.estimate)):
+        if best is None or (
+            trial.score < options.keep_ratio * best.score and _beyond_chance(trial.estimate, best.estimate)
+        ):
             best = trial
-        if best.score < EXPLAINED:
+        if best.score < options.explained_error:
             break
     if best is None or best.estimate is None:
         raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
-    if best.score >= EXPLAINED:
-        best = tried(best.model, hasty=False)
+    if best.score >= options.explained_error:
+        best = tried(best.model, coarse=False)
     return Choice(tuple(trials), best)
 
 
@@ -109,16 +113,16 @@ def _ladder(joints: int, drive: Drive) -> Iterator[Model]:
     yield Model(joints, "coulomb", drive)
     yield Model(joints, "stribeck", drive)
     yield Model(joints, "stribeck_load", drive)
-    yield Model(joints, "stribeck_load", drive, ripple=True)
-    yield Model(joints, "stribeck_load", drive, presliding=True)
-    yield Model(joints, "coulomb", drive, asymmetry=True)
+    yield Model(joints, "stribeck_load", drive, {"ripple"})
+    yield Model(joints, "stribeck_load", drive, {"presliding"})
+    yield Model(joints, "coulomb", drive, {"asymmetry"})
 
 
 def _on_top(model: Model, best: Model) -> Model:
     """Direction is added to the best so far; presliding and ripple only show with all of friction in place."""
-    if model.asymmetry:
-        return replace(best, asymmetry=True)
-    return replace(model, ripple=model.ripple or best.ripple)
+    if "asymmetry" in model.options:
+        return best.having("asymmetry")
+    return model.having("ripple") if "ripple" in best.options else model
 
 
 def _beyond_chance(richer: Estimate | None, plainer: Estimate | None) -> bool:
@@ -140,12 +144,12 @@ def _try(
     starts: Sequence[Mapping[str, float]],
     model: Model,
     *,
-    hasty: bool,
+    coarse: bool,
 ) -> Trial:
     started = time.perf_counter()
     relative = None
     try:
-        estimate = identify(periods, model, hasty=hasty, starts=starts)
+        estimate = identify(periods, model, coarse=coarse, starts=starts)
         if held_out is None:
             score = _criterion(estimate, periods)
         else:

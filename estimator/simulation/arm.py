@@ -2,13 +2,15 @@
 
 The equations are those of `hil.estimator.models.regressor` with a friction law that is smooth:
 
-    motor torque = torque_scale torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
+    given torque = torque_scale torque (1 - saturation (torque_scale torque)^2)
+    motor torque = given torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
     friction(v) = viscous v + viscous_asymmetry |v| + level(v) tanh(v / width)
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
 
-with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb level itself is the offset. With
-presliding the term level(v) tanh(v / width) makes way for the bristles of `hil.estimator.simulation.bristles`.
-`hil.estimator.simulation.sensitivity` differentiates these equations and this scheme.
+and cable_stiffness q beside friction, with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb
+level itself is the offset. With presliding the term level(v) tanh(v / width) makes way for the bristles of
+`hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these equations and this
+scheme.
 
 Each step is the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999): L-stable for the
 slope of the friction, which its Jacobian holds, and of second order whatever else that Jacobian leaves out.
@@ -25,16 +27,26 @@ import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.models.parameters import Physics
+from hil.estimator.models.parameters import Physics, place_of
+from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
 
-LONGEST_STEP = 0.85e-3  # s
-MOST_PIECES = 64
+# Of joint 1 in `Physics.vector`; joint 2 follows.
+VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING = map(
+    place_of, ("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity")
+)
+LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
+    place_of, ("load", "viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale")
+)
+SATURATION, CABLE = map(place_of, ("saturation", "cable_stiffness"))
+
+INTEGRATION = IntegrationOptions()
+MAX_SUBSTEPS = INTEGRATION.max_substeps
 FADED = 40.0  # e to minus this is lost beside 1, and takes a library longer than any other power
 GAMMA = 1.0 - math.sqrt(0.5)
 
 
-def steps_per_sample(rate: float, longest: float = LONGEST_STEP) -> int:
+def steps_per_sample(rate: float, longest: float = INTEGRATION.max_step) -> int:
     """Integration steps of at most `longest` [s] in one sample at `rate` [1/s]."""
     return math.ceil(1.0 / (rate * longest))
 
@@ -61,7 +73,7 @@ def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tupl
     return position[:joints], state[:, :joints]
 
 
-def finer_pieces(physics: Physics, step: float, most: int = MOST_PIECES) -> int:
+def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> int:
     """Finer steps in place of one of `step` [s] near standstill, at most `most`.
 
     Dry friction turned round may carry a joint across a quarter of its step's width in one of them. A power of
@@ -90,22 +102,23 @@ def bend_at(v: float, sharp: float) -> tuple[float, float]:
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
 def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, float]:
     """Torque that a drive leaves its joint after friction, and the slope of that friction."""
-    c = 6 + joint
-    t *= p[c + 24]
-    if p[c + 20] != 0.0:
-        t *= 1.0 + p[c + 16] * math.sin(p[c + 20] * q) + p[c + 18] * math.cos(p[c + 20] * q)
-    level = p[c + 2] * (1.0 + p[c + 8] * bump_at(v / p[c + 10])) + p[c + 12] * abs(t)
-    bend, bent = bend_at(v, 1.0 / p[c + 6])
-    left = t - p[c + 4] - p[c] * v - (p[c + 14] * v + level) * bend
-    return left, p[c] + level * bent
+    viscous, cycles = p[VISCOUS + joint], p[CYCLES + joint]
+    t *= p[SCALE + joint]
+    t -= p[SATURATION + joint] * t * t * t
+    if cycles != 0.0:
+        t *= 1.0 + p[SINE + joint] * math.sin(cycles * q) + p[COSINE + joint] * math.cos(cycles * q)
+    level = p[COULOMB + joint] * (1.0 + p[RISE + joint] * bump_at(v / p[FADING + joint])) + p[LOAD + joint] * abs(t)
+    bend, bent = bend_at(v, 1.0 / p[WIDTH + joint])
+    left = t - p[OFFSET + joint] - p[CABLE + joint] * q - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
+    return left, viscous + level * bent
 
 
 def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:
     """Mass matrix's first row, torques left for acceleration, and the slopes of friction."""
     left_1, slope_1 = _drive(p, 0, q1, v1, t1)
     left_2, slope_2 = _drive(p, 1, q2, v2, t2)
-    q1 += p[28]
-    q2 += p[29]
+    q1 += p[ZERO]
+    q2 += p[ZERO + 1]
     cos_1, sin_1, cos_2, sin_2 = math.cos(q1), math.sin(q1), math.cos(q2), math.sin(q2)
     across = p[1] * cos_2
     turning = p[1] * sin_2
@@ -126,8 +139,9 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
     From velocities [rad/s] and the last accelerations [rad/s^2].
     """
     ahead = 2.0 * left * piece
-    near_1 = (p[8] > 0.0) & ((min(abs(v1), abs(v1 + ahead * a1)) < 6.0 * p[12]) | (v1 * (v1 + ahead * a1) < 0.0))
-    near_2 = (p[9] > 0.0) & ((min(abs(v2), abs(v2 + ahead * a2)) < 6.0 * p[13]) | (v2 * (v2 + ahead * a2) < 0.0))
+    u1, u2 = v1 + ahead * a1, v2 + ahead * a2
+    near_1 = (p[COULOMB] > 0.0) & ((min(abs(v1), abs(u1)) < 6.0 * p[WIDTH]) | (v1 * u1 < 0.0))
+    near_2 = (p[COULOMB + 1] > 0.0) & ((min(abs(v2), abs(u2)) < 6.0 * p[WIDTH + 1]) | (v2 * u2 < 0.0))
     return 1 if near_1 | near_2 else left
 
 

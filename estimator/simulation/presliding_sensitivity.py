@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import SLIDING, Physics
-from hil.estimator.simulation.arm import MOST_PIECES, pieces_now
+from hil.estimator.simulation.arm import MAX_SUBSTEPS, pieces_now
 from hil.estimator.simulation.bristles import (
     COULOMB,
     DAMPING,
@@ -22,6 +22,7 @@ from hil.estimator.simulation.bristles import (
     LOAD,
     OFFSET,
     RISE,
+    SATURATION,
     SCALE,
     STIFFNESS,
     VISCOUS,
@@ -58,10 +59,10 @@ class PreslidingSensitive(Sensitive):
         start: Array,
         causes: tuple[str, ...],
         step: float,
-        most_pieces: int = MOST_PIECES,
-        pull: Array | None = None,
+        max_substeps: int = MAX_SUBSTEPS,
+        tracking_stiffness: Array | None = None,
     ) -> None:
-        super().__init__(physics, start, causes, step, most_pieces, pull)
+        super().__init__(physics, start, causes, step, max_substeps, tracking_stiffness)
         *room, at = self._room
         # Dry friction is the bristles' here: within the arm's step its derivatives go nowhere.
         within = at.copy()
@@ -127,6 +128,8 @@ def _bend(
             coulomb, rise, fading, load = p[COULOMB + joint], p[RISE + joint], p[FADING + joint], p[LOAD + joint]
             scale, damping = p[SCALE + joint], p[DAMPING + joint]
             t = scale * commanded
+            cube, eased = t * t * t, 1.0 - 3.0 * p[SATURATION + joint] * t * t
+            t -= p[SATURATION + joint] * cube
             loaded = load if t > 0.0 else -load
             u = v + ahead * faster[joint]
             bump = math.exp(-((u / fading) ** 2))
@@ -143,9 +146,10 @@ def _bend(
             level_by[r + at[RISE + joint]] = coulomb * bump
             level_by[r + at[FADING + joint]] = 2.0 * coulomb * rise * bump * u * u / fading**3
             level_by[r + at[LOAD + joint]] = abs(t)
-            level_by[r + at[SCALE + joint]] = loaded * commanded
+            level_by[r + at[SCALE + joint]] = loaded * commanded * eased
+            level_by[r + at[SATURATION + joint]] = -loaded * cube
             for cause in range(2):
-                level_by[r + at[DELAY + cause]] = loaded * scale * dt[cause, joint]
+                level_by[r + at[DELAY + cause]] = loaded * scale * eased * dt[cause, joint]
             b[joint] = way * level + away * left
             bent = way * b[joint] / level
             z = (2 + joint) * WIDE

@@ -31,8 +31,15 @@ class Drive(BaseModel):
     gear_ratio: Positive = Field(description="turns of the rotor per turn of the joint")
     torque_constant: Positive = Field(description="torque at the output shaft per motor current [N m/A]")
     current_lag: NotNegative = Field(0.0, description="time constant of the current loop, first order [s]")
-    viscous: NotNegative = Field(0.0, description="friction per velocity [N m s/rad]")
-    coulomb: NotNegative = Field(0.0, description="dry friction while sliding fast [N m]")
+    saturation: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
+        0.0, description="share of the torque that is lost at saturation_current"
+    )
+    saturation_current: Positive = Field(1.0, description="current at which that share is lost [A]")
+    viscous: NotNegative = Field(0.0, description="friction per velocity, warm [N m s/rad]")
+    coulomb: NotNegative = Field(0.0, description="dry friction while sliding fast, warm [N m]")
+    cold_viscous: NotNegative = Field(0.0, description="viscous friction at time 0 above the warm one, as a fraction")
+    cold_coulomb: NotNegative = Field(0.0, description="dry friction at time 0 above the warm one, as a fraction")
+    warm_up_time: Positive = Field(60.0, description="time constant in which that goes [s]")
     coulomb_width: NotNegative = Field(
         0.0,
         description="0 sticks; more is smooth, coulomb * tanh(velocity / width) [rad/s]",
@@ -45,6 +52,8 @@ class Drive(BaseModel):
     )
     presliding_damping: NotNegative = Field(0.0, description="of that spring's bending [N m s/rad]")
     offset: Finite = Field(0.0, description="constant torque on the side of the load [N m]")
+    cable_stiffness: NotNegative = Field(0.0, description="of a cable that pulls the joint to cable_angle [N m/rad]")
+    cable_angle: Finite = Field(0.0, description="joint angle where the cable is slack [rad]")
     ripple: NotNegative = Field(0.0, description="torque ripple over the angle, as a fraction of torque")
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
     cogging: NotNegative = Field(0.0, description="amplitude of the cogging torque at the output shaft [N m]")
@@ -55,6 +64,16 @@ class Drive(BaseModel):
     stops: tuple[Finite, Finite] | None = Field(None, strict=False, description="joint angles of the hard stops [rad]")
     stop_stiffness: Positive = Field(200.0, description="of a hard stop [N m/rad]")
     stop_damping: NotNegative = Field(1.0, description="of a hard stop [N m s/rad]")
+
+    @property
+    def warms_up(self) -> bool:
+        """Whether its friction changes with time."""
+        return bool(self.cold_viscous or self.cold_coulomb)
+
+    def coldness(self, time: float) -> tuple[float, float]:
+        """Viscous and dry friction at `time` [s] since it was switched on, in units of the warm ones."""
+        cold = math.exp(-time / self.warm_up_time)
+        return 1.0 + self.cold_viscous * cold, 1.0 + self.cold_coulomb * cold
 
     @model_validator(mode="after")
     def _width_is_resolved(self) -> Self:
@@ -111,20 +130,23 @@ class Arm(BaseModel):
         return self.gravity * math.cos(self.tilt)
 
 
-def base_parameters(arm: Arm | None) -> dict[str, float]:
-    """The truth an identification of this arm should find, by the estimator's names and in its order [SI].
+def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]:
+    """The truth an identification of this arm at `time` [s] should find, by the estimator's names, in its order [SI].
 
-    Empty when there is no `Arm`: of another plant nothing is known here.
+    Empty when there is no `Arm`: of another plant nothing is known here. Without a time, that of warm drives.
 
     What no base parameter stands for is left out: dry friction above Coulomb (Stribeck rise, load), presliding, the
-    current's lag, ripple, cogging, backlash, stops. `gravity` values are those of the tilted plane.
+    current's lag, saturation, ripple, cogging, a cable's stiffness, backlash, stops. `gravity` values are those of the
+    tilted plane; an offset holds what a cable pulls with at angle 0.
     """
     if arm is None:
         return {}
     parameters = _rigid_body(arm)
-    for quantity in ("viscous", "coulomb", "offset"):
-        for joint, drive in enumerate(arm.drives, start=1):
-            parameters[f"{quantity}_{joint}"] = getattr(drive, quantity)
+    drives = list(enumerate(arm.drives, start=1))
+    parameters |= {f"viscous_{joint}": drive.viscous * drive.coldness(time)[0] for joint, drive in drives}
+    parameters |= {f"coulomb_{joint}": drive.coulomb * drive.coldness(time)[1] for joint, drive in drives}
+    pull = {joint: drive.cable_stiffness * drive.cable_angle for joint, drive in drives}
+    parameters |= {f"offset_{joint}": drive.offset - pull[joint] for joint, drive in drives}
     return parameters
 
 

@@ -14,6 +14,7 @@ LONGEST_STEP = 0.6e-3  # s: short against the arm's own motion
 SHORTEST_STEP = 1e-9  # s: less than this is rounding
 STEP_PER_WIDTH = 0.02  # s per rad/s: short against the time the arm takes to cross a smooth friction step
 STEP_PER_SWING = 0.2  # of the time in which a rotor on its bristles swings through one radian of phase
+LEAST_GRIP = 5.0  # N m s/rad between a hand and the joint that it moves
 JAM = 1e6  # N m of dry friction: more than anything here can push
 
 
@@ -21,6 +22,7 @@ class Motor:
     """The laws of one drive. It holds no state of the arm; only its current and its friction's bristles move in it."""
 
     __slots__ = (
+        "_bent",
         "_bristle_damping",
         "_drive",
         "_lag",
@@ -29,11 +31,13 @@ class Motor:
         "_mean_left",
         "_shaped",
         "_step",
+        "_warms_up",
         "_width",
         "bristle_stiffness",
         "bristle_torque",
         "constants",
         "current",
+        "held_at",
         "jammed",
         "longest_step",
         "viscous",
@@ -43,33 +47,52 @@ class Motor:
         self._drive = drive
         self._lag = drive.current_lag
         self._width = drive.coulomb_width
-        self._shaped = bool(drive.ripple or drive.cogging or drive.load or drive.stops)
+        self._shaped = bool(
+            drive.ripple or drive.cogging or drive.load or drive.stops or drive.saturation or drive.cable_stiffness
+        )
+        # Torque falls behind current like 1 / sqrt(1 + x^2), so that the share is lost at that current.
+        self._bent = (1.0 / (1.0 - drive.saturation) ** 2 - 1.0) / (
+            drive.torque_constant * drive.saturation_current
+        ) ** 2
+        self._warms_up = drive.warms_up
         self._step = self._left = self._mean_left = self._level = 0.0
         self._bristle_damping = drive.presliding_damping
         self.bristle_stiffness = drive.presliding_stiffness
         """0 for dry friction that sticks [N m/rad]."""
         self.bristle_torque = 0.0  # N m
-        self.constants = (
-            drive.torque_constant,
-            drive.offset,
-            drive.coulomb,
-            drive.coulomb * drive.stribeck_rise,
-            1.0 / drive.stribeck_velocity,
-        )
-        """Torque constant, offset, Coulomb level, Stribeck rise, 1 / Stribeck velocity."""
-        self.viscous = drive.viscous
+        self._set_friction(0.0)
         self.jammed = False
         """True: something holds the joint fast."""
+        self.held_at: float | None = None
+        """The velocity of a hand that holds the joint [rad/s]; None where none does."""
         self.current = 0.0  # A
         self.longest_step = min(LONGEST_STEP, STEP_PER_WIDTH * self._width) if self._width else LONGEST_STEP
         if self.bristle_stiffness and drive.rotor_inertia:
             swing = sqrt(armature(drive) / self.bristle_stiffness)
             self.longest_step = min(LONGEST_STEP, STEP_PER_SWING * swing)
 
+    def warm_up(self, time: float) -> None:
+        """Friction is from here on what it is at `time` [s] since the drive was switched on."""
+        if self._warms_up:
+            self._set_friction(time)
+
+    def _set_friction(self, time: float) -> None:
+        drive = self._drive
+        viscous, dry = drive.coldness(time)
+        self.constants = (
+            drive.torque_constant,
+            drive.offset,
+            drive.coulomb * dry,
+            drive.coulomb * dry * drive.stribeck_rise,
+            1.0 / drive.stribeck_velocity,
+        )
+        """Torque constant, offset, Coulomb level, Stribeck rise, 1 / Stribeck velocity."""
+        self.viscous = drive.viscous * viscous
+
     @property
     def is_plain(self) -> bool:
         """Whether lag, torque, offset and sticking Stribeck friction are all there is to it."""
-        return not (self._shaped or self._width or self.bristle_stiffness or self.jammed)
+        return not (self._shaped or self._width or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """What the drive does during one step, its angle and velocity given at the step's middle.
@@ -106,6 +129,11 @@ class Motor:
             level = 0.0
         if self.jammed:
             level += JAM
+        if self.held_at is not None:
+            # Stiff enough to take a bare rotor along within one step, and not stiffer: the hand's skin.
+            grip = max(2.0 * armature(self._drive) / step, LEAST_GRIP)
+            torque += grip * (self.held_at - velocity)
+            slope += grip
         return torque, level, slope, command + away * left
 
     def bend(self, step: float, velocity: float) -> None:
@@ -131,9 +159,11 @@ class Motor:
     def _shape(
         self, step: float, torque: float, level: float, angle: float, velocity: float
     ) -> tuple[float, float, float]:
-        """Ripple, cogging, friction from load and stops, which only some drives have."""
+        """Saturation, ripple, cogging, friction from load, a cable and stops, which only some drives have."""
         drive = self._drive
         slope = 0.0
+        if self._bent:
+            torque /= sqrt(1.0 + self._bent * torque * torque)
         if drive.ripple:
             torque *= 1.0 + drive.ripple * sin(drive.ripple_cycles * angle)
         if drive.load:
@@ -142,6 +172,8 @@ class Motor:
             # Its mean over the step: a joint that turns through whole cycles in a step feels nothing of them.
             half = 0.5 * step * drive.cogging_cycles * velocity
             torque += drive.cogging * sin(drive.cogging_cycles * angle) * (sin(half) / half if half else 1.0)
+        if drive.cable_stiffness:
+            torque -= drive.cable_stiffness * (angle - drive.cable_angle)
         if drive.stops is not None:
             low, high = drive.stops
             if angle > high or angle < low:

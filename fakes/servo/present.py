@@ -6,6 +6,8 @@ from random import Random
 from struct import Struct
 
 from hil.drivers.packet import StatusError
+from hil.fakes.servo.controller import POSITION_MODE
+from hil.fakes.servo.encoder import Reading
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
 
@@ -21,6 +23,8 @@ _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 _REALTIME_TICK_WRAP = 32_768
 _REVERSE = 0x01  # of Drive Mode
+_MOST_HOMING_TICKS = 1024
+"""A Homing Offset beyond this is ignored in Position Control Mode (e-Manual, Homing Offset)."""
 _CLEAR_TURNS = b"\x01DXL\x22"
 
 # Realtime Tick, Moving, Moving Status, Present PWM; Present Current (or Load), Velocity, Position; the trajectories.
@@ -43,11 +47,15 @@ class Present:
         clock_rate: float,
         current_noise_a: float,
         noise: Random | None,
+        encoder: Reading,
+        senses_supply: bool,
     ) -> None:
         self.zero_ticks = zero_ticks
         self.direction = direction
         self.sign = direction
-        """+1 or -1: the servo's sense of rotation as it reports it, against the joint's."""
+        """+1 or -1: the sense of the servo's current, velocity and PWM against the joint's."""
+        self.position_sign = direction
+        """The same of its positions, which Reverse Mode inverts on every model."""
         self.jump_ticks = 0
         """By how much the encoder is wrong."""
         self._memory = memory
@@ -56,7 +64,10 @@ class Present:
         self._noise_a = current_noise_a
         self._noise = noise
         self._unit = model.current_unit_a
-        self._imperfect = noise is not None or model.senses_supply
+        self._encoder = encoder
+        self._encoder_is_perfect = encoder.is_perfect
+        self._senses_supply = senses_supply
+        self._imperfect = noise is not None or senses_supply
         self._booted_at = 0.0
         self._turn_ticks = 0
         self._shift = 0
@@ -69,7 +80,8 @@ class Present:
     def derive(self, share: Share) -> None:
         """Take over what registers say; share: of time in which the bridge is on for a current and a velocity."""
         self._reversed = bool(self._memory.get("Drive Mode") & _REVERSE)
-        self.sign = -self.direction if self._reversed else self.direction
+        self.position_sign = -self.direction if self._reversed else self.direction
+        self.sign = self.position_sign if self._model.reverses_all else self.direction
         self._moving_threshold = self._memory.get("Moving Threshold")
         self._share = share
         self._shift_changed()
@@ -77,7 +89,7 @@ class Present:
     def power_up(self, now: float, position: float) -> None:
         """Count time and turns from here."""
         self._booted_at = now
-        self._forget_turns(position)
+        self.forget_turns(position)
 
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """The instruction Clear: forget the turns; the error number. Errors but Result Fail are unsure."""
@@ -87,13 +99,20 @@ class Present:
             return StatusError.DATA_RANGE
         if moving:
             return StatusError.RESULT_FAIL
-        self._forget_turns(position)
+        self.forget_turns(position)
         return StatusError.NONE
 
     def ticks(self, position: float) -> float:
-        """Present Position at a joint angle [rad], before rounding."""
-        ticks = self.zero_ticks + self.direction * position * _TICKS_PER_RAD
+        """Present Position at a joint angle [rad], before rounding and without noise."""
+        ticks = self._encoder.steady(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
         return (TICKS_PER_TURN - ticks if self._reversed else ticks) + self._shift
+
+    def angle(self, ticks: float) -> float:
+        """The joint angle [rad] at a Present Position."""
+        ticks -= self._shift
+        if self._reversed:
+            ticks = TICKS_PER_TURN - ticks
+        return self.direction * (ticks - self.zero_ticks) / _TICKS_PER_RAD
 
     def velocity_ticks(self, velocity: float) -> float:
         """Present Velocity at a joint velocity [rad/s], before rounding."""
@@ -114,7 +133,8 @@ class Present:
             ticks = round(sign * current / unit)
             if ticks > 32_767 or ticks < -32_768:
                 ticks = -32_768 if ticks < 0 else 32_767
-        encoder = round(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
+        angle = self.zero_ticks + self.direction * position * _TICKS_PER_RAD
+        encoder = round(angle if self._encoder_is_perfect else self._encoder.sample(angle))
         if self._reversed:
             encoder = TICKS_PER_TURN - encoder
         return _STATE.pack(ticks, round(sign * velocity * _TICKS_PER_RAD_S), encoder + self._shift + self.jump_ticks)
@@ -141,7 +161,7 @@ class Present:
         """What the current sensor makes of the motor's current [A]."""
         if self._noise is not None:
             current += self._noise.gauss(0.0, self._noise_a)
-        if self._model.senses_supply:
+        if self._senses_supply:
             current *= abs(self._share(current, velocity))
         return current
 
@@ -153,12 +173,18 @@ class Present:
         tick = int((now - self._booted_at) * self._clock_rate * 1000) % _REALTIME_TICK_WRAP
         self._memory.set("Realtime Tick", tick)
 
-    def _forget_turns(self, position: float) -> None:
+    def forget_turns(self, position: float) -> None:
+        """Reset Present Position to its value within one turn (before Homing Offset), the joint being at `position`."""
         self._turn_ticks = 0
         self._shift_changed()
-        raw = round(self.ticks(position)) - self._memory.get("Homing Offset")
+        raw = round(self.ticks(position)) - self._homing_ticks()
         self._turn_ticks = -(raw // TICKS_PER_TURN) * TICKS_PER_TURN
         self._shift_changed()
 
+    def _homing_ticks(self) -> int:
+        offset = self._memory.get("Homing Offset")
+        ignored = abs(offset) > _MOST_HOMING_TICKS and self._memory.get("Operating Mode") == POSITION_MODE
+        return 0 if ignored else offset
+
     def _shift_changed(self) -> None:
-        self._shift = self._turn_ticks + self._memory.get("Homing Offset")
+        self._shift = self._turn_ticks + self._homing_ticks()

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -17,9 +17,11 @@ from hil.cli import data as cli_data
 from hil.cli import dry_run as cli_dry_run
 from hil.cli import init as cli_init
 from hil.cli import results as cli_results
+from hil.cli import runs as cli_runs
 
 if TYPE_CHECKING:
     from hil.config.schema import Config
+    from hil.results.result import SettledResult
 
 app = typer.Typer(
     name="hil",
@@ -35,7 +37,10 @@ ConfigPath = Annotated[
 ]
 PortOrConfig = Annotated[
     str | None,
-    typer.Argument(metavar="[PORT]", help="Serial port or pyserial URL, or a TOML file; without it: list the ports."),
+    typer.Argument(
+        metavar="[PORT]",
+        help="Serial port or pyserial URL, a TOML file, or a bundled name; without it: list the ports.",
+    ),
 ]
 OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default runs/TIME-ARM.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
@@ -87,6 +92,7 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
     from hil.config.schema import load_config
     from hil.errors import ConfigError
     from hil.experiment.run import run_experiment
+    from hil.results.json_form import to_json
     from hil.runs.recording import load_samples
     from hil.runs.run_folder import RunFolder
     from hil.runs.timing import timing
@@ -103,7 +109,11 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
         torque = run_experiment(checked, run, config, watch)
     terminal.say(torque)
     samples = load_samples(run.samples_path, len(checked.joints))
-    recorded = {"run": str(run.path), "samples": len(samples), "timing": timing(samples, checked.experiment.rate)}
+    recorded = {
+        "run": str(run.path),
+        "samples": len(samples),
+        "timing": to_json(timing(samples, checked.experiment.rate)),
+    }
     if json_only:
         print(strict_json.dumps(recorded))
         return
@@ -183,7 +193,7 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
     from hil.setup.preflight import Level, check_arm
 
     checked = load_config(config)
-    fakes.register()
+    fakes.register_for(checked.url)
     with Terminal(quiet=json_only).busy("Looking"):
         findings = list(check_arm(checked))
     print(json.dumps(found(findings))) if json_only else print_findings(findings, config)
@@ -195,7 +205,9 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
     epilog="Example: hil setup /dev/ttyUSB0 --baud 57600 --id 1 --new-id 2 --new-baud 1000000 --return-delay-us 0"
 )
 def setup(
-    port: Annotated[str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, or a TOML file.")],
+    port: Annotated[
+        str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, a TOML file, or a bundled name.")
+    ],
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
     baud: Annotated[int, typer.Option("--baud", help="Its present baud.")] = 1_000_000,
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
@@ -233,6 +245,9 @@ app.command(epilog="Example: hil export runs/20261121-153000-fake_two_link --for
 )
 app.command(epilog="Example: hil init /dev/ttyUSB0 --out my_arm.toml")(cli_init.init)
 app.command("dry-run", epilog="Example: hil dry-run configs/first_time.toml --picture dry_run.png")(cli_dry_run.dry_run)
+app.command(epilog="Example: hil runs runs")(cli_runs.runs)
+app.command(epilog='Example: hil note runs/20261121-153000-fake_two_link --text "new gearbox"')(cli_runs.note)
+app.command(epilog="Example: hil diff runs/before runs/after --png wear.png")(cli_runs.diff)
 app.command(epilog="Example: hil compare runs/20261121-153000-fake_two_link")(cli_data.compare)
 app.command(epilog="Example: hil calibrate runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147")(
     cli_data.calibrate
@@ -247,14 +262,23 @@ def _list_faults(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.command(epilog="Example: hil fake configs/fake_two_link.toml --pty --link /tmp/arm")
+@app.command(epilog="Example: hil fake koch --pty --link /tmp/arm")
 def fake(
-    config: ConfigPath,
+    config: Annotated[
+        Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or the name of an arm; see below.")
+    ],
     pty: Annotated[bool, typer.Option("--pty", help="Serve it on a terminal device until Ctrl-C or SIGTERM.")] = False,
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="Symbolic link to that device.")] = None,
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND[:KEY=VALUE,...]", help="Let this go wrong; may be repeated. See --list-faults."),
+    ] = None,
+    move: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ID:to=RAD[,at=S,duration=S]",
+            help="Let a hand move this servo's joint while its torque is off (or ID:ticks=POSITION); may be repeated.",
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of noise and faults, instead of the file's.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No status line.")] = False,
@@ -263,13 +287,31 @@ def fake(
         typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="Print the kinds of faults and exit."),
     ] = False,
 ) -> None:
-    """Serve the fake arm of a file to any program, in real time; without --pty, say what it is made of."""
+    """Serve a fake arm to any program, in real time; without --pty, say what it is made of.
+
+    Arms by name: koch, viperx_300, open_manipulator_x, fake_two_link and the other fake arms that come with hil.
+    """
     from hil.cli import fake as fake_command
 
     if pty:
-        fake_command.serve_fake(config, link, fault or [], seed, quiet)
+        fake_command.serve_fake(config, link, fault or [], move or [], seed, quiet)
     else:
-        fake_command.describe_fake(config, fault or [], seed)
+        fake_command.describe_fake(config, fault or [], move or [], seed)
+
+
+@app.command(epilog="Example: hil hand /tmp/arm 2:to=0.5 3:ticks=2500,duration=2")
+def hand(
+    device: Annotated[Path, typer.Argument(metavar="DEVICE", help="The terminal that `hil fake --pty` serves.")],
+    moves: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[ID:to=RAD]...", help="Where to: an angle, or ID:ticks=POSITION; also at, duration."),
+    ] = None,
+    release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Let go of this servo's joint.")] = None,
+) -> None:
+    """Move joints of a fake arm whose torque is off, as somebody does who calibrates an arm."""
+    from hil.cli import fake as fake_command
+
+    fake_command.move_by_hand(device, moves or [], release or [])
 
 
 def main() -> NoReturn:
@@ -285,9 +327,9 @@ def main() -> NoReturn:
     sys.exit(0)
 
 
-def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool) -> None:
+def _show(result: "SettledResult", config: "Config", path: Path, json_only: bool) -> None:
     if json_only:
-        print(strict_json.dumps(result))
+        print(strict_json.dumps(result.to_json()))
         return
     from rich.console import Console
 

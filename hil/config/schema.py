@@ -13,12 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from hil import fakes
 from hil.config.bundled import find_config
 from hil.config.known_quantities import KnownConfig
+from hil.config.plausible import implausible
 from hil.drivers.bus import BusConfig
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
+from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm, beside
-from hil.fakes.table_errors import describe
+from hil.fakes.names import find_arm
+from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
 
@@ -118,7 +121,9 @@ class PriorConfig(_Table):
     """
 
     spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
-    rough_spread: PositiveFloat = Field(0.5, le=1, description="of each value guessed from length and model")
+    rough_spread: PositiveFloat | None = Field(
+        None, le=1, description="of each value guessed; each its own unless given"
+    )
     link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
     link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
     link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
@@ -184,20 +189,21 @@ class ExperimentConfig(_Table):
 class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
-    friction: Literal["auto", "coulomb", "stribeck", "stribeck_load"] = Field(
+    friction: Literal["auto"] | Friction = Field(
         "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
     )
-    drive: Literal["delay", "lag", "delay_lag"] = "lag"
-    presliding: bool = Field(False, description="dry friction that yields like a spring before it slides")
-    asymmetry: bool = Field(False, description="viscous friction that differs with direction")
-    ripple: bool = Field(False, description="torque ripple over the joint's angle")
-    zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
-    torque_scale: bool = Field(
-        False, description="the ratio of the joints' torque constants; one of them has to be believed"
-    )
+    drive: Drive = "lag"
+    presliding: bool = Field(False, description=OPTIONS["presliding"])
+    asymmetry: bool = Field(False, description=OPTIONS["asymmetry"])
+    ripple: bool = Field(False, description=OPTIONS["ripple"])
+    zeros: bool = Field(False, description=OPTIONS["zeros"])
+    torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
+    saturation: bool = Field(False, description=OPTIONS["saturation"])
+    cable: bool = Field(False, description=OPTIONS["cable"])
+    encoder: bool = Field(False, description=OPTIONS["encoder"])
 
     @property
-    def fixed_friction(self) -> Literal["coulomb", "stribeck", "stribeck_load"]:
+    def fixed_friction(self) -> Friction:
         """What fits that make no choice take: "stribeck" where the file says "auto"."""
         return "stribeck" if self.friction == "auto" else self.friction
 
@@ -216,8 +222,10 @@ class SafetyConfig(_Table):
     watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
     allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
-    max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")
-    max_late: int = Field(20, ge=1, le=1000, description="deadlines in a row that may be missed")
+    missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may give no reply")
+    late_time: PositiveFloat = Field(0.05, le=2, description="s for which deadlines may be missed")
+    max_missing: int | None = Field(None, ge=1, le=1000, description="replies in a row; in place of missing_time")
+    max_late: int | None = Field(None, ge=1, le=1000, description="deadlines in a row; in place of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
@@ -225,7 +233,9 @@ class SafetyConfig(_Table):
     min_voltage: float = Field(0.0, ge=0, description="V; the servos' own limits hold beside it")
     max_voltage: PositiveFloat = Field(30.0, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
-    follow_share: PositiveFloat = Field(0.3, le=1, description="of current_limit, by how much it may differ for longer")
+    follow_share: PositiveFloat = Field(
+        0.3, le=1, description="of the planned peak, by how much it may differ for longer"
+    )
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
     damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
     limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
@@ -273,6 +283,9 @@ class Config(_Table):
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
         for key, values in self._per_joint():
             _same_length(key, values, count)
+        slips = list(implausible(self))
+        if slips:
+            raise ValueError("; ".join(slips))
         if self.experiment.lines is not None:
             _same_length("experiment.lines", self.experiment.lines, count)
             excited = [line for lines in self.experiment.lines for line in lines]
@@ -331,6 +344,7 @@ class Config(_Table):
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
             watchdog_required=not self.safety.allow_no_watchdog,
+            interval=1 / self.experiment.rate,
         )
 
     @property
@@ -389,8 +403,19 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 
 
 def port_url(port: str) -> str:
-    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
-    fakes.register()
-    if port.endswith(".toml") and "://" not in port:
-        return load_config(Path(port)).url
-    return port
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
+    one, or the fake arm of that name; raises ConfigError.
+    """
+    url = _url_of(port)
+    fakes.register_for(url)
+    return url
+
+
+def _url_of(port: str) -> str:
+    if "://" in port:
+        return port
+    config = find_config(Path(port))
+    if config.suffix == ".toml":
+        return load_config(config).url
+    arm = find_arm(port)
+    return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
-from hil.estimator.data.periodicity import period_difference
+from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.simulation.closed_loop import Stabilised
 from hil.plan.stabiliser import feedback_of, feedback_torque
@@ -96,13 +96,3 @@ def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
         if settling_difference(position[period - 1], position[period]) <= within:
             return period
     return None
-
-
-def settling_difference(former: NDArray[np.float64], latest: NDArray[np.float64]) -> float:
-    """How far a period, (joints, samples) [rad], is from the one before: RMS over the motion's RMS, the worst joint.
-
-    Only the later halves are compared. Where they agree the former period ended settled, so all of the latest one is,
-    even though the former began with the transient of the ramp: a whole period of arm time is saved.
-    """
-    half = former.shape[1] // 2
-    return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())

@@ -7,7 +7,7 @@ from typing import Any
 
 from hil import __version__, strict_json
 from hil.errors import ExportError, RunFolderError
-from hil.export.columns import UNITS
+from hil.export.columns import COLUMN_UNITS
 from hil.export.source import Source
 
 _WHOLE = ("phase", "segment", "period", "error", "missing")
@@ -51,7 +51,7 @@ def _write(writer: Any, source: Source) -> None:
             message = shared | {name: _number(columns[name][row][joint]) for name in _PER_JOINT}
             data = json.dumps(message, allow_nan=False).encode()
             writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, data=data, sequence=row)
-    result = strict_json.dumps(source.result, indent=2).encode()
+    result = strict_json.dumps(source.result.to_json(), indent=2).encode()
     writer.add_attachment(
         create_time=start, log_time=start, name="result.json", media_type="application/json", data=result
     )
@@ -66,6 +66,6 @@ def _schema() -> dict[str, Any]:
     properties: dict[str, Any] = {}
     for name in (*_SHARED, *_PER_JOINT):
         properties[name] = {"type": "integer"} if name in _WHOLE else {"type": ["number", "null"]}
-        if name in UNITS:
-            properties[name]["description"] = UNITS[name]
+        if name in COLUMN_UNITS:
+            properties[name]["description"] = COLUMN_UNITS[name]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "type": "object", "properties": properties}

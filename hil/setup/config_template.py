@@ -9,14 +9,15 @@ from hil.drivers.servo_model import Mode, Published, servo_model
 
 STANDARD_GRAVITY = 9.81
 _OF_STALL = 0.3  # of the stall current or the supply: what the guard allows at first
-_OF_LIMIT = 0.25  # of that: the first excitation's peak on joint 1; half of it on joint 2
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 _RATES = (400, 200, 100, 50, 20)
 
 
 @dataclass(frozen=True)
 class JointAnswers:
-    """One joint. rest: angle where it hangs [rad]; swing: how far it may go from there to either side [rad]."""
+    """One joint. rest: angle where it hangs [rad]; swing: how far it may go from there to either side [rad]; length:
+    from this joint to the next, or to the tip [m].
+    """
 
     name: str
     id: int
@@ -25,6 +26,7 @@ class JointAnswers:
     rest: float
     direction: int = 1
     swing: float = math.pi / 2
+    length: float = 0.12
 
     @property
     def joint(self) -> Joint:
@@ -51,20 +53,23 @@ def arm_toml(arm: ArmAnswers) -> str:
     mechanism = [
         "[arm]",
         _line(f"gravity = {arm.gravity:g}", "m/s^2; 0 for an arm that moves in a horizontal plane"),
-        _line(f"rest_pose = {_list([joint.rest for joint in arm.joints], 4)}", "rad: where it hangs; hil looks first"),
+        _line(f"rest_pose = {_list([joint.rest for joint in arm.joints], 4)}", _rest_meaning(arm)),
+        _line(
+            f"link_lengths = {_list([joint.length for joint in arm.joints], 3)}", "m: joint to joint, and to the tip"
+        ),
     ]
     experiment = [
         "[experiment]",
         _line(f"rate = {rate:.1f}", "samples per second; hil check tells what this bus can do"),
         _line("period = 10.0", "s"),
         _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: lines shared out between the joints in turn"),
-        _line(f"peak_torque = {_list(_peaks(arm), 3)}", "N m: small for a first run"),
+        _line("pilot = true", "find the torque: small first, then up to the limits"),
         _line("ramp = 1.0", "s, in and out"),
         "seed = 1",
     ]
     model = [
         "[model]",
-        _line('friction = "stribeck"', '"coulomb" has less, "stribeck_load" more; "auto" tries them all'),
+        _line('friction = "auto"', "tries friction models and keeps what predicts best"),
         _line('drive = "lag"', '"delay": a pure delay instead of a current loop'),
     ]
     if len(arm.joints) == 2:
@@ -117,14 +122,12 @@ def _goal_limit(answers: JointAnswers) -> float:
     return float(f"{most:.2g}")
 
 
-def _peaks(arm: ArmAnswers) -> list[float]:
-    """N m: the outer joint carries less."""
-    peaks = []
-    for number, answers in enumerate(arm.joints):
-        servo = servo_model(answers.model)
-        published = servo.torque_per_volt if servo.default_mode is Mode.PWM else servo.torque_per_ampere
-        peaks.append(_OF_LIMIT * 0.5**number * _goal_limit(answers) * published.value)
-    return peaks
+def _rest_meaning(arm: ArmAnswers) -> str:
+    if not arm.gravity:
+        return "rad: where it lies at the start; hil holds it about there"
+    if arm.joints[0].rest > 0:
+        return "rad: upright; hold it there until hil does, and again at the end"
+    return "rad: where it hangs; hil looks first"
 
 
 def _rate(arm: ArmAnswers) -> float:

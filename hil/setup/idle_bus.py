@@ -13,7 +13,7 @@ _SECONDS = 1.0
 
 def quiet_stream(config: Config) -> tuple[str, ...]:
     """What the servos say of themselves, and how the exchange keeps time, in lines for a person. Raises DriverError."""
-    fakes.register()
+    fakes.register_for(config.url)
     with ServoBus.open(config.bus) as bus:
         return (*_limits(config, bus), _timing(config, bus))
 

@@ -9,10 +9,12 @@ from hypothesis.extra.numpy import arrays
 from hil.estimator.data.fourier import cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.periodicity import period_difference
 from hil.estimator.errors import ModelError, ShapeError
-from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
-from hil.estimator.models.regressor import inverse_dynamics, parameter_names, parameter_units, regressor
+from hil.estimator.models.regressor import inverse_dynamics, regressor
+from hil.estimator.models.terms import base_names, units_of
+from hil.estimator.options import CoordinateOptions
 from hil.estimator.simulation.arm import simulate
 from hil.estimator.simulation.drive import motor_torque
 
@@ -33,15 +35,15 @@ def test_regressor_gives_the_torque_of_the_written_equations(theta: np.ndarray, 
 
 
 def test_names_units_and_errors() -> None:
-    assert len(parameter_units(2)) == len(parameter_names(2)) == 12
-    assert parameter_names(1) == ("inertia_1", "gravity_1", "viscous_1", "coulomb_1", "offset_1")
+    assert len(units_of(base_names(2))) == len(base_names(2)) == 12
+    assert base_names(1) == ("inertia_1", "gravity_1", "viscous_1", "coulomb_1", "offset_1")
     assert Model(2, "stribeck_load", "lag").names[12:] == (
         *("coulomb_width_1", "coulomb_width_2", "stribeck_rise_1", "stribeck_rise_2"),
         *("stribeck_velocity_1", "stribeck_velocity_2", "load_1", "load_2", "lag"),
     )
     assert len(Model(2, "stribeck_load", "lag").units) == 21
     with pytest.raises(ModelError, match="3 joints"):
-        parameter_names(3)
+        base_names(3)
     with pytest.raises(ModelError, match="'dahl'"):
         Model(2, "dahl")  # type: ignore[arg-type]
     with pytest.raises(ShapeError):
@@ -110,7 +112,7 @@ def test_motor_torque_is_the_mean_of_the_late_command(
 @given(arrays(float, (21,), elements=st.floats(-2.0, 2.0)))
 def test_every_coordinate_is_a_physical_arm(x: np.ndarray) -> None:
     names = Model(2, "stribeck_load", "lag").names
-    there = Coordinates(names, scales_of(names, 0.3, 3.0, 0.02), 1e-3)
+    there = Coordinates(names, scales_of(names, Sizes(0.3, 3.0, 0.02)), CoordinateOptions(1e-3))
     value = dict(zip(names, there.values(x), strict=True))
     a, b, d, ia = (value[name] for name in ("inertia_1", "coupling", "inertia_2", "armature_2"))
     for c in np.cos(np.linspace(0.0, np.pi, 7)):
@@ -126,7 +128,7 @@ def test_every_coordinate_is_a_physical_arm(x: np.ndarray) -> None:
 
 def test_simulation_obeys_inverse_dynamics() -> None:
     """Torques that inverse dynamics asks for along a chosen motion bring that motion about."""
-    names = parameter_names(2)
+    names = base_names(2)
     theta = np.array([0.018, 0.0033, 0.0028, 0.01, 0.55, 0.22, 0.045, 0.04, 0.055, 0.05, 0.004, -0.003])
     width, rate, steps, samples = 0.2, 400.0, 8, 400
     t = (np.arange(samples * steps) + 0.5) / (rate * steps)

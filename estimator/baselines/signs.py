@@ -1,0 +1,100 @@
+"""Reversed columns: a torque or a position with the wrong sign, found by inverse dynamics with every combination.
+
+A reversed torque of the only joint, or of all joints, leaves the residual as it was and makes inertias and friction
+negative; a reversed column of one joint among two contradicts the other joint's equations and leaves more residual.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from hil.estimator.baselines.idim import InverseDynamics, fit_inverse_dynamics
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import EstimationError
+
+CUTOFF = 8.0  # Hz
+COULOMB_WIDTH = 0.05  # rad/s
+LESS_RESIDUAL = 0.6
+"""Of the residual as given: what a combination must leave at most to be more credible on its residual alone."""
+
+SAME_RESIDUAL = 1.05
+"""A combination that makes negative inertia or friction positive may leave this much more."""
+
+_POSITIVE = ("inertia", "viscous", "coulomb")
+_STANDARD_ERRORS = 3.0
+
+
+@dataclass(frozen=True)
+class Signs:
+    """A combination: +1 as given, -1 reversed, of each joint's torque and position (joints,)."""
+
+    torque: tuple[int, ...]
+    position: tuple[int, ...]
+
+    @property
+    def reversed_columns(self) -> tuple[str, ...]:
+        """What is reversed, in words."""
+        named = [f"the torque of joint {joint}" for joint, sign in enumerate(self.torque, start=1) if sign < 0]
+        return (*named, *(f"the position of joint {joint}" for joint, sign in enumerate(self.position, 1) if sign < 0))
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """Columns that seem reversed. residual, residual_given: RMS of the torque left over its RMS, worst joint."""
+
+    signs: Signs
+    residual: float
+    residual_given: float
+    impossible: tuple[str, ...]
+    """Parameters that come out negative with the signs as given."""
+
+
+def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
+    """The reversal that explains the recordings much better than the signs given; None where there is none.
+
+    Says nothing, rather than raise, where filtered inverse dynamics cannot be solved.
+    """
+    joints = recordings[0].joints
+    given = _fit(recordings, Signs((1,) * joints, (1,) * joints))
+    if given is None:
+        return None
+    impossible, left = _impossible(given), float(given.relative_residual.max())
+    best: tuple[float, Signs] | None = None
+    for signs in _combinations(joints):
+        fitted = _fit(recordings, signs)
+        if fitted is None or _impossible(fitted):
+            continue
+        residual = float(fitted.relative_residual.max())
+        credible = residual < LESS_RESIDUAL * left or (bool(impossible) and residual < SAME_RESIDUAL * left)
+        if credible and (best is None or residual < best[0]):
+            best = residual, signs
+    return None if best is None else Suspicion(best[1], best[0], left, impossible)
+
+
+def _combinations(joints: int) -> Iterator[Signs]:
+    """Every reversal but none, fewest columns first. A mirrored arm is the same arm: joint 1's position stays."""
+    every = (
+        Signs(torque, (1, *position))
+        for torque in product((1, -1), repeat=joints)
+        for position in product((1, -1), repeat=joints - 1)
+    )
+    yield from sorted((signs for signs in every if signs.reversed_columns), key=lambda each: len(each.reversed_columns))
+
+
+def _fit(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | None:
+    torque, position = (np.array(each, dtype=float)[:, None] for each in (signs.torque, signs.position))
+    turned = [replace(each, torque=each.torque * torque, position=each.position * position) for each in recordings]
+    try:
+        return fit_inverse_dynamics(turned, CUTOFF, COULOMB_WIDTH)
+    except EstimationError:
+        return None
+
+
+def _impossible(fitted: InverseDynamics) -> tuple[str, ...]:
+    """Inertias and friction that are negative by more than chance."""
+    bad = fitted.value < -_STANDARD_ERRORS * fitted.std
+    return tuple(
+        name for name, negative in zip(fitted.names, bad, strict=True) if negative and name.startswith(_POSITIVE)
+    )

@@ -1,0 +1,110 @@
+"""The subcommands about many runs: the list of them, a name and a note for one, the difference of two.
+
+The modules that do the work are imported inside the commands, as in hil.cli.app.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hil import strict_json
+
+if TYPE_CHECKING:
+    from hil.estimation.diff import Difference
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
+
+
+def runs(
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the run folders are.")] = Path("runs"),
+    json_only: Json = False,
+) -> None:
+    """List the runs in a folder: arm, when, verdict, residual, name and note."""
+    from hil.runs.collection import find_runs
+
+    found = find_runs(folder)
+    if json_only:
+        print(strict_json.dumps({"runs": [run.to_json() for run in found]}))
+        return
+    if not found:
+        print(f"No run in {folder}. `hil identify ARM.toml` makes one.")
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    for heading in ("run", "arm", "when", "verdict"):
+        table.add_column(heading, overflow="fold")
+    table.add_column("residual", justify="right")
+    table.add_column("name, note", overflow="fold")
+    for run in found:
+        when = f"{run.started:%Y-%m-%d %H:%M}" if run.started else "-"
+        residual = "-" if run.residual is None else f"{run.residual:.3f}"
+        said = ": ".join(each for each in (run.note.name, run.note.text) if each)
+        table.add_row(*(escape(each) for each in (str(run.path), run.arm, when, run.verdict, residual, said)))
+    Console(highlight=False).print(table)
+
+
+def note(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")],
+    name: Annotated[str | None, typer.Option("--name", help="A short name, for `hil runs`.")] = None,
+    text: Annotated[str | None, typer.Option("--text", help="Anything worth remembering.")] = None,
+) -> None:
+    """Give a run a name and a note; without options, print them. Example: hil note RUN --text "new gearbox"."""
+    from hil.runs.collection import Note, read_note, write_note
+
+    kept = read_note(run)
+    if name is not None or text is not None:
+        kept = Note(kept.name if name is None else name, kept.text if text is None else text)
+        write_note(run, kept)
+    print(": ".join(each for each in (kept.name, kept.text) if each) or "no name, no note")
+
+
+def diff(
+    before: Annotated[Path, typer.Argument(metavar="RUN", help="The earlier run (or result.json, exported TOML).")],
+    after: Annotated[Path, typer.Argument(metavar="RUN", help="The later one, of the same arm.")],
+    png: Annotated[Path | None, typer.Option("--png", metavar="FILE", help="Draw it; needs the extra `png`.")] = None,
+    json_only: Json = False,
+) -> None:
+    """What changed on an arm between two runs, and whether it is more than chance: is the gearbox wearing?"""
+    from hil.estimation.diff import diff_runs
+
+    difference = diff_runs(before, after)
+    if png is not None:
+        from hil.report.diff_plot import save_diff_plot
+
+        save_diff_plot(difference, png)
+    if json_only:
+        print(strict_json.dumps(difference.to_json()))
+        return
+    _print_difference(difference)
+    if png is not None:
+        print(f"Drawn in {png}")
+
+
+def _print_difference(difference: "Difference") -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("parameter", no_wrap=True)
+    for heading in ("before", "after", "change %", "in std."):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("")
+    for change in difference.changes:
+        percent = "-" if change.percent is None else f"{change.percent:+.2f}"
+        shown = (f"{change.before:.5g}", f"{change.after:.5g}", percent, f"{change.z:+.1f}")
+        table.add_row(change.name, *shown, "changed" if change.changed else "")
+    console = Console(highlight=False)
+    console.print(table)
+    for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):
+        if names:
+            console.print(f"Not in the model {lacking}: {', '.join(names)}.", soft_wrap=True, markup=False)
+    found = ", ".join(change.name for change in difference.changed)
+    console.print(
+        f"Changed by more than chance: {found}." if found else "Nothing changed by more than chance.",
+        soft_wrap=True,
+        markup=False,
+    )

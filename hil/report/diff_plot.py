@@ -1,0 +1,42 @@
+"""A picture of what changed between two runs: changes with intervals, significant ones marked."""
+
+from pathlib import Path
+
+from hil.errors import MissingExtra, RunFolderError
+from hil.estimation.diff import Change, Difference
+
+_SHOWN_PERCENT = 100.0
+_WIDTH_OF_95 = 1.96
+
+
+def save_diff_plot(difference: Difference, path: Path) -> None:
+    """Write a PNG or SVG, by the ending of `path`. Raises MissingExtra without matplotlib, RunFolderError."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("The picture needs matplotlib: pip install 'hil[png]'.") from error
+    shown = [change for change in difference.changes if _interval(change) is not None]
+    figure = Figure(figsize=(7.0, 0.8 + 0.28 * len(shown)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for row, change in enumerate(reversed(shown)):
+        percent, half = _interval(change) or (0.0, 0.0)
+        colour = "tab:red" if change.changed else "0.45"
+        axes.errorbar(percent, row, xerr=half, fmt="o", color=colour, capsize=3, markersize=4)
+    axes.set_yticks(range(len(shown)), [change.name for change in reversed(shown)])
+    axes.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
+    axes.set_xlabel("change, % of the value before, with 95 % interval; red: more than chance")
+    try:
+        figure.savefig(path, dpi=150)
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path} cannot be written: {error}.") from error
+
+
+def _interval(change: Change) -> tuple[float, float] | None:
+    """Change and half its 95 % interval [% of the value before]; None where that says nothing."""
+    if change.percent is None or not change.before:
+        return None
+    half = _WIDTH_OF_95 * 100 * (change.before_std**2 + change.after_std**2) ** 0.5 / abs(change.before)
+    hidden = not change.changed and half > _SHOWN_PERCENT
+    return None if hidden else (change.percent, half)
