@@ -43,6 +43,9 @@ PortOrConfig = Annotated[
     ),
 ]
 OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default runs/TIME-ARM.")]
+TakeOver = Annotated[
+    bool, typer.Option("--take-over", help="Let an arm that is held sink slowly and take it over. Hold it by hand.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
 
 
@@ -56,7 +59,7 @@ def _root(
 
 
 @app.command(epilog="Example: hil identify configs/fake_two_link.toml")
-def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> None:
+def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
     """Excite the arm, take one settled period, print its parameters with error bars."""
     from hil.cli.terminal import Terminal
     from hil.config.schema import load_config
@@ -64,7 +67,7 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
     from hil.experiment.run import run_experiment
     from hil.runs.run_folder import RunFolder
 
-    checked = load_config(config)
+    checked = _taking_over(load_config(config), take_over)
     run = RunFolder.create(out or _default_folder(config), checked)
     terminal = Terminal(quiet=json_only)
     if checked.experiment.pilot:
@@ -86,7 +89,7 @@ def identify(config: ConfigPath, out: OutPath = None, json_only: Json = False) -
 
 
 @app.command(epilog="Example: hil record configs/fake_two_link.toml --out runs/monday")
-def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> None:
+def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
     """Play the experiment and keep its recording, for `hil estimate`."""
     from hil.cli.terminal import Terminal
     from hil.config.schema import load_config
@@ -97,7 +100,7 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
     from hil.runs.run_folder import RunFolder
     from hil.runs.timing import timing
 
-    checked = load_config(config)
+    checked = _taking_over(load_config(config), take_over)
     if checked.experiment.pilot:
         raise ConfigError(
             f"{config}: experiment.pilot = true: each step's torque follows from an estimate of the one before, which "
@@ -223,6 +226,7 @@ def setup(
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
+    from hil.setup.servo_session import recover
     from hil.setup.servo_settings import open_servo, set_up
 
     if new_baud is not None and new_baud not in BAUD_RATES:
@@ -232,6 +236,8 @@ def setup(
     opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)
+        if written := recover(servo, opened.url):
+            print(f"What an earlier run could not put back is put back: {', '.join(written)}.", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
         changes = set_up(servo, confirm, new_id=new_id, new_baud=new_baud, return_delay_us=return_delay_us)
     finally:
@@ -336,6 +342,12 @@ def _show(result: "SettledResult", config: "Config", path: Path, json_only: bool
     from hil.cli.result_table import print_result
 
     print_result(result, config, path, Console(highlight=False))
+
+
+def _taking_over(config: "Config", wanted: bool) -> "Config":
+    if not wanted:
+        return config
+    return config.model_copy(update={"safety": config.safety.model_copy(update={"take_over": True})})
 
 
 def _default_folder(config: Path) -> Path:

@@ -233,12 +233,13 @@ class SafetyConfig(_Table):
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
     max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
-    min_voltage: float = Field(0.0, ge=0, description="V; the servos' own limits hold beside it")
+    min_voltage: float = Field(0.0, ge=0, description="V; what the models shut down at from the factory, unless given")
     max_voltage: PositiveFloat = Field(30.0, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
     follow_share: PositiveFloat = Field(
         0.3, le=1, description="of the planned peak, by how much it may differ for longer"
     )
+    take_over: bool = Field(False, description="let an arm that is held sink slowly and take it over; else refuse it")
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
     damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
     limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
@@ -279,6 +280,19 @@ class Config(_Table):
     known: KnownConfig | None = None
     columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
     fake: FakeArm | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _usual_voltage(cls, values: Any) -> Any:
+        """Where no min_voltage is given: that of the model that takes least. 0 V is no supply for any of them."""
+        if not isinstance(values, dict) or not isinstance(values.get("safety", {}), dict):
+            return values
+        joints = values.get("joints")
+        names = (
+            [str(joint.get("model")) for joint in joints if isinstance(joint, dict)] if isinstance(joints, list) else []
+        )
+        least = min((SERVO_MODELS[name].min_voltage for name in names if name in SERVO_MODELS), default=0.0)
+        return {**values, "safety": {"min_voltage": least, **values.get("safety", {})}}
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -347,6 +361,7 @@ class Config(_Table):
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
             watchdog_required=not self.safety.allow_no_watchdog,
+            take_over=self.safety.take_over,
             interval=1 / self.experiment.rate,
         )
 

@@ -22,6 +22,7 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
+from hil.setup.servo_session import servo_session
 
 _LAST_SAMPLES = 100
 """How many samples an error carries with it."""
@@ -41,7 +42,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
     """
     plan = make_plan(config) if plan is None else plan
     fakes.register_for(config.url)
-    with StopRequest() as stop, EventLog(run) as log, ServoBus.open(config.bus) as bus:
+    with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
 
         def note(what: str) -> None:

@@ -19,6 +19,7 @@ from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.experiment.guard import Guard
+from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
@@ -59,7 +60,9 @@ class Stream:
         self._plan = plan
         self._config = config
         self._safety = config.safety
-        self._guard = Guard(config, _largest_goals(plan))
+        planned = _largest_goals(plan)
+        self._guard = Guard(config, planned)
+        self._model = ModelWatch(config, planned)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -198,6 +201,7 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 

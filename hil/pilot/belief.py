@@ -95,7 +95,7 @@ class Belief:
         return replace(belief, learned=self.learned + 1)
 
     def _held(self, config: Config, seen: Seen, still: Mask, random: np.random.Generator) -> "Belief":
-        """Arms whose joints move where the real ones stood `still` (joints,) get more dry friction until they do not."""
+        """Arms whose joints move where the real ones stood `still` (joints,) get dry friction until they stand too."""
         belief = self
         places = [self.names.index(f"coulomb_{joint + 1}") for joint in np.flatnonzero(still)]
         for _ in range(_MOST_RAISES if places else 0):

@@ -40,8 +40,8 @@ _AFTER_LIMIT = 0.85
 _MOST_RAISE = 1.6
 _AT_LIMIT = 0.99
 _MORE, _LITTLE_MORE, _FAIR = 1.15, 1.03, 0.7
-"""Times the torque of the run before: where one more would add less, it is not made; the first where a typical arm comes
-fairly far on its way to a limit."""
+"""Times the torque of the run before: where one more would add less, it is not made; the first where a typical arm
+comes fairly far on its way to a limit."""
 
 
 @dataclass
