@@ -31,6 +31,9 @@ class SimulatedRun:
     """Integration steps in a sample."""
     max_substeps: int
     """Into which a step may be cut near standstill."""
+    pulled_to: Array | None = None
+    """Where springs end that draw the arm, held from sample to sample (joints, samples) [rad]; `measured` unless given.
+    """
 
     @classmethod
     def of(cls, period: SettledPeriod, integration: IntegrationOptions) -> "SimulatedRun":
@@ -71,7 +74,8 @@ class SimulatedRun:
         times = {"delay": physics.delay, "lag": physics.lag}
         torque, slopes = torque_and_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
         samples = round(horizon * samples)
+        ends = self.measured if self.pulled_to is None else self.pulled_to
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
-            true = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], self.measured[:, part])
+            true = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part])
             yield part, *measured_and_slopes(physics, names, *true)

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque
-from hil.dry_run.prediction import GUARDED
+from hil.dry_run.prediction import GUARDED, predict
 from hil.dry_run.waves import designed_plan, roomy_plan
 from hil.errors import ExperimentError
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import Belief, prior_belief
 from hil.pilot.gains import with_stabiliser
 from hil.pilot.steps import Played, Player, Step
-from hil.plan.plan import Plan
+from hil.plan.plan import Plan, scaled
 from hil.runs.run_folder import RunFolder
 
 Array = NDArray[np.float64]
@@ -27,7 +27,9 @@ ARMS = 96
 PILOT_SHARES = (0.45, 0.6, 0.75, 0.9)
 """Of the limits: how far pilots go, one after the other; the last for all that follow."""
 
-MOST_STEPS = 8
+MOST_STEPS, MOST_PILOTS = 12, 10
+"""Runs before the full one; of these, until all joints move."""
+
 CERTAIN = 0.85
 """A typical arm should come this far on its way to a limit; where it stays below, uncertainty costs too much range."""
 
@@ -38,6 +40,7 @@ _PILOT_PERIOD_SHARE = 0.5
 _PILOT_SETTLING = 1
 _AFTER_LIMIT = 0.85
 """Of the torque under which a limit was passed: the most of what follows."""
+_MOST_RAISE = 1.6
 _AT_LIMIT = 0.99
 _MORE = 1.15
 """Times the torque of the run before: where one more would add less, it is not made."""
@@ -108,10 +111,10 @@ class Search:
 
     def _pilot(self) -> None:
         """Small runs until every joint moves."""
-        while len(self.steps) < MOST_STEPS - 2:
+        while len(self.steps) < MOST_PILOTS:
             number = len(self.steps)
             config = pilot_config(self.held)
-            found = self.amplitude(config, PILOT_SHARES[min(number, len(PILOT_SHARES) - 1)])
+            found = self._pilot_amplitude(config, PILOT_SHARES[min(number, len(PILOT_SHARES) - 1)])
             self._play(config, f"pilot-{number + 1}", "Pilot" if number == 0 else f"Pilot {number + 1}", found)
             moved = self.moved
             if moved.all():
@@ -124,12 +127,26 @@ class Search:
         if not moved.all():
             self._give_up(config, [j.name for j, m in zip(self.config.joints, moved, strict=True) if not m])
 
+    def _pilot_amplitude(self, config: Config, share: float) -> Amplitude:
+        """As safe as ever, and of a joint that has not moved yet not much more than it was given last: just above what
+        friction holds, motion grows fast, and what held says little of what will move.
+        """
+        found = self.amplitude(config, share)
+        if not self.steps:
+            return found
+        most = np.where(self.moved, np.inf, _MOST_RAISE * self.steps[-1].peak_torque)
+        if (found.peak_torque <= most).all():
+            return found
+        plan = scaled(config, found.plan, np.minimum(found.peak_torque, most))
+        torque = plan.segments[0].peak_torque
+        return Amplitude(plan, torque, predict(config, plan, self.belief.ensemble(self._farther), pose=self.pose))
+
     def _raise_to_limits(self) -> tuple[Config, Amplitude]:
         """Runs on the way, until the arm is known well enough to go to its limits at once."""
         config = self.held
         plan = self._waves(config)
         found = self.amplitude(config, 1.0, plan)
-        while not self._certain(config, found) and len(self.steps) < MOST_STEPS - 1:
+        while not self._certain(config, found) and len(self.steps) < MOST_STEPS:
             self.player.say(
                 "What is known so far is too uncertain to go to the limits at once: one more run on the way."
             )
@@ -164,9 +181,9 @@ class Search:
         )
         most = ", ".join(f"{torque:.3g}" for torque in most_torque(config))
         raise ExperimentError(
-            f"{_and(still)} did not move by {MOVED_STEPS} encoder steps. Tried: {tried}; the current limits allow {most} "
-            "N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, look at the "
-            "supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
+            f"{_and(still)} did not move by {MOVED_STEPS} encoder steps. Tried: {tried}; the current limits allow "
+            f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
+            "look at the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
         )
 
 

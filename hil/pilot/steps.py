@@ -86,7 +86,8 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
         """Run one step, compare, tell.
 
-        Raises what a run raises, but for what tells of the arm alone: it passed a limit, did not move or did not settle.
+        Raises what a run raises, but for what tells of the arm alone: it passed a limit, did not move or did not
+        settle.
         """
         torque, error = "", None
         try:
