@@ -24,8 +24,9 @@ WIDENED = 1.5
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
-_FRICTIONS = 4.0
-"""Times the mean dry friction: a planned torque below is taken for as much."""
+_FRICTIONS = 8.0
+"""Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
+an alarm."""
 _TILT_SHARE = 0.2  # of gravity, in a direction that the angles' zero does not expect
 _STILL_RAD_S = 0.06
 
