@@ -138,7 +138,9 @@ class ArmConfig(_Table):
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
-    rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+    rest_tolerance: PositiveFloat = Field(
+        0.5, description="rad from the rest pose allowed at the start: friction may hold an arm far from it"
+    )
     link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
     prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
 
