@@ -17,6 +17,7 @@ TOGETHER_S = 0.3
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
+REFUSED, STRANGER = "refused", "stranger"
 
 WORDS = {
     SILENCE: r"no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response"
@@ -38,6 +39,8 @@ WORDS = {
     PROGRAM: r"deadlines?\b|the computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
     SIGNAL: r"Ctrl-C|SIGINT|SIGTERM|SIGHUP",
     MODEL: r"any arm|than (the )?model|predicted|not as planned|foreseen|the dry run",
+    REFUSED: r"refus|\balert\b|answers? with an? error|hardware error",
+    STRANGER: r"another (program|master)|somebody else|not asked for|collision|other master",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
 }
 """What a message has to say for a cause to count as named."""
@@ -86,6 +89,8 @@ CAUSES: dict[str, frozenset[str]] = {
     FaultKind.STUCK_JOINT: frozenset({STUCK, ENCODER, MODEL}),
     FaultKind.ENCODER_JUMP: frozenset({ENCODER, POSE}),
     FaultKind.CABLE_PULLED: frozenset({CABLE}),
+    FaultKind.STATUS_ERROR: frozenset({REFUSED, SILENCE, TORQUE}),
+    FaultKind.OTHER_MASTER: _BYTES | {STRANGER, LATE},
 }
 """What each fault may rightly be called. Held fast and a dead encoder cannot be told apart from the host's side."""
 
