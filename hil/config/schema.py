@@ -19,7 +19,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
-from hil.fakes.description import FakeArm
+from hil.fakes.description import FakeArm, beside
 from hil.fakes.names import find_arm
 from hil.toml_errors import describe
 
@@ -397,6 +397,8 @@ def parse_config(text: str, path: Path) -> Config:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
+    if isinstance(values.get("fake"), dict):
+        values["fake"] = beside(values["fake"], path.parent)
     try:
         return Config(path=path, **values)
     except ValidationError as error:

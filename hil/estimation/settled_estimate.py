@@ -4,9 +4,6 @@ import logging
 import time
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hil.config.schema import Config
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.physical import physical_of
@@ -15,9 +12,9 @@ from hil.estimation.result_checks import describe_choice, describe_validation, d
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimator.data.settled_period import SettledPeriod
-from hil.estimator.identify import Estimate, identify, predict
-from hil.estimator.models.parameters import Physics
-from hil.estimator.selection.settled import Choice, choose
+from hil.estimator.identify import Estimate, identify
+from hil.estimator.selection.candidates import considered
+from hil.estimator.selection.settled import Choice, choose, predict_period
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import judge
 from hil.plan.plan import HELD_OUT, IDENTIFY
@@ -40,9 +37,10 @@ def estimate_run(run: RunFolder) -> SettledResult:
     period = settled_period(config, facts, samples, IDENTIFY)
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     estimate, choice = _estimate(config, period, other, run.load_starts())
+    estimate = replace(estimate, covariance=considered(period, estimate))
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if other is not None:
-        predicted = _predict(config, estimate, other)
+        predicted = predict_period(estimate, other)
         played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
@@ -77,11 +75,3 @@ def _estimate(
         choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts)
         return choice.estimate, choice
     return identify(period, wanted_model(wanted, len(config.joints)), starts=starts), None
-
-
-def _predict(config: Config, estimate: Estimate, other: SettledPeriod) -> NDArray[np.float64]:
-    """The model's free prediction of another multisine, (joints, samples) [rad]."""
-    if other.stabiliser is None:
-        return predict(estimate, other.torque, other.rate, other.command_to_sample)
-    arm, pose = Physics.of(estimate.parameters), np.array(config.arm.rest_pose)
-    return other.stabiliser.settled_positions(arm, pose, other.rate, other.command_to_sample)
