@@ -63,6 +63,14 @@ class JointConfig(_Table):
     current_limit: PositiveFloat | None = Field(None, le=30, description="A")
     voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
 
+    @field_validator("name")
+    @classmethod
+    def _printable(cls, name: str) -> str:
+        """A name goes into terminals, XML, HTML and CSV: no control character, line break or half of a surrogate."""
+        if bad := [each for each in name if not each.isprintable()]:
+            raise ValueError(f"{name!a}: {bad[0]!a} is not a character that can be printed")
+        return name
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.position_limit
