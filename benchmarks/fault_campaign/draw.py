@@ -88,7 +88,14 @@ CAUSES: dict[str, frozenset[str]] = {
 """What each fault may rightly be called. Held fast and a dead encoder cannot be told apart from the host's side."""
 
 UNHEARD = frozenset(
-    {Kind.DEAF, Kind.STALL, Kind.KILLED, FaultKind.CABLE_PULLED, FaultKind.SILENT_SERVO, FaultKind.CORRUPTED_INSTRUCTION}
+    {
+        Kind.DEAF,
+        Kind.STALL,
+        Kind.KILLED,
+        FaultKind.CABLE_PULLED,
+        FaultKind.SILENT_SERVO,
+        FaultKind.CORRUPTED_INSTRUCTION,
+    }
 ) | {FaultKind.LOST_INSTRUCTION, FaultKind.REBOOT}
 """Where the program cannot reach a servo, the watchdog's time counts."""
 

@@ -63,7 +63,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
 
 def _measure(bus: ServoBus, *, fast: bool, one_write: bool) -> Way:
     exchange = bus.make_exchange(fast=fast, one_write=one_write, slow_every=SLOW_EVERY)
-    nothing = [0] * len(bus.joints)
+    nothing = [0] * len(exchange.ids)
     trips = np.empty(CYCLES)
     lost = 0
     for index in range(CYCLES):
