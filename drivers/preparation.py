@@ -11,11 +11,12 @@ from hil.drivers.servo import Servo, describe_error
 LISTEN_S = 0.05
 """How long the bus must be quiet before this program speaks on it for good [s]."""
 
-_PATIENCES_S = (0.06, 0.3)
-"""What is allowed for an adapter, one after the other, where no servo answers in the usual time [s]."""
+SLOWEST_S = 0.1
+"""The slowest adapter that is waited for [s]."""
 
 _TRIPS = 5
-_PING_BYTES = 24
+_PING_BYTES = 24  # on the wire: the ping and its status
+_STATUS_BYTES = 14
 _MARGIN = 1.25
 _MOST_HEARD_BYTES = 4096
 _SLOWER_THAN_KNOWN_S = 1.5e-3
@@ -29,22 +30,25 @@ def learn_latency(servo: Servo) -> None:
     The port's `latency` is raised to what is measured where that is more than its kind of adapter should take.
     """
     port, usual = servo.port, servo.port.latency
-    for patience in (usual, *_PATIENCES_S):
-        port.latency = max(usual, patience)
-        trips = []
-        with suppress(NoReply, WrongReply):
-            for _ in range(_TRIPS):
-                start = port.clock.now()
-                servo.ping(attempts=1)
-                trips.append(port.clock.now() - start)
-        if len(trips) < _TRIPS:
-            # What comes late must not be taken for an answer to the next question.
-            port.read(_MOST_HEARD_BYTES, _PATIENCES_S[-1])
-        if trips:
-            taken = min(trips) - port.wire_time(_PING_BYTES)
-            port.latency = usual if taken < usual + _SLOWER_THAN_KNOWN_S else _MARGIN * taken
-            return
-    port.latency = usual  # whoever asks next says what is wrong
+    trips = _trips(servo)
+    if not trips and port.read(_STATUS_BYTES, SLOWEST_S):  # nothing, but then something
+        port.discard_input()
+        port.latency = SLOWEST_S
+        trips = _trips(servo)
+    taken = min(trips, default=0.0) - port.wire_time(_PING_BYTES)
+    # Where nobody answers, whoever asks next says what is wrong.
+    port.latency = usual if taken < usual + _SLOWER_THAN_KNOWN_S else _MARGIN * taken
+
+
+def _trips(servo: Servo) -> list[float]:
+    """How long some pings took [s], up to the first that had no answer."""
+    clock, trips = servo.port.clock, []
+    with suppress(NoReply, WrongReply):
+        for _ in range(_TRIPS):
+            start = clock.now()
+            servo.ping(attempts=1)
+            trips.append(clock.now() - start)
+    return trips
 
 
 def check_quiet(port: Port) -> None:

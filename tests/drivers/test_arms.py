@@ -181,7 +181,7 @@ def test_without_an_idea_of_the_pose_present_position_is_believed(opened: Open) 
 # Slow and strange adapters
 
 
-@pytest.mark.parametrize("latency_us", [1_000.0, 16_000.0, 45_000.0, 150_000.0])
+@pytest.mark.parametrize("latency_us", [1_000.0, 16_000.0, 45_000.0, 90_000.0])
 def test_slow_adapters_are_waited_for(opened: Open, latency_us: float) -> None:
     joints = Joint("a", 1, XM430), Joint("b", 2, XM430)
     bus, port = opened(arm({}, {}, adapter_latency_us=latency_us), *joints)
