@@ -1,6 +1,6 @@
 """The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
@@ -13,6 +13,7 @@ from hil.drivers.errors import (
     WrongModel,
 )
 from hil.drivers.exchange import Exchange
+from hil.drivers.hold import let_sink, refuse_held
 from hil.drivers.joint import Joint
 from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
 from hil.drivers.port import Port, open_port
@@ -26,11 +27,11 @@ from hil.drivers.sync_read import one_each
 _PROBES = 3
 """How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
 
-STATUS_S = 0.04
-"""From one status of a servo to its next [s]."""
+STATUS_S = 0.035
+"""From one status of the servos to the next [s]."""
 
-SHORT_STATUS_S = 0.08
-"""The same where each costs a sample of the servo's state [s]."""
+_SHARE, _MOST_SHARE = 0.6, 0.9
+"""Of a cycle that a status may take on the wire; adapter and computer need the rest."""
 
 MOST_STRANGERS = 2
 """How many instructions of another master may be heard while an experiment runs; a damaged reply can look like one."""
@@ -46,6 +47,7 @@ class BusConfig:
     url: device or pyserial URL. one_write: Sync Write and group read leave in one write; False where `hil check` finds
     that an arm needs two. fast_sync_read: use it where every servo's firmware has it. slow_every: cycles from one
     reading of tick or voltage and temperature to the next. watchdog_required: refuse firmware without Bus Watchdog.
+    take_over: let an arm that somebody holds sink slowly, then cut its torque; else it is refused.
     interval: s from one exchange to the next, 0 where there is no fixed rate; servos then tell no status.
     """
 
@@ -56,12 +58,17 @@ class BusConfig:
     fast_sync_read: bool = True
     slow_every: int = 100
     watchdog_required: bool = True
+    take_over: bool = False
     interval: float = 0.0
 
     def __post_init__(self) -> None:
         ids = [drive.id for joint in self.joints for drive in joint.drives]
         if len(set(ids)) < len(ids):
             raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}: each needs one of its own.")
+
+    def is_same_arm(self, other: "BusConfig") -> bool:
+        """Whether both are the same servos on the same port."""
+        return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
 
 
 @dataclass(frozen=True)
@@ -119,13 +126,14 @@ class ServoBus:
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check who answers, bring every servo into its mode with torque off.
+        """Open the port, check who answers and that nobody holds the arm, bring every servo into its mode.
 
-        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting; the port is closed then.
+        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting, TorqueHeld; the port is closed then.
         """
         bus = cls.connect(config)
         try:
             bus.check_identity()
+            bus.release_held()
             bus.prepare()
         except BaseException:
             bus.close()
@@ -154,6 +162,11 @@ class ServoBus:
     def servo(self, joint: Joint) -> Servo:
         """The joint's servo, the first where it has two, for reading and writing registers."""
         return self.servos(joint)[0]
+
+    @property
+    def drives(self) -> Mapping[Joint, Servo]:
+        """Every servo, by a joint of its own: those of `Joint.drives`, in their order."""
+        return self._servos
 
     def servos(self, joint: Joint) -> tuple[Servo, ...]:
         """All servos of a joint, in the order of its `drives`."""
@@ -185,6 +198,17 @@ class ServoBus:
                 "then nothing stops this servo when the program is killed or the cable is pulled."
             )
         self._without_watchdog.add(joint)
+
+    def release_held(self, ours: Collection[Joint] = ()) -> None:
+        """See to it that no servo has torque before anything is written: raises TorqueHeld, or with
+        `BusConfig.take_over` lets the arm sink. ours: joints that a program of this user left behind, cut at once.
+        """
+        for joint in ours:
+            if self._servos[joint].read("Torque Enable"):
+                self._servos[joint].write("Torque Enable", 0)
+        if self.config.take_over:
+            let_sink(self._servos, self.port.clock)
+        refuse_held(self._servos)
 
     def prepare(self) -> None:
         """Bring every servo into its mode with torque off, and prepare the exchange.
@@ -240,21 +264,18 @@ class ServoBus:
         )
 
     def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Spans | None, int]:
-        """What each servo tells of itself in its turn, and the cycles between two turns; None where there is no time.
-
-        Where a cycle is too short for it beside the state, servos that measure their motor's current go without: that
-        they are driven shows in every sample. The others give it in place of their state.
-        """
+        """What the servos tell of themselves and the cycles from one time to the next; None where there is no time."""
         interval, modes, count = self.config.interval, [drive.mode for drive in self._drives], len(self._drives)
         if not interval:
             return None, 0
-        whole = status_span(modes, tables)
-        state_bytes, whole_bytes = (one_each(each, count)[0].size for each in (spans(modes, tables)[0], whole))
-        taken = 24 + 8 * count + (count - 1) * (11 + state_bytes) + 11 + whole_bytes  # of goals, request, replies
-        if self.port.wire_time(taken) + return_delay * count + self.port.latency < interval:
-            return whole, max(1, round(STATUS_S / count / interval))
-        if any(joint.servo.senses_supply for joint in self.joints):
-            return status_span(modes, tables, short=True), max(2, round(SHORT_STATUS_S / count / interval))
+        # Without a sensor in the motor lost torque shows in Torque Enable first, so that is worth a late sample.
+        share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
+        for whole in (True, False):
+            span = status_span(modes, tables, whole=whole)
+            goals = 14 * len(set(modes)) + 3 * count
+            taken = self.port.wire_time(goals + 14 + count + count * (11 + one_each(span, count)[0].size))
+            if taken + return_delay * count < share * interval:
+                return span, max(1, round(STATUS_S / interval))
         return None, 0
 
     @property
@@ -359,7 +380,7 @@ class ServoBus:
         interrupts: list[BaseException] = []
         with signals_held_back():
             try:
-                self._broadcast_torque_off()
+                self._torque_off_at_once()
             except BaseException as interrupt:  # the servos must be tried one by one whatever happens
                 interrupts.append(interrupt)
             confirmed, unconfirmed = self._confirm_torque_off(interrupts)
@@ -378,22 +399,22 @@ class ServoBus:
                 confirmed.append(joint)
             else:
                 unconfirmed.append((joint, why))
-                self._broadcast_torque_off()
+                self._torque_off_at_once()
         for joint in confirmed:
             if joint not in self._without_watchdog:
                 _write_surely(self._servos[joint], "Bus Watchdog", 0, interrupts)
         return tuple(confirmed), tuple(unconfirmed)
 
-    def _broadcast_torque_off(self) -> None:
-        """To all servos at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s where one is silent.
-
-        Twice, since a packet may be lost.
+    def _torque_off_at_once(self) -> None:
+        """To all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s where one is
+        silent. A Sync Write, since what else is on the bus may be held by somebody. Twice, since a packet may be lost.
         """
         entry = self._servos[self._drives[0]].table["Torque Enable"]
-        body = entry.address.to_bytes(2, "little") + b"\x00"
+        body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
+        body += b"".join(bytes((drive.id, 0)) for drive in self._drives)
         # Where this fails, the confirmed writes will say so.
         with suppress(DriverError):
-            self.port.write(2 * encode(BROADCAST_ID, Instruction.WRITE, body))
+            self.port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
 
 
 def _write_surely(servo: Servo, register: str, value: int, interrupts: list[BaseException]) -> str | None:

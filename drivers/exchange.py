@@ -7,9 +7,8 @@ A Sync Write has no reply, so the group read that follows it leaves in the same 
 instead of two. All packets are prepared once; a cycle packs the goals and one CRC.
 
 Which registers come back may change from cycle to cycle: `spans[0]` mostly, and every `slow_every`-th time one of the
-others, in turn. All spans should hold what the control needs; the slow ones hold more. Every `status_every`-th time one
-servo, in turn, also gives the registers that say whether it is still driven: by Bulk Read, so that the other servos'
-packets get no longer.
+others, in turn. All spans should hold what the control needs; the slow ones hold more. Every `status_every`-th time
+it is `status`, with the registers that say whether the servos are still driven.
 """
 
 import struct
@@ -18,11 +17,10 @@ from typing import NamedTuple
 
 from fastcrc import crc16
 
-from hil.drivers.bulk_read import BulkRead
 from hil.drivers.control_table import Register
 from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction
 from hil.drivers.port import Port
-from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
+from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
 HOST_S = 0.75e-3
 """Allowed for the computer itself, USB frames included, on top of what wire, servos and adapter take."""
@@ -42,7 +40,7 @@ _pack_crc = struct.Struct("<H").pack
 class Reply(NamedTuple):
     """One exchange: times on the port's clock [s], which of the spans was read, and one answer per servo.
 
-    span: index into the exchange's spans, and from len(spans) on: spans[0] of all but one servo, whose status it was.
+    span: index into the exchange's spans; len(spans) is the status.
     See hil.drivers.sync_read for what an answer is; None where none came.
     """
 
@@ -58,7 +56,7 @@ class Exchange:
     goal: the register, or one for each servo. spans, status: what is read, each of them for all servos or one for each.
     return_delay: the longest Return Delay Time of the servos [s]. fast: read with Fast Sync Read. one_write: both
     packets leave in one write; else in two. slow_every: cycles from one slow span to the next. status: span in which
-    one servo tells its status, every `status_every` cycles; None for never. interval: s from one cycle to the next,
+    the servos tell their status, every `status_every` cycles; None for never. interval: s from one cycle to the next,
     where known; a slow cycle can wait longer for an answer than a fast one.
     """
 
@@ -93,19 +91,13 @@ class Exchange:
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
         ]
-        self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in spans]
+        every = [*spans] if status is None else [*spans, status]
+        self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self._slow_spans = len(spans) - 1
-        if status is not None:
-            states, told = one_each(spans[0], len(self.ids)), one_each(status, len(self.ids))
-            self._reads += [
-                BulkRead(self.ids, [*states[:place], told[place], *states[place + 1 :]])
-                for place in range(len(self.ids))
-            ]
         least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
         self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
         self._status_every = _NEVER if status is None else status_every
         self._until_status = self._status_every
-        self._told = 0
         self._slow_every = slow_every
         self._until_slow = slow_every
         self._slow = 0
@@ -166,14 +158,13 @@ class Exchange:
             self._port.discard_input()
             # An answer that comes later still must not be taken for the answer to this request. Nothing in a packet
             # says which request it answers, but its length does when the spans differ.
-            return 0 if 1 <= self._lost <= self._slow_spans else self._next_slow()
+            return self._next_slow() if self._lost == 0 else 0
         if self._until_slow <= 0:
             self._until_slow = self._slow_every
             # A status that is due too waits for the next cycle: both at once would be the longest of all.
             return self._next_slow()
         self._until_status = self._status_every
-        self._told = (self._told + 1) % len(self.ids)
-        return 1 + self._slow_spans + self._told
+        return 1 + self._slow_spans
 
     def _next_slow(self) -> int:
         if not self._slow_spans:

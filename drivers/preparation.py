@@ -7,6 +7,8 @@ from hil.drivers.joint import Joint
 from hil.drivers.packet import Framer, HardwareError
 from hil.drivers.port import Port
 from hil.drivers.servo import Servo, describe_error
+from hil.drivers.servo_model import Mode
+from hil.drivers.settings import arms_itself
 
 LISTEN_S = 0.05
 """How long the bus must be quiet before this program speaks on it for good [s]."""
@@ -21,7 +23,8 @@ _MARGIN = 1.25
 _MOST_HEARD_BYTES = 4096
 _SLOWER_THAN_KNOWN_S = 1.5e-3
 
-_TIME_BASED_PROFILE = 0x04  # of Drive Mode: means nothing in current and PWM mode
+TIME_BASED_PROFILE = 0x04
+"""Bit of Drive Mode that changes profiles only, which current and PWM mode do not have."""
 
 
 def learn_latency(servo: Servo) -> None:
@@ -78,7 +81,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     if fault != HardwareError(0):
         raise ServoFault(fault_text(joint, describe_error(fault)))
     drive_mode = servo.read("Drive Mode")
-    if drive_mode & ~_TIME_BASED_PROFILE:
+    if drive_mode & ~TIME_BASED_PROFILE:
         raise WrongSetting(
             f"{joint.title}: Drive Mode is {drive_mode}, 0 is needed (no reverse, no torque on by goal). "
             "Set it to 0 with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
@@ -89,8 +92,18 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
             f"{joint.title}: its Secondary ID is {secondary}, so it does what is told to that servo too. Give it none: "
             f"hil setup {servo.port.url} --id {joint.id} --secondary-id 255."
         )
+    if arms_itself(servo):
+        raise WrongSetting(
+            f"{joint.title}: Startup Configuration turns its torque on by itself whenever it is switched on or "
+            "reboots. Set that register to 0 with DYNAMIXEL Wizard 2.0."
+        )
     if servo.read("Operating Mode") != joint.mode:
         servo.write("Operating Mode", joint.mode)
+    if servo.read("Bus Watchdog"):
+        servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    # Goal PWM limits the output in current mode too; what another program left there may be nothing.
+    if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
+        servo.write("Goal PWM", servo.read("PWM Limit"))
 
 
 def fault_text(joint: Joint, cause: str) -> str:

@@ -1,5 +1,7 @@
 """One sample of the arm in SI units, and how raw answers become it."""
 
+import functools
+import operator
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -25,19 +27,18 @@ class Slow(NamedTuple):
 
 
 class Status(NamedTuple):
-    """What one servo told of itself beside its state, in its turn.
+    """What a servo tells of itself a few times in 0.1 s, beside its state.
 
-    joint: its index. torque: whether Torque Enable is on. hardware_error: Hardware Error Status. The others are None
-    where the cycle has no time for them: watchdog, Bus Watchdog [20 ms], 255 when it acted; goal: the register of the
-    goal [A, or V under PWM]; tick: the servo's own clock [s], which wraps at 32.768 s.
+    watchdog: Bus Watchdog [20 ms], 255 when it acted. goal: the register of the goal [A, or V under PWM]. tick: the
+    servo's own clock [s], which wraps at 32.768 s. torque: Torque Enable; hardware_error: Hardware Error Status; both
+    None where the cycle has no time for them.
     """
 
-    joint: int
-    torque: bool
-    hardware_error: int
-    watchdog: int | None = None
-    goal: float | None = None
-    tick: float | None = None
+    watchdog: int
+    goal: float
+    tick: float
+    torque: bool | None = None
+    hardware_error: int | None = None
 
 
 class State(NamedTuple):
@@ -58,7 +59,7 @@ class State(NamedTuple):
     error: tuple[int, ...]
     missing: tuple[bool, ...]
     slow: Slow | None = None
-    status: Status | None = None
+    status: tuple[Status | None, ...] | None = None
 
 
 _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
@@ -91,27 +92,26 @@ def _span(
 SLOW_SPANS = 2
 """How many of `spans` are read now and then."""
 
-_SHORT_STATUS = ("Torque Enable", "Hardware Error Status")
+_WHOLE_STATUS = 9
+"""Values of an answer with a whole status: ERR, five registers and the state."""
+
+_DRIVEN = ("Torque Enable", "Hardware Error Status")
 
 
-def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, short: bool = False) -> Spans:
-    """What one servo is asked for in its turn: whether it is still driven, and its state.
+def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, whole: bool) -> Spans:
+    """What says whether a servo is still driven and watched, and its state.
 
-    mode: how all servos are driven, or how each is. short: without the state, which that cycle then lacks, where a
-    cycle has no time for both.
+    mode: how all servos are driven, or how each is. whole: from Torque Enable on; else without what stands in front of
+    Bus Watchdog, which takes half of the bytes.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
-    names = [_SHORT_STATUS if short else (*_SHORT_STATUS, *_status_names(own)) for own in modes]
+    names = [(*_DRIVEN, *_status_names(own)) if whole else _status_names(own) for own in modes]
     return Span.of(tables, names[0]) if len(set(modes)) == 1 else Span.each(tables, names)
 
 
 def _status_names(mode: Mode) -> tuple[str, ...]:
     goal = "Goal Current" if mode is Mode.CURRENT else "Goal PWM"
     return "Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position"
-
-
-_STATE_IN_STATUS = 6
-"""Where the state begins in the answer of a status: behind ERR and five registers."""
 
 
 class Converter:
@@ -134,12 +134,10 @@ class Converter:
 
     def state(self, ticks: Sequence[int], reply: Reply) -> State:
         sent = tuple([unit * tick for unit, tick in zip(self._drive_units, ticks, strict=True)])
-        told = reply.span - SLOW_SPANS - 1
-        # The tick stands in front of the three that are always read, voltage and temperature behind them.
-        at = 2 if reply.span == 1 else 1
+        # What is read beside the three that are always read stands in front of them, voltage and heat behind them.
+        at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
         drive, velocity, position, error, missing = [], [], [], [], []
-        answers = reply.servos if told < 0 else _states(reply.servos, told)
-        for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(answers, self._scales, strict=True):
+        for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True):
             if answer is None or len(answer) == 1:
                 drive.append(NAN)
                 velocity.append(NAN)
@@ -162,16 +160,23 @@ class Converter:
             tuple(error),
             tuple(missing),
             _slow(reply) if 0 < reply.span <= SLOW_SPANS else None,
-            self._status(told, reply.servos[told]) if told >= 0 else None,
+            self._status(reply.servos) if reply.span > SLOW_SPANS else None,
         )
 
-    def _status(self, joint: int, answer: Answer) -> Status | None:
-        if answer is None or len(answer) == 1:
-            return None
-        if len(answer) <= _STATE_IN_STATUS:
-            return Status(joint, bool(answer[1]), answer[2])
-        _, torque, error, watchdog, goal, tick, *_ = answer
-        return Status(joint, bool(torque), error, watchdog, goal * self._drive_units[joint], tick * 1e-3)
+    def _status(self, answers: Sequence[Answer]) -> tuple[Status | None, ...]:
+        told: list[Status | None] = []
+        for answer, unit in zip(answers, self._drive_units, strict=True):
+            if answer is None or len(answer) == 1:
+                told.append(None)
+                continue
+            watchdog, goal, tick = answer[-6:-3]
+            driven = (bool(answer[1]), answer[2]) if len(answer) == _WHOLE_STATUS else (None, None)
+            told.append(Status(watchdog, goal * unit, tick * 1e-3, *driven))
+        return tuple(told)
+
+    @staticmethod
+    def _answer_length(reply: Reply) -> int:
+        return max((len(answer) for answer in reply.servos if answer is not None), default=1)
 
     def _wrong(self, goals: Sequence[float]) -> ValueError:
         if len(goals) != len(self._joints):
@@ -182,15 +187,6 @@ class Converter:
                     f"{joint.title} was given a goal of {goal} {joint.mode.goal_unit}: that is no number."
                 )
         return ValueError(f"goals {list(goals)} cannot be sent.")
-
-
-def _states(answers: Sequence[Answer], told: int) -> list[Answer]:
-    """The answers with the state alone, or nothing, left of the one that told its status."""
-    states = list(answers)
-    status = answers[told]
-    if status is not None:
-        states[told] = status[:1] + status[_STATE_IN_STATUS:]
-    return states
 
 
 def _slow(reply: Reply) -> Slow:
@@ -226,11 +222,23 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
             tuple([min(slow.voltage[place] for place in places) for places in servos]),
             tuple([max(slow.temperature[place] for place in places) for places in servos]),
         ),
-        status=status
-        and status._replace(
-            joint=of[status.joint],
-            goal=None if status.goal is None else status.goal * len(servos[of[status.joint]]),
-        ),
+        status=status and tuple([_told([status[place] for place in places]) for places in servos]),
+    )
+
+
+def _told(statuses: Sequence[Status | None]) -> Status | None:
+    """What the servos of one joint tell as one: the goal is the sum, what is wrong with one is wrong with it."""
+    told = [status for status in statuses if status is not None]
+    if len(told) < len(statuses):
+        return None
+    torque = [status.torque for status in told if status.torque is not None]
+    errors = [status.hardware_error for status in told if status.hardware_error is not None]
+    return Status(
+        max(status.watchdog for status in told),
+        sum(status.goal for status in told),
+        told[0].tick,
+        all(torque) if torque else None,
+        functools.reduce(operator.or_, errors) if errors else None,
     )
 
 

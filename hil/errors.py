@@ -11,6 +11,7 @@ HilError                    exit code
     ├── SafetyStop          1   the guard saw a limit passed and stopped the arm
     ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
     ├── NotSettled          1   the motion never became periodic
+    ├── DidNotMove          1   friction or something harder holds a joint
     ├── NoSafeTorque        1   a dry run found none that keeps the arm within its limits
     └── RecordingCutShort   1   the recording holds no settled period
 
@@ -119,6 +120,10 @@ class NoSafeTorque(ExperimentError):
 
 class NotSettled(ExperimentError):
     """Successive periods never became alike. Example: a joint that slips, or a cable that drags."""
+
+
+class DidNotMove(ExperimentError):
+    """A joint stood still for a whole period. Example: torque below what friction holds; a jammed gear."""
 
 
 class RecordingCutShort(ExperimentError):

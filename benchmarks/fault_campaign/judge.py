@@ -56,9 +56,10 @@ class Story:
 
 @dataclass(frozen=True)
 class Verdict:
-    """owed: why current had to end, "" where nothing asked for it; late_ms: how long it flowed from then on; beyond: way
-    of each joint beyond its limit (joints,) [rad]; named: whether the user reads the cause, None where nothing stopped;
-    misleading: the user reads causes that it was not, and not the one that it was.
+    """owed: why current had to end, "" where nothing asked for it; late_ms: how long it flowed from then on.
+
+    beyond: way of each joint beyond its limit (joints,) [rad]. named: whether the user reads the cause, None where
+    nothing stopped. misleading: the user reads causes that it was not, and not the one that it was.
     """
 
     owed: str

@@ -254,10 +254,13 @@ class Guard:
             "the two readings is frozen or wrong. Look at the encoder and its magnet; replace the servo.",
         )
 
-    def _look_status(self, status: Status, state: State) -> None:
-        wrong = self._status.look(status, state.goal_current[status.joint], state.time_before_write)
-        if wrong is not None:
-            self._stop(status.joint, *wrong)
+    def _look_status(self, told: Sequence[Status | None], state: State) -> None:
+        for index, status in enumerate(told):
+            if status is None:
+                continue
+            wrong = self._status.look(index, status, state.goal_current[index], state.time_before_write)
+            if wrong is not None:
+                self._stop(index, *wrong)
 
     def _judge_work(self, index: int) -> None:
         """Friction takes energy: a joint whose motor has only ever taken energy out turns against its command."""

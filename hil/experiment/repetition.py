@@ -1,6 +1,6 @@
 """Successive periods compared as they are played, so that no period ends in a burst of work.
 
-The difference is that of `hil.estimation.settled_period.settling_difference`, summed sample by sample: at the end of a
+The difference is that of `hil.estimator.data.periodicity.settling_difference`, summed sample by sample: at the end of a
 period only a few divisions are left. The former period lies in one buffer, which the latest one overwrites.
 """
 

@@ -1,4 +1,4 @@
-"""What each servo tells of itself in its turn: is it still driven, is it watched, does it take goals, is it of now?
+"""What servos tell of themselves beside their state: driven, watched, taking their goals, and answering of now?
 
 None of this shows in a reply's position and velocity, and in its current only where the servo has a sensor in its
 motor. The registers are read back a few times in 0.1 s (hil.drivers.bus), so each of these faults is seen in 0.1 s.
@@ -32,20 +32,20 @@ class StatusCheck:
         self._missed = [0] * len(config.joints)
         self._clock: list[tuple[float, float] | None] = [None] * len(config.joints)
 
-    def look(self, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
+    def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. What is wrong, for a sentence."""
         if status.hardware_error:
             error = describe_error(HardwareError(status.hardware_error))
             return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then switch its supply off and on."
-        if not status.torque:
+        if status.torque is False:
             return Cause.TORQUE_OFF, (
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
                 "supply failed for a moment, or another program uses this bus."
             )
-        return self._watchdog(status) or self._goal(status, sent) or self._time(status, now)
+        return self._watchdog(status) or self._goal(joint, status, sent) or self._time(joint, status, now)
 
     def _watchdog(self, status: Status) -> tuple[Cause, str] | None:
-        if status.watchdog is None or status.watchdog == self._armed:
+        if status.watchdog == self._armed:
             return None
         if status.watchdog == _TRIPPED:
             return Cause.WATCHDOG, (
@@ -59,9 +59,8 @@ class StatusCheck:
             "program uses this bus, or the servo was rebooted."
         )
 
-    def _goal(self, status: Status, sent: float) -> tuple[Cause, str] | None:
-        joint = status.joint
-        if status.goal is None or abs(status.goal - sent) < self._half_tick[joint]:
+    def _goal(self, joint: int, status: Status, sent: float) -> tuple[Cause, str] | None:
+        if abs(status.goal - sent) < self._half_tick[joint]:
             self._missed[joint] = 0
             return None
         self._missed[joint] += 1
@@ -73,10 +72,7 @@ class StatusCheck:
             "former one before. Packets to it get lost, or it refuses them: look at cable and limits."
         )
 
-    def _time(self, status: Status, now: float) -> tuple[Cause, str] | None:
-        if status.tick is None:
-            return None
-        joint = status.joint
+    def _time(self, joint: int, status: Status, now: float) -> tuple[Cause, str] | None:
         former, self._clock[joint] = self._clock[joint], (status.tick, now)
         if former is None:
             return None

@@ -17,8 +17,9 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
-from hil.errors import ExperimentError, NotSettled
+from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.experiment.guard import Guard
+from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
@@ -59,7 +60,9 @@ class Stream:
         self._plan = plan
         self._config = config
         self._safety = config.safety
-        self._guard = Guard(config, _largest_goals(plan))
+        planned = _largest_goals(plan)
+        self._guard = Guard(config, planned)
+        self._model = ModelWatch(config, planned)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -123,10 +126,14 @@ class Stream:
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                 return
+        if difference <= self._plan.drift_within:
+            self._note(f"{segment.role}: still changes by {difference:.2%} a period, slowly; the last ones are used")
+            return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}. Look for play, a dragging cable or a slipping joint; or raise "
+            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} of what only "
+            "drifts. Look for play, a dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 
@@ -134,7 +141,7 @@ class Stream:
         """A joint that friction or something harder holds shows after one period, before minutes are spent on it."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
-                raise ExperimentError(
+                raise DidNotMove(
                     f"{joint.title} moved by {way:.4f} rad in a whole period: it is stuck, or friction holds it. "
                     "Move it by hand with torque off; if it is free, raise experiment.peak_torque."
                 )
@@ -194,6 +201,7 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 
