@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.prior import Prior
 from hil.estimator.chain.stage1 import fit_lines
@@ -64,6 +65,7 @@ class ChainEstimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
+@one_blas_thread
 def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 

@@ -97,15 +97,15 @@ class ChainProblem:
             return Quadratic(np.inf, np.zeros_like(normal), np.zeros_like(gradient))
         return Quadratic(cost, normal, gradient)
 
-    def minimise(self, x: Array, enough: float, damping: float | None = None, at: Quadratic | None = None) -> Minimum:
-        """Minimise the sum of squares from `x`, until it falls by less than `enough` of it."""
+    def minimise(self, x: Array, ftol: float, damping: float | None = None) -> Minimum:
+        """Minimise the sum of squares from `x`, until it falls by less than `ftol` of it."""
 
         def limits(point: Array) -> tuple[Array, Array]:
             least, most = np.full(point.size, -LONGEST), np.full(point.size, LONGEST)
             self.coordinates.limit(least, most)
             return least, most
 
-        return minimise(self.evaluate, x, enough, damping, at, move=self.coordinates.moved, limits=limits)
+        return minimise(self.evaluate, x, ftol, damping, move=self.coordinates.moved, limits=limits)
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Foreseen positions of each period (joints, samples) [rad]; None where a motion runs away."""

@@ -263,3 +263,12 @@ plant.advance(0.1, (1.0, 0.0))
 assert abs(plant.velocity[0] - 9.0) < 1e-9 and plant.position[1] == 0.0
 """,
     )
+
+
+def test_hooks_run_what_make_lint_runs() -> None:
+    hooks = re.findall(
+        r"entry: \.venv/bin/([\w-]+)( \w+)?", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    )
+    lint = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert lint
+    assert {"".join(hook) for hook in hooks} == set(re.findall(r"\$\(BIN\)/([\w-]+(?: (?:check|format))?)", lint[1]))
