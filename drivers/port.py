@@ -46,6 +46,8 @@ class Port:
         self.url = url
         self.baud = baud
         self.latency = adapter_latency(url)
+        self.latency_measured = False
+        """Whether `latency` was measured, because replies come later than this kind of adapter lets one think."""
         self.echoes = False
         """Whether the adapter hears what it sends. Set-up work finds out."""
         self._serial = opened

@@ -40,7 +40,8 @@ def learn_latency(servo: Servo) -> None:
         trips = _trips(servo)
     taken = min(trips, default=0.0) - port.wire_time(_PING_BYTES)
     # Where nobody answers, whoever asks next says what is wrong.
-    port.latency = usual if taken < usual + _SLOWER_THAN_KNOWN_S else _MARGIN * taken
+    port.latency_measured = taken >= usual + _SLOWER_THAN_KNOWN_S
+    port.latency = _MARGIN * taken if port.latency_measured else usual
 
 
 def _trips(servo: Servo) -> list[float]:

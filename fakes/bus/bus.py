@@ -114,6 +114,11 @@ class FakeBus:
         return self.clock.now() - self._origin
 
     @property
+    def advanced_to(self) -> float:
+        """The time up to which plant and servos have lived [s on the clock]."""
+        return self._now
+
+    @property
     def collisions(self) -> int:
         """How often host and servos, or two servos, spoke at once."""
         return self._wire.collisions
