@@ -5,23 +5,35 @@
 
 import math
 import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PositiveFloat,
+    Tag,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from hil import fakes
 from hil.config.bundled import find_config
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
 from hil.drivers.bus import BusConfig
-from hil.drivers.joint import Joint
+from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm, beside
 from hil.fakes.names import find_arm
-from hil.toml_errors import describe
+from hil.toml_errors import UNSAID, describe
 
 FAKE_URL = "fake://"
 
@@ -33,6 +45,13 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
+BusId = Annotated[int, Field(ge=0, le=252)]
+_One = TypeVar("_One")
+OneOrList = Annotated[
+    Annotated[_One, Tag(f"{UNSAID}one")] | Annotated[list[_One], Tag(f"{UNSAID}list")],
+    Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
+]
+"""A value, or a list of such; a wrong one is named as what it looks like."""
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -49,9 +68,11 @@ class JointConfig(_Table):
     """`[[joints]]`: one joint, from the base outwards."""
 
     name: str = Field(min_length=1, max_length=20)
-    id: int = Field(ge=0, le=252)
+    servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or those of the two servos of the joint")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
-    direction: Literal[-1, 1] = 1
+    turns: OneOrList[Literal[-1, 1]] = Field(
+        1, alias="direction", description="-1 where the servo turns against the joint; for two servos one each"
+    )
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
     mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
@@ -77,6 +98,36 @@ class JointConfig(_Table):
         if low >= high:
             raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
         return self
+
+    @model_validator(mode="after")
+    def _a_direction_for_each_servo(self) -> Self:
+        if isinstance(self.servos, list) and not 1 <= len(self.servos) <= 2:
+            raise ValueError(f"id has {len(self.servos)} entries: one servo or two move a joint")
+        if len(set(self.ids)) < len(self.ids):
+            raise ValueError(f"id = {list(self.ids)}: each servo needs one of its own")
+        if isinstance(self.turns, list) and len(self.turns) != len(self.ids):
+            raise ValueError(f"direction has {len(self.turns)} entries for {len(self.ids)} servos: one each")
+        return self
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The IDs of its servos, the first one's first."""
+        return tuple(self.servos) if isinstance(self.servos, list) else (self.servos,)
+
+    @property
+    def id(self) -> int:
+        """The ID of its servo, the first where it has two."""
+        return self.ids[0]
+
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """+1 or -1 for each of its servos."""
+        return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
+
+    @property
+    def direction(self) -> int:
+        """+1 or -1, of the first servo."""
+        return self.directions[0]
 
     @model_validator(mode="after")
     def _driven(self) -> Self:
@@ -120,7 +171,16 @@ class JointConfig(_Table):
 
     @property
     def joint(self) -> Joint:
-        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks, self.drive_mode)
+        seconds = tuple(SecondServo(*each) for each in zip(self.ids[1:], self.directions[1:], strict=True))
+        return Joint(
+            self.name,
+            self.id,
+            servo_model(self.model),
+            self.direction,
+            self.zero_ticks,
+            self.drive_mode,
+            seconds=seconds,
+        )
 
 
 class PriorConfig(_Table):
@@ -318,10 +378,8 @@ class Config(_Table):
             excited = [line for lines in self.experiment.lines for line in lines]
             if len(set(excited)) != len(excited):
                 raise ValueError("experiment.lines: two joints share a line; each joint needs its own")
-        for key in ("id", "name"):
-            values = [getattr(joint, key) for joint in self.joints]
-            if len(set(values)) != count:
-                raise ValueError(f"joints: two joints have the same {key} {values[0]!r}")
+        _all_different("id", [servo_id for joint in self.joints for servo_id in joint.ids])
+        _all_different("name", [joint.name for joint in self.joints])
         for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
             _check_rest_pose(joint, rest)
         if self.experiment.peak_torque is not None:
@@ -330,8 +388,6 @@ class Config(_Table):
         self._check_pilot()
         if self.model.torque_scale and count != 2:
             raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
-        if len({joint.drive_mode for joint in self.joints}) != 1:
-            raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
         return self
@@ -366,7 +422,7 @@ class Config(_Table):
         return BusConfig(
             self.url,
             self.port.baud,
-            tuple(joint.joint for joint in self.joints),
+            tuple(replace(joint.joint, near=rest) for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True)),
             one_write=self.port.one_write,
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
@@ -410,6 +466,12 @@ def parse_config(text: str, path: Path) -> Config:
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
     if len(values) != count:
         raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each of [[joints]]")
+
+
+def _all_different(key: str, values: Sequence[int | str]) -> None:
+    again = [value for place, value in enumerate(values) if value in values[:place]]
+    if again:
+        raise ValueError(f"joints: two joints have the same {key} {again[0]!r}")
 
 
 def _check_rest_pose(joint: JointConfig, rest: float) -> None:

@@ -157,11 +157,19 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms on the wire alone at "
             f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
         )
+    slowest = bus.port.latency + wire
+    if slowest <= 1 / rate:
+        return
     file = latency_timer(bus.port.url)
-    if file is not None and bus.port.latency + wire > 1 / rate:
+    if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which leaves "
-            f"{1 / (bus.port.latency + wire):.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+            f"{1 / slowest:.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+        )
+    if bus.port.latency_measured:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: replies lie {bus.port.latency * 1e3:.0f} ms in this adapter, as measured, which "
+            f"leaves {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short latency, such as a U2D2."
         )
 
 
