@@ -212,13 +212,18 @@ class ServoBus:
         """Whether every servo's firmware has Fast Sync Read."""
         return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
 
-    def make_exchange(self, *, fast: bool, one_write: bool, slow_every: int | None = None) -> Exchange:
-        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first."""
+    def make_exchange(
+        self, *, fast: bool, one_write: bool, slow_every: int | None = None, with_status: bool = True
+    ) -> Exchange:
+        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first.
+
+        with_status: servos also tell their status where the configured rate leaves time for it.
+        """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
         mode = self.joints[0].mode
         return_delay = max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos)
-        status, status_every = self._status_turns(tables, return_delay)
+        status, status_every = self._status_turns(tables, return_delay) if with_status else (None, 0)
         return Exchange(
             self.port,
             [servo.id for servo in servos],

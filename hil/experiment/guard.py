@@ -7,6 +7,7 @@ turn), `silence` (time without replies or commands).
 """
 
 from collections.abc import Sequence
+from math import isnan
 from typing import NamedTuple, NoReturn
 
 from hil.config.schema import Config, JointConfig
@@ -30,6 +31,11 @@ EARLY_MOTION_RAD = 0.05
 
 LONG_GAP = 3.0
 """Intervals between two samples from which on what lies between them is not known well enough to be added up."""
+
+LATE_SHARE = 0.2
+"""Of the deadlines that may be missed for long."""
+
+_OFTEN_LATE = 4.0
 
 WORK_TOLERANCE_RAD = 0.03
 """Work that a joint may seem to give out before its sign is called wrong: this angle at its largest torque."""
@@ -97,6 +103,7 @@ class Guard:
         self._missing = [0] * count
         self._work = [0.0] * count
         self._late = 0
+        self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
@@ -116,9 +123,11 @@ class Guard:
     def late(self, seconds: float = 0.0) -> None:
         """A deadline passed unused, `seconds` after the last command. Raises SafetyStop after too long a time."""
         self._late += 1
+        self._often_late += 1.0
         seconds = max(seconds, self._late * self._interval)
         allowed, said = self._late_limit
         if seconds <= allowed:
+            self._judge_rate()
             return
         missed = max(self._late, int(seconds / self._interval))
         raise SafetyStop(
@@ -126,6 +135,16 @@ class Guard:
             f"{1e3 * allowed:.0f} ms. {_WHY_LATE}{self._acted(seconds)}",
             Cause.LATE,
         )
+
+    def _judge_rate(self) -> None:
+        """Deadlines missed now and then add up where more than a share of them is."""
+        if self._often_late * self._interval >= 0.5 * self._late_limit.seconds and self._often_late >= _OFTEN_LATE:
+            raise SafetyStop(
+                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed: the replies come too late for "
+                f"{1 / self._interval:g} Hz. `hil check` measures what this bus can do: look at the adapter's latency "
+                "timer and the servos' return delay, or lower experiment.rate.",
+                Cause.LATE,
+            )
 
     def look(self, state: State, watchdog_gap: float = 0.0) -> None:
         """Raise SafetyStop when a limit is passed or an answer makes no sense.
@@ -140,6 +159,7 @@ class Guard:
                 Cause.LATE,
             )
         self._late = 0
+        self._often_late = max(0.0, self._often_late - LATE_SHARE)
         for index, limits in enumerate(self._limits):
             if state.error[index] & ALERT:
                 self._stop(index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, reboot.")
@@ -149,6 +169,7 @@ class Guard:
                 self._look_at_joint(index, limits, state, now)
         if state.slow is not None:
             self._look_slow(state.slow)
+            self._look_at_clocks(state.slow, now)
         if state.status is not None:
             self._look_status(state.status, state)
 
@@ -253,6 +274,11 @@ class Guard:
             f"reports a velocity of {velocity:+.2f} rad/s that does not fit its position, {position:.3f} rad: one of "
             "the two readings is frozen or wrong. Look at the encoder and its magnet; replace the servo.",
         )
+
+    def _look_at_clocks(self, slow: Slow, now: float) -> None:
+        for index, tick in enumerate(slow.tick):
+            if not isnan(tick) and (wrong := self._status.look_at_clock(index, tick, now)) is not None:
+                self._stop(index, *wrong)
 
     def _look_status(self, told: Sequence[Status | None], state: State) -> None:
         for index, status in enumerate(told):
