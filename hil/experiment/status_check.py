@@ -53,8 +53,8 @@ class StatusCheck:
             return None
         if status.watchdog == _TRIPPED:
             return Cause.WATCHDOG, (
-                "was stopped by its Bus Watchdog: it heard nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Look at its cable; close other programs on this computer."
+                "has lost its torque: its watchdog acted (Bus Watchdog reads 255), so it heard nothing for "
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Look at its plug and wire."
             )
         if status.watchdog == 0 and self._may_be_unwatched:
             return None
