@@ -32,6 +32,7 @@ MOST_PATIENCE_S = 0.02
 """However slow the cycle: a servo that says nothing must not keep the others waiting."""
 
 _NEVER = 1 << 62
+_DOUBTS = 3
 
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
@@ -96,6 +97,8 @@ class Exchange:
         self._slow_spans = len(spans) - 1
         least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
         self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
+        self._soonest = [0.5 * port.wire_time(self._bytes(read)) for read in self._reads]
+        self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
         self._until_status = self._status_every
         self._slow_every = slow_every
@@ -149,7 +152,22 @@ class Exchange:
             servos = self._search(read, received, before + timeout)
             if None in servos:
                 self._late_possible, self._lost = True, span
+        elif self._doubts and self._now() - before < self._soonest[span]:
+            servos = self._latest(read, servos, before + timeout)
         return Reply(before, self._now(), span, servos)
+
+    def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
+        """Of answers that came sooner than the wire can carry them: is it an earlier request that they answer?
+
+        A reply that comes twice lies there when the next request is sent, and from then on every answer is one cycle
+        old. Where the true answer follows it is taken. Where none does the far end is no wire (a pty), and after a few
+        such times nothing is doubted any more.
+        """
+        received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
+        if not received:
+            self._doubts -= 1
+            return servos
+        return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self) -> int:
         """The span to read where it is not simply the first: after a loss, in a slow turn, or to learn a status."""
