@@ -16,7 +16,8 @@ from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
-from hil.plan.plan import Plan, make_plan
+from hil.plan.chain_plan import plan_of
+from hil.plan.plan import Plan
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
@@ -39,7 +40,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
     shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`.
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
-    plan = make_plan(config) if plan is None else plan
+    plan = plan_of(config) if plan is None else plan
     fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, ServoBus.open(config.bus) as bus:
         clock = bus.port.clock
