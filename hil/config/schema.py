@@ -24,6 +24,7 @@ from pydantic import (
 
 from hil import fakes
 from hil.config.bundled import find_config
+from hil.config.chain import MOST_JOINTS, chain_slips
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
 from hil.drivers.bus import BusConfig
@@ -31,7 +32,7 @@ from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
-from hil.fakes.description import FakeArm, beside
+from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import find_arm
 from hil.toml_errors import UNSAID, describe
 
@@ -205,7 +206,11 @@ class ArmConfig(_Table):
     """`[arm]`: what is known of the mechanism."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
-    rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
+    urdf: str | None = Field(None, description="of an arm in space: a file beside this one; [[joints]] bear its names")
+    base: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+        [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of its base, rad"
+    )
+    rest_pose: list[float] = Field(description="rad: where the arm hangs, or lies, when nothing drives it")
     rest_tolerance: PositiveFloat = Field(
         0.5, description="rad from the rest pose allowed at the start: friction may hold an arm far from it"
     )
@@ -257,6 +262,14 @@ class ExperimentConfig(_Table):
     def samples(self) -> int:
         """Samples in a period."""
         return round(self.rate * self.period)
+
+
+class PathConfig(_Table):
+    """`[joint_path]`: of an arm in space, the path that excites it; band's upper end is its highest frequency."""
+
+    centre: list[float] = Field(description="rad per joint: what the path goes around")
+    swing: list[PositiveFloat] = Field(description="rad per joint: how far from there")
+    speed: list[PositiveFloat] = Field(description="rad/s per joint: how fast at most")
 
 
 class ModelConfig(_Table):
@@ -341,9 +354,10 @@ class Config(_Table):
 
     path: Path = Field(exclude=True)
     port: PortConfig
-    joints: list[JointConfig] = Field(min_length=1, max_length=2)
+    joints: list[JointConfig] = Field(min_length=1, max_length=MOST_JOINTS)
     arm: ArmConfig
     experiment: ExperimentConfig
+    joint_path: PathConfig | None = None
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
     stabiliser: StabiliserConfig | None = None
@@ -370,7 +384,7 @@ class Config(_Table):
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
         for key, values in self._per_joint():
             _same_length(key, values, count)
-        slips = list(implausible(self))
+        slips = [*chain_slips(self), *implausible(self)]
         if slips:
             raise ValueError("; ".join(slips))
         if self.experiment.lines is not None:
@@ -386,7 +400,7 @@ class Config(_Table):
             for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
                 _check_peak_torque(joint, peak)
         self._check_pilot()
-        if self.model.torque_scale and count != 2:
+        if self.model.torque_scale and count != 2 and not self.is_chain:
             raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
@@ -397,6 +411,8 @@ class Config(_Table):
         lists = {"experiment.peak_torque": self.experiment.peak_torque, "arm.link_lengths": self.arm.link_lengths}
         if self.stabiliser is not None:
             lists |= {"stabiliser.stiffness": self.stabiliser.stiffness, "stabiliser.damping": self.stabiliser.damping}
+        if self.joint_path is not None:
+            lists |= {f"joint_path.{key}": value for key, value in self.joint_path.model_dump().items()}
         if self.arm.prior is not None:
             guessed = self.arm.prior.model_dump(exclude={"spread", "rough_spread"})
             lists |= {f"arm.prior.{key}": value for key, value in guessed.items()}
@@ -404,12 +420,19 @@ class Config(_Table):
 
     def _check_pilot(self) -> None:
         experiment = self.experiment
+        if self.is_chain:
+            return
         if experiment.pilot and self.arm.link_lengths is None:
             raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
         if experiment.peak_torque is None and self.arm.link_lengths is None:
             raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
         if experiment.design == "optimal" and not experiment.pilot:
             raise ValueError('experiment.design = "optimal" needs pilot = true: it designs on the pilot\'s model')
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether a URDF describes the arm."""
+        return self.arm.urdf is not None
 
     @property
     def url(self) -> str:
@@ -457,6 +480,9 @@ def parse_config(text: str, path: Path) -> Config:
         raise ConfigError(f"{path}: path is not a known key.")
     if isinstance(values.get("fake"), dict):
         values["fake"] = beside(values["fake"], path.parent)
+    arm = values.get("arm")
+    if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
+        values["arm"] = {**arm, "urdf": str(found_beside(path.parent, arm["urdf"]))}
     try:
         return Config(path=path, **values)
     except ValidationError as error:

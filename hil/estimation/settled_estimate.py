@@ -5,6 +5,7 @@ import time
 from dataclasses import replace
 
 from hil.config.schema import Config
+from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.result import Checks, make_result
@@ -32,6 +33,8 @@ log = logging.getLogger(__name__)
 def estimate_run(run: RunFolder) -> SettledResult:
     """Estimate from the recording in `run` and write its result.json; the result. Raises HilError, EstimationError."""
     config, facts = run.load_config(), run.load_facts()
+    if config.is_chain:
+        return estimate_chain_run(run, config, facts)
     samples = load_samples(run.samples_path, len(config.joints))
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)

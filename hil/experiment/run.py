@@ -17,7 +17,8 @@ from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
-from hil.plan.plan import Plan, make_plan
+from hil.plan.chain_plan import plan_of
+from hil.plan.plan import Plan
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
@@ -52,7 +53,7 @@ def run_experiment(
     is known of the arm, by default its prior.
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
-    plan = make_plan(config) if plan is None else plan
+    plan = plan_of(config) if plan is None else plan
     fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
