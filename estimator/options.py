@@ -219,7 +219,7 @@ class SelectionOptions:
     """Of the Coulomb step of one joint, tried where the motion is not explained [rad/s]."""
     overrule_ratio: float = 0.8
     """Of the chosen model's error of prediction: what another one must reach to be chosen instead."""
-    ripple_evidence: float = 0.15
+    ripple_evidence: float = 0.05
     """Of the score test, from which ripple is tried: where it repeats is found roughly, so that a fit sees more."""
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
     """Chance at which nothing is taken for something, in turn until the motion is explained as well."""

@@ -17,6 +17,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.covariance import autocorrelation
+from hil.estimator.fit.objective import Run
 from hil.estimator.fit.reparametrisation import Sizes
 from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
@@ -100,11 +101,7 @@ def linearised(
     every = (*estimate.names, *added)
     values = {name: known.get(name, term_of(name).absent) for name in added} | estimate.parameters
     physics = Physics.of({**known, **values})
-    run = (
-        SimulatedRun.of(used, INTEGRATION)
-        if used.stabiliser is None
-        else StabilisedRun.of(used, used.stabiliser, INTEGRATION)
-    )
+    run = simulated_run(used)
     rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
     weight = np.where(np.isfinite(estimate.residual), 1.0 / np.maximum(rms, 1e-300), 0.0)
     causes = len(every) + 2 * period.joints
@@ -190,6 +187,13 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     return covariance
 
 
+def simulated_run(period: SettledPeriod) -> Run:
+    """A period as it is simulated here, in the steps of a fit's result."""
+    if period.stabiliser is None:
+        return SimulatedRun.of(period, INTEGRATION)
+    return StabilisedRun.of(period, period.stabiliser, INTEGRATION)
+
+
 def colour(residual: Array) -> float:
     """Integrated autocorrelation of a residual (joints, samples), worst joint, missing samples as 0; 1 is white."""
     worst = 1.0
@@ -210,6 +214,8 @@ def _richer(model: Model) -> dict[str, Model]:
 
 
 def _may_be(option: str, model: Model) -> bool:
+    if option == "lags":
+        return model.joints == 2 and model.drive != "delay"
     return option != "torque_scale" or model.joints == 2
 
 

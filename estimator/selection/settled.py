@@ -137,8 +137,10 @@ class Selection:
 
     def grow(self, model: Model) -> Trial:
         """From `model` to the richest one that the motion asks for. Raises ConvergenceError."""
-        unknown: set[Option] = {"zeros", "torque_scale"} if model.joints == 2 else {"zeros"}
-        plain = self._try_or_none(model.having(*unknown))
+        unknown: set[Option] = {"zeros"}
+        if model.joints == 2:
+            unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
+        plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
             return plain
@@ -185,12 +187,19 @@ class Selection:
         if self._left(best) > self._options.presliding_residual**2:
             return best  # what is missing would be taken for what is there
         for level in self._options.prune_levels:
+            plainer = self._pruned_at(level, best)
+            if plainer is best or self._gain(best, plainer) < self._worth(best, plainer):
+                return plainer
+        return best
+
+    def _pruned_at(self, level: float, best: Trial) -> Trial:
+        """Pruned and fitted again until nothing more is doubtful: a fit of fewer terms knows the rest better."""
+        while best.estimate is not None:
             plainer = _without_nothings(best.estimate, level, self._fixed)
-            if plainer == best.model:
-                return best
-            trial = self._try_or_none(plainer, best)
-            if trial is not None and self._gain(best, trial) < self._worth(best, trial):
-                return trial
+            trial = None if plainer == best.model else self._try_or_none(plainer, best)
+            if trial is None:
+                break
+            best = trial
         return best
 
     def judged(self, chosen: Trial) -> Trial:
@@ -226,22 +235,27 @@ class Selection:
         return max(1, len(richer.model.names) - len(plainer.model.names)) * float(np.log(independent))
 
     def _try_or_none(
-        self, model: Model, near: Trial | None = None, values: Mapping[str, float] = MappingProxyType({})
+        self,
+        model: Model,
+        near: Trial | None = None,
+        values: Mapping[str, float] = MappingProxyType({}),
+        *,
+        coarse: bool = False,
     ) -> Trial | None:
         """A trial; None where the fit does not converge."""
         try:
-            return self._try(model, near, values)
+            return self._try(model, near, values, coarse=coarse)
         except ConvergenceError:
             self.trials.append(Trial(model, None, None, np.inf, 0.0))
             return None
 
-    def _try(self, model: Model, near: Trial | None, values: Mapping[str, float]) -> Trial:
+    def _try(self, model: Model, near: Trial | None, values: Mapping[str, float], *, coarse: bool = False) -> Trial:
         """From where `near` ended, with `values` for what it lacks, or from scratch."""
         started = time.perf_counter()
         place = None
         if near is not None and near.estimate is not None:
             place = Near({**near.estimate.parameters, **values}, near.estimate.start)
-        estimate = identify(self._periods, model, starts=self._starts, near=place)
+        estimate = identify(self._periods, model, starts=self._starts, near=place, coarse=coarse)
         relative, score = self._predicted(estimate)
         trial = Trial(model, estimate, relative, score, time.perf_counter() - started)
         self.trials.append(trial)

@@ -204,6 +204,7 @@ class ModelConfig(_Table):
     saturation: bool = Field(False, description=OPTIONS["saturation"])
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
+    lags: bool = Field(False, description=OPTIONS["lags"])
 
     @property
     def fixed_friction(self) -> Friction:
