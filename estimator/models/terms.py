@@ -77,6 +77,8 @@ class Term:
     spread: Scale | float | None = None
     """How far from its `absent` value it lies on a usual arm (standard deviation), as a scale or a number [unit]; None
     where nothing is expected of it."""
+    log_spread: float | None = None
+    """The same of a positive term's logarithm, about that of `initial`."""
 
     @property
     def of_torque(self) -> bool:
@@ -139,6 +141,7 @@ _DECLARED = (
         absent=1.0,
         max_step=1.0,
         standstill=True,
+        log_spread=1.0,
     ),
     Term("load", "1", "dry friction per motor torque", part="stribeck_load", initial=0.02),
     Term(

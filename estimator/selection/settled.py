@@ -17,16 +17,22 @@ from scipy.stats import chi2
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError, PeriodicityError
-from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.fit.stage2 import Near
 from hil.estimator.identify import Estimate, identify, predict
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
-from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_of
+from hil.estimator.options import IntegrationOptions, LikelihoodOptions, MinimiserOptions, SelectionOptions
+from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
 
 DEFAULTS = SelectionOptions()
+THOROUGH = LikelihoodOptions()
+QUICK = LikelihoodOptions(
+    minimiser=MinimiserOptions(max_iterations=25, unfinished=1.0),
+    integration=IntegrationOptions(max_substeps=16),
+    coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
+)
+"""Bristles that turn out as stiff as none would take many substeps for nothing."""
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 """What is nothing where it is small, and so costs a fit nothing but its columns."""
 
@@ -131,7 +137,6 @@ class Selection:
         self._starts = starts
         self._options = options
         self._fixed = fixed
-        self._known = ripple_of(self._periods[0], fit_lines(self._periods[0]))
         self.trials: list[Trial] = []
         """In the order in which they were made."""
 
@@ -145,22 +150,29 @@ class Selection:
         if plain is not None and explained and not self._seen(plain):
             return plain
         smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
-        best = self._better(self._try_or_none(smooth, plain if explained else None), plain)
+        best = plain
+        if plain is not None and self._left(plain) < self._options.near_residual**2:
+            best = self._better(self._try_or_none(smooth, plain), plain)
+        if best is None or self._left(best) > self._options.presliding_residual**2:
+            best = self._better(self._try_or_none(smooth), best)
         if best is None:
             raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
         if self._left(best) > self._options.presliding_residual**2:
-            best = self._better(self._try_or_none(smooth.having("presliding")), best) or best
+            best = self._better(self._try_or_none(smooth.having("presliding"), coarse=True), best) or best
         if not self._is_explained(best):
             best = self._with_ripple(best)
         return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
 
     def _seen(self, trial: Trial) -> list[Candidate]:
         assert trial.estimate is not None
-        return [each for each in candidates(self._periods[0], trial.estimate, self._known) if each.evidence > 1.0]
+        return [each for each in candidates(self._periods[0], trial.estimate, {}) if each.evidence > 1.0]
 
     def _with_ripple(self, best: Trial) -> Trial:
         assert best.estimate is not None
-        for each in candidates(self._periods[0], best.estimate, self._known):
+        if "ripple" in best.model.options:
+            return best
+        known = ripple_cycles(self._periods[0], best.estimate, self._options.ripple_cycles)
+        for each in candidates(self._periods[0], best.estimate, known):
             if each.part == "ripple" and each.evidence > self._options.ripple_evidence:
                 return self._better(self._try_or_none(each.model, best, each.values), best) or best
         return best
@@ -179,6 +191,8 @@ class Selection:
         """`richer` if its terms gain what they must, else `plainer`."""
         if richer is None or plainer is None:
             return richer or plainer
+        if richer.model == plainer.model:
+            return min(richer, plainer, key=self._left)
         return richer if self._gain(richer, plainer) > self._worth(richer, plainer) else plainer
 
     def prune(self, best: Trial) -> Trial:
@@ -255,7 +269,8 @@ class Selection:
         place = None
         if near is not None and near.estimate is not None:
             place = Near({**near.estimate.parameters, **values}, near.estimate.start)
-        estimate = identify(self._periods, model, starts=self._starts, near=place, coarse=coarse)
+        options = QUICK if coarse and "presliding" in model.options else THOROUGH
+        estimate = identify(self._periods, model, starts=self._starts, near=place, coarse=coarse, options=options)
         relative, score = self._predicted(estimate)
         trial = Trial(model, estimate, relative, score, time.perf_counter() - started)
         self.trials.append(trial)
