@@ -212,13 +212,18 @@ class ServoBus:
         """Whether every servo's firmware has Fast Sync Read."""
         return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
 
-    def make_exchange(self, *, fast: bool, one_write: bool, slow_every: int | None = None) -> Exchange:
-        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first."""
+    def make_exchange(
+        self, *, fast: bool, one_write: bool, slow_every: int | None = None, status: bool = True
+    ) -> Exchange:
+        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first.
+
+        status: whether the servos tell their status now and then, where there is time for it.
+        """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
         mode = self.joints[0].mode
         return_delay = max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos)
-        status, status_every = self._status_turns(tables, return_delay)
+        span, status_every = self._status_turns(tables, return_delay) if status else (None, 0)
         return Exchange(
             self.port,
             [servo.id for servo in servos],
@@ -228,7 +233,7 @@ class ServoBus:
             fast=fast,
             one_write=one_write,
             slow_every=slow_every or self.config.slow_every,
-            status=status,
+            status=span,
             status_every=status_every,
             interval=self.config.interval,
         )

@@ -2,9 +2,9 @@
 
 The stabiliser gave k (pose - measured) for a spring of stiffness k; in closed loop the simulated arm would be given
 k (pose - simulated), which is the torque that was commanded and a spring k (measured - simulated) beside it. So the
-simulation has that spring instead of the loop: an arm that falls over by itself stays with the real one, the
-derivatives are those of every other run, and where model and arm agree the spring gives nothing. The stabiliser's
-damper is left out: it only says how fast what is left dies away.
+simulation has that spring instead of the loop: an arm that falls over by itself stays with the real one, derivatives
+are those of every other run, and where model and arm agree the spring gives nothing. The stabiliser's damper is left
+out: it only says how fast what is left dies away.
 """
 
 from collections.abc import Iterator

@@ -14,7 +14,17 @@ from hil.estimator.errors import ModelError
 
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]
 Drive = Literal["delay", "lag", "delay_lag"]
-Option = Literal["presliding", "asymmetry", "ripple", "zeros", "torque_scale", "saturation", "cable", "encoder", "lags"]
+Option = Literal[
+    "presliding",
+    "asymmetry",
+    "ripple",
+    "zeros",
+    "torque_scale",
+    "saturation",
+    "cable",
+    "encoder",
+    "lags",
+]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
 Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation"]

@@ -110,7 +110,8 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, flo
     level = p[COULOMB + joint] * (1.0 + p[RISE + joint] * bump_at(v / p[FADING + joint])) + p[LOAD + joint] * abs(t)
     bend, bent = bend_at(v, 1.0 / p[WIDTH + joint])
     left = t - p[OFFSET + joint] - p[CABLE + joint] * q - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
-    return left, viscous + level * bent
+    slope = viscous + level * bent
+    return left, slope
 
 
 def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:

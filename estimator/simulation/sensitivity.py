@@ -204,13 +204,11 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     cable = p[CABLE + joint]
     left[stage, joint] = motor - offset - cable * q - viscous * v - dry * bend
     slope[stage, joint] = viscous + level * bent
-    n = now * NUMBERS + stage * BY_STATE
-    numbers[n + 5 * joint] = cycles * turn * passed - cable
-    numbers[n + 5 * joint + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
-    numbers[n + 8 + 2 * joint], numbers[n + 9 + 2 * joint] = (
-        cycles * turn * loaded * bent,
-        level_v * bent + level * bent_v,
-    )
+    left_by = now * NUMBERS + stage * BY_STATE + 5 * joint
+    slope_by = left_by + 8 - 3 * joint
+    numbers[left_by], numbers[slope_by] = cycles * turn * passed - cable, cycles * turn * loaded * bent
+    numbers[left_by + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
+    numbers[slope_by + 1] = level_v * bent + level * bent_v
 
 
 def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple[float, float]:

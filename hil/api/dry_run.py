@@ -1,6 +1,7 @@
 """`hil.dry_run`: the experiment simulated on arms like the one on the bench. Nothing moves."""
 
 from dataclasses import dataclass
+from html import escape
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ __all__ = ["Rehearsal", "dry_run"]
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Rehearsal:
-    """What a dry run foretells. found: everything it computed."""
+    """What a dry run foretells. file: the configuration's, as the caller wrote it. found: everything it computed."""
 
+    file: Path
     config: Config
     found: DryRun
 
@@ -57,7 +59,7 @@ class Rehearsal:
     def __repr__(self) -> str:
         torque = ", ".join(f"{value:.2f}" for value in self.largest_peak_torque)
         return (
-            f"Dry run of {self.config.path} on {self.found.arms} arms drawn from the {self.found.source}: "
+            f"Dry run of {self.file} on {self.found.arms} arms drawn from the {self.found.source}: "
             f"{'safe' if self.is_safe else 'NOT SAFE'}, chance of a guard stop {100 * self.stop_chance:.2g} %; "
             f"largest safe peak_torque = [{torque}] N m"
         )
@@ -74,7 +76,7 @@ class Rehearsal:
             for index, joint in enumerate(self.config.joints)
             for row, (name, unit) in enumerate(quantities_of(self.config))
         ]
-        return f"<p>{self!r}</p>" + html_table(("joint", "peak", "unit", "median", "99 %", "limit"), rows)
+        return f"<p>{escape(repr(self))}</p>" + html_table(("joint", "peak", "unit", "median", "99 %", "limit"), rows)
 
 
 def dry_run(
@@ -100,6 +102,7 @@ def dry_run(
         NoSafeTorque: no torque keeps all simulated arms within their limits.
         hil.drivers.errors.DriverError: with `servos`, they do not answer.
     """
-    checked, _ = loaded(config)
+    checked, shown = loaded(config)
     on_progress(Progress("simulation", "Simulating"))
-    return Rehearsal(checked, simulate(checked, None if result is None else Path(result), arms, servos))
+    former = None if result is None else Path(result)
+    return Rehearsal(shown, checked, simulate(checked, former, arms, servos))

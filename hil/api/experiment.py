@@ -5,7 +5,7 @@ from datetime import datetime
 from os import PathLike
 from pathlib import Path
 
-from hil.api.progress import OnProgress, Progress, ignore
+from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.config.schema import Config, load_config
 from hil.errors import ConfigError
@@ -38,9 +38,10 @@ def identify(
     Args:
         config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
         out: run folder, which must be new or empty; runs/TIME-ARM unless given.
-        take_over: let an arm whose torque is on at the start sink slowly, instead of refusing it. Hold it by hand.
-        on_progress: called with a `Progress` about 20 times a second while the arm moves. The control loop calls it: it
-            must return within a fraction of a sample, and whatever it raises stops the arm.
+        take_over: let an arm that another program holds sink slowly and take it over; hold it by hand.
+        on_progress: called with a `Progress` about 20 times a second while the arm moves, on a real bus by a thread of
+            its own. It cannot disturb the experiment: what comes too fast is dropped, and when it raises, that is
+            logged and it is not called again.
 
     Returns:
         The result, with the run folder as `run`; its report is in there too.
@@ -53,14 +54,16 @@ def identify(
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
     """
     checked, shown = loaded(config)
-    checked = _taking_over(checked, take_over)
+    if take_over:
+        checked = _taking_over(checked)
     run = new_run_folder(checked, shown, out)
+    tell = forgiving(on_progress)
 
     def watch(stream: StreamProgress) -> None:
-        on_progress(Progress("experiment", stream=stream))
+        tell(Progress("experiment", stream=stream))
 
     def say(message: str) -> None:
-        on_progress(Progress("experiment", message))
+        tell(Progress("experiment", message))
 
     if checked.experiment.pilot:
         from hil.pilot import identify_in_steps
@@ -69,7 +72,7 @@ def identify(
         say(torque)
     else:
         say(run_experiment(checked, run, shown, watch))
-        on_progress(Progress("estimation", "Estimating"))
+        tell(Progress("estimation", "Estimating"))
         result = estimate_run(run)
     write_run_report(run)
     log.info("%s: trust it: %s", run.path, result.verdict.trust)
@@ -88,22 +91,18 @@ def record(
     The arm moves. Arguments and exceptions are those of `identify`.
     """
     checked, shown = loaded(config)
-    checked = _taking_over(checked, take_over)
+    if take_over:
+        checked = _taking_over(checked)
     if checked.experiment.pilot:
         raise ConfigError(
             f"{shown}: experiment.pilot = true: each step's torque follows from an estimate of the one before, which "
             "`hil identify` does. To record alone, give experiment.peak_torque and set pilot = false."
         )
     run = new_run_folder(checked, shown, out)
-    torque = run_experiment(checked, run, shown, lambda stream: on_progress(Progress("experiment", stream=stream)))
-    on_progress(Progress("experiment", torque))
+    tell = forgiving(on_progress)
+    torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
+    tell(Progress("experiment", torque))
     return load_run(run.path)
-
-
-def _taking_over(config: Config, wanted: bool) -> Config:
-    if not wanted:
-        return config
-    return config.model_copy(update={"safety": config.safety.model_copy(update={"take_over": True})})
 
 
 def loaded(config: ConfigLike) -> tuple[Config, Path]:
@@ -111,6 +110,10 @@ def loaded(config: ConfigLike) -> tuple[Config, Path]:
     if isinstance(config, Config):
         return config, config.path
     return load_config(Path(config)), Path(config)
+
+
+def _taking_over(config: Config) -> Config:
+    return config.model_copy(update={"safety": config.safety.model_copy(update={"take_over": True})})
 
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:

@@ -1,5 +1,6 @@
 """What a long call tells while it runs."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -7,6 +8,8 @@ from typing import Literal
 from hil.experiment.stream import Progress as StreamProgress
 
 __all__ = ["OnProgress", "Progress", "Stage"]
+
+log = logging.getLogger(__name__)
 
 Stage = Literal["experiment", "estimation", "simulation", "check"]
 
@@ -32,6 +35,23 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
+
+
+def forgiving(listener: OnProgress) -> OnProgress:
+    """The same, but its first exception is logged and it is not called again: nothing disturbs an arm under torque."""
+    failed = False
+
+    def tell(progress: Progress) -> None:
+        nonlocal failed
+        if failed:
+            return
+        try:
+            listener(progress)
+        except Exception:
+            failed = True
+            log.exception("on_progress raised an exception; it is not called again")
+
+    return tell
 
 
 def ignore(_: Progress) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from hil.cli.options import ConfigPath, Json
+from hil.cli.options import ConfigPath, Json, PortOrFile
 
 PortOrConfig = Annotated[
     str | None,
@@ -66,9 +66,7 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
 
 
 def setup(
-    port: Annotated[
-        str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, a TOML file, or a bundled name.")
-    ],
+    port: PortOrFile,
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
     baud: Annotated[int, typer.Option("--baud", help="Its present baud.")] = 1_000_000,
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,

@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hil import strict_json
-from hil.cli.options import ConfigPath, Json, OutPath, TakeOver
+from hil.cli.options import ConfigPath, Json, OutPath
 
 if TYPE_CHECKING:
     from hil.api.run import Estimation, Identification
 
+TakeOver = Annotated[
+    bool, typer.Option("--take-over", help="Let an arm that is held sink slowly and take it over. Hold it by hand.")
+]
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="RUN | FILE.csv ..", help="Run folder, or CSV files of one arm with --config.")
 ]

@@ -1,4 +1,4 @@
-"""The subcommand `hil fake`: what it takes. hil.cli.fake does the work, imported when it is asked to."""
+"""The subcommands about fake arms: what they take. hil.cli.fake does the work, imported when it is asked to."""
 
 from pathlib import Path
 from typing import Annotated

@@ -10,7 +10,7 @@ ConfigPath = Annotated[
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")]
 OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default runs/TIME-ARM.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
-TakeOver = Annotated[
-    bool, typer.Option("--take-over", help="Let an arm that is held sink slowly and take it over. Hold it by hand.")
+PortOrFile = Annotated[
+    str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, a TOML file, or a bundled name.")
 ]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]

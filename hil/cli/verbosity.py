@@ -48,13 +48,15 @@ def _set_up(verbose: int, quiet: bool) -> None:
     for handler in [each for each in logger.handlers if isinstance(each, _ShownOnTerminal)]:
         logger.removeHandler(handler)
     logger.setLevel(logging.NOTSET)
+    shown = _ShownOnTerminal()
+    shown.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s", "%H:%M:%S"))
+    shown.setLevel(logging.ERROR)  # warnings are among the results
     if quiet:
         logger.setLevel(logging.ERROR)
     elif verbose:
         logger.setLevel(logging.INFO if verbose == 1 else logging.DEBUG)
-        shown = _ShownOnTerminal()
-        shown.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s", "%H:%M:%S"))
-        logger.addHandler(shown)
+        shown.setLevel(logging.NOTSET)
+    logger.addHandler(shown)
 
 
 class _ShownOnTerminal(logging.StreamHandler):  # type: ignore[type-arg]

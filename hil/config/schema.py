@@ -19,7 +19,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
-from hil.fakes.description import FakeArm
+from hil.fakes.description import FakeArm, beside
 from hil.fakes.names import find_arm
 from hil.toml_errors import describe
 
@@ -193,7 +193,7 @@ class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
     friction: Literal["auto"] | Friction = Field(
-        "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
+        "auto", description='"auto" tries all that follows too, and keeps what the motion asks for'
     )
     drive: Drive = "lag"
     presliding: bool = Field(False, description=OPTIONS["presliding"])
@@ -213,10 +213,9 @@ class ModelConfig(_Table):
 
     @model_validator(mode="after")
     def _auto_has_no_terms(self) -> Self:
-        if self.friction == "auto" and (self.presliding or self.asymmetry or self.ripple or self.zeros):
-            raise ValueError(
-                'friction = "auto" chooses presliding, asymmetry and ripple itself and leaves zeros out: give none'
-            )
+        given = [option for option in OPTIONS if option != "torque_scale" and getattr(self, option)]
+        if self.friction == "auto" and given:
+            raise ValueError(f'friction = "auto" chooses {", ".join(given)} itself: give none, or a law of friction')
         return self
 
 
@@ -390,6 +389,8 @@ def parse_config(text: str, path: Path) -> Config:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
+    if isinstance(values.get("fake"), dict):
+        values["fake"] = beside(values["fake"], path.parent)
     try:
         return Config(path=path, **values)
     except ValidationError as error:

@@ -22,7 +22,7 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
-from hil.setup.servo_session import servo_session
+from hil.setup.servo_session import has_moved, servo_session
 
 _LAST_SAMPLES = 100
 """How many samples an error carries with it."""
@@ -32,6 +32,9 @@ _MOST_UNSEEN = 20
 
 _PATIENCE_S = 0.2
 """How long the end of a run waits for whoever watches."""
+
+
+_MOVED = 2.0
 
 
 def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch, plan: Plan | None = None) -> str:
@@ -147,13 +150,17 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described."""
+    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described.
+
+    Where the run before it has passed that check, friction may hold the arm twice as far away.
+    """
+    tolerance = config.arm.rest_tolerance * (_MOVED if has_moved() else 1.0)
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
-        if abs(position - rest) > config.arm.rest_tolerance:
+        if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
                 f"{joint} is at {position:.3f} rad; arm.rest_pose says {rest:.3f} and arm.rest_tolerance allows "
-                f"{config.arm.rest_tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
+                f"{tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
                 f"Only if it is in its rest pose now, set zero_ticks = {ticks}."
             )
 

@@ -86,8 +86,7 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
         """Run one step, compare, tell.
 
-        Raises what a run raises, but for what tells of the arm alone: it passed a limit, did not move or did not
-        settle.
+        Raises what a run raises, but for what tells of the arm alone: a limit passed, no motion, no steady motion.
         """
         torque, error = "", None
         try:

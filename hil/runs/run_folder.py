@@ -4,6 +4,7 @@ config.toml     copied byte for byte
 experiment.json the [experiment] that was really played, where the tool chose it (pilot, torque found by dry runs)
 stabiliser.json the [stabiliser] likewise
 run.json        versions, start time, and the few facts that the samples need to be read again
+servo_settings.json  what the servos were set to before (hil.setup.servo_session)
 events.jsonl    what happened when, one JSON object a line, written as it happens
 samples.npy     every sample (hil.runs.recording)
 lateness.json   how many samples were how late (hil.runs.timing)

@@ -98,7 +98,7 @@ def test_the_run_folder_is_named_after_time_and_arm(arm_file: ArmFile) -> None:
     assert folder.name.endswith("-arm")
     assert {file.name for file in folder.iterdir()} == {
         "config.toml", "run.json", "events.jsonl", "samples.npy", "lateness.json", "result.json", "period.npz",
-        "report.html",
+        "report.html", "servo_settings.json",
     }  # fmt: skip
     assert (folder / "config.toml").read_bytes() == Path("arm.toml").read_bytes()
     events = [json.loads(line)["event"] for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
