@@ -276,7 +276,7 @@ class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
     friction: Literal["auto"] | Friction = Field(
-        "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
+        "auto", description='"auto" tries all that follows too, and keeps what the motion asks for'
     )
     drive: Drive = "lag"
     presliding: bool = Field(False, description=OPTIONS["presliding"])
@@ -287,6 +287,7 @@ class ModelConfig(_Table):
     saturation: bool = Field(False, description=OPTIONS["saturation"])
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
+    lags: bool = Field(False, description=OPTIONS["lags"])
 
     @property
     def fixed_friction(self) -> Friction:
@@ -295,10 +296,9 @@ class ModelConfig(_Table):
 
     @model_validator(mode="after")
     def _auto_has_no_terms(self) -> Self:
-        if self.friction == "auto" and (self.presliding or self.asymmetry or self.ripple or self.zeros):
-            raise ValueError(
-                'friction = "auto" chooses presliding, asymmetry and ripple itself and leaves zeros out: give none'
-            )
+        given = [option for option in OPTIONS if option != "torque_scale" and getattr(self, option)]
+        if self.friction == "auto" and given:
+            raise ValueError(f'friction = "auto" chooses {", ".join(given)} itself: give none, or a law of friction')
         return self
 
 
