@@ -92,6 +92,7 @@ def make_chain_plan(config: Config) -> Plan:
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
         settle_within=experiment.settle_within,
+        drift_within=experiment.drift_within,
     )
 
 
