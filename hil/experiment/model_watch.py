@@ -1,9 +1,9 @@
 """The dry run's model beside the experiment: is the motion one that any arm like this could make?
 
-What is known before the run is what the dry run knows: an ensemble of arms, from `[arm.prior]` or from a former result.
-Its mean and covariance, made wider, are where `hil.estimator.models.momentum_observer` begins. Without link lengths,
-with which no dry run is possible either, nothing is known but the torque that shall move the arm: then the first motion
-teaches the model, and only what comes after it is judged.
+What is known before the run is what the dry run knows: an ensemble of arms, from `[arm.prior]` or from an earlier
+result. Its mean and covariance, made wider, are where `hil.estimator.models.momentum_observer` begins. Without link
+lengths, with which no dry run is possible either, nothing is known but the torque that shall move the arm: then the
+first motion teaches the model, and only what comes after it is judged.
 """
 
 from collections.abc import Sequence

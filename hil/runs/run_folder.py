@@ -129,7 +129,7 @@ class RunFolder:
         return self.path / "stabiliser.json"
 
     def load_config(self) -> Config:
-        """The configuration, with the experiment that was really played. Raises ConfigError, RunFolderError."""
+        """The configuration, with the experiment as it was actually played. Raises ConfigError, RunFolderError."""
         config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
         if not self.played_path.is_file():
             return config

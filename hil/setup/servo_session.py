@@ -96,7 +96,7 @@ class ServoSession:
             self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
     def end(self) -> None:
-        """Put back what every servo was set to; each that cannot be is named. Never raises DriverError."""
+        """Restore every servo's settings; name those that cannot be restored. Never raises DriverError."""
         failed = self._put_back(self._kept)
         if failed:
             clock = self.bus.port.clock
