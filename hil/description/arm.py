@@ -95,7 +95,7 @@ class ArmDescription:
     held: tuple[str, ...]
     """Movable joints that are not among the arm's, such as a gripper's: taken as held at zero."""
     doubts: tuple[str, ...]
-    """In words: what is odd about its inertias."""
+    """In words: what is implausible about its inertias."""
 
     @property
     def parameters(self) -> Array:
