@@ -1,6 +1,6 @@
 """Unconstrained coordinates of a chain's parameters: positive ones are exponentials, base parameters and offsets plain.
 
-A base parameter is a sum that may have either sign; that the mass matrix stays positive is for the fit to look after.
+A base parameter is a sum that may have either sign; the fit must keep the mass matrix positive definite.
 """
 
 from collections.abc import Mapping
@@ -66,13 +66,13 @@ class ChainCoordinates:
         return slope
 
     def limit(self, least: Array, most: Array) -> None:
-        """Lower in place what coordinates may change by in one step."""
+        """Reduce in place the permitted step of each coordinate."""
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], RESHAPING, LONGEST)
         least[:count], most[:count] = -bound, bound
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Where `step` leads from `x`, both with coordinates of something else at their end."""
+        """The point reached by `step` from `x`; both may have further coordinates at the end."""
         y: Array = x + step
         widths = np.flatnonzero(self._floors)
         # Far above its floor a width follows its logarithm, near it itself: else it would never arrive.

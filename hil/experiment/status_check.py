@@ -38,7 +38,7 @@ class StatusCheck:
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
-        """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. Returns what is wrong, as part of a sentence."""
+        """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. Returns the fault as text."""
         if status.hardware_error:
             error = describe_error(HardwareError(status.hardware_error))
             return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle it."

@@ -283,7 +283,7 @@ class PhysicalQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres and inertias under what [known] says. not_told_apart: groups that need one more known quantity."""
+    """Masses, centres and inertias, using [known]. not_told_apart: groups that need another known one."""
 
     quantities: Mapping[str, PhysicalQuantity]
     not_told_apart: tuple[tuple[str, ...], ...]

@@ -165,7 +165,7 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 
 
 def recover(servo: Servo, port: str) -> list[str]:
-    """Restore settings that a terminated program left changed. Returns what was done, in words. Raises as `Servo.write`."""
+    """Restore settings that a terminated program left changed. Raises as `Servo.write`."""
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.is_ours_to_mend:
         return []
