@@ -4,8 +4,8 @@
     python benchmarks/bus_cycle.py --json     one JSON object on standard output and nothing else there
 
 Each cycle is a Sync Write of 2 bytes and a Sync Read of 10 bytes with 2 servos (`--servos`). The clients take turns, a
-short round each, so that the machine's moods hit all of them: medians of the rounds, and for the ratios the median of
-each round's own ratio. A pty has no wire: "answered at once"
+short round each, so that variations of the machine's speed affect all of them: medians of the rounds, and for the
+ratios the median of each round's own ratio. A pty has no wire: "answered at once"
 shows what the client costs by itself, "1 Mbaud" has the responder wait as long as the bytes take at 1 Mbaud.
 Absolute figures are this machine's; compare the ratios.
 

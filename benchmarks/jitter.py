@@ -1,4 +1,4 @@
-"""What a computer that is late costs: the ideal fake arm with a jittering loop, its real times used and not.
+"""The cost of a late computer: the ideal fake arm with a jittering loop, with and without correction for actual times.
 
     python benchmarks/jitter.py [--json] [--rms-us 0 200 500] [--config configs/fake_two_link_ideal.toml]
 

@@ -10,7 +10,7 @@ from hil.drivers.servo_model import Mode
 from hil.drivers.settings import WATCHDOG_TRIPPED
 
 FADE_S = 1.0
-"""How long the limit of what a held servo may give is taken down to nothing [s]."""
+"""Time over which a held servo's output limit is reduced to zero [s]."""
 
 SINKING_S = 4.0
 """How long a joint may go on sinking, braked by its own motor, before torque is cut [s]."""

@@ -70,7 +70,7 @@ class Calibration:
     """Torque constants and the arm's parameters in true units."""
 
     factor: Array
-    """True over supposed torque constant of each joint (joints,)."""
+    """Ratio of true to assumed torque constant of each joint (joints,)."""
     factor_std: Array
     names: tuple[str, ...]
     value: Array

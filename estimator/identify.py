@@ -35,7 +35,7 @@ class Estimate:
     """
 
     model: Model
-    """What was fitted."""
+    """The fitted model."""
     names: tuple[str, ...]
     """The base parameters, then the friction terms and the drive's."""
     units: tuple[str, ...]
@@ -49,7 +49,7 @@ class Estimate:
     position: Array
     """Simulated positions (joints, samples) [rad]."""
     residual: Array
-    """Measured less simulated position (joints, samples) [rad]; NaN where a sample is missing."""
+    """Measured minus simulated position (joints, samples) [rad]; NaN where a sample is missing."""
     position_step: Array
     """The encoders' steps (joints,) [rad]."""
     iterations: int

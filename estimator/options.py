@@ -19,11 +19,11 @@ class IntegrationOptions:
 
 @dataclass(frozen=True)
 class MinimiserOptions:
-    """Of Levenberg-Marquardt in coordinates of the size of 1."""
+    """Options of Levenberg-Marquardt in coordinates of order 1."""
 
     max_iterations: int = 60
     max_step: float = 2.0
-    """Change of one coordinate in one iteration."""
+    """Largest change of one coordinate in one iteration."""
     unfinished: float = 1e-2
     """After `max_iterations` a relative decrease below this still counts as converged."""
     initial_damping: float = 1e-3
@@ -38,7 +38,7 @@ class SegmentedMinimiserOptions:
 
     max_iterations: int = 80
     max_step: float = 2.0
-    """Change of one coordinate in one iteration."""
+    """Largest change of one coordinate in one iteration."""
     unfinished: float = 1e-3
     """After `max_iterations` a relative decrease below this still counts as converged."""
     initial_damping: float = 1e-3
@@ -138,19 +138,19 @@ class LikelihoodOptions:
     """The same far from the minimum, where it is anything but."""
 
     same_cost: float = 1.0
-    """Two minima whose sums of squares are this close are one."""
+    """Minima whose sums of squares are this close count as the same."""
     close_cost: float = 25.0
-    """Two minima this close are told apart by fine steps only."""
+    """Minima this close are distinguished only with fine steps."""
     explained_cost: float = 1.03
-    """Per sample: nothing is left for another initial guess to find."""
+    """Per sample: below this no further initial guess is tried."""
     hopeless_cost: float = 2.0
-    """Per sample: a coarse fit that leaves more is given up."""
+    """Per sample: a coarse fit with a larger residual is abandoned."""
     refine_ratio: float = 1.01
-    """Of the best sum of squares: up to here another try may still end lower."""
+    """Relative to the best sum of squares: up to this ratio another try may still end lower."""
     outlier_threshold: float = 4.0
     """Standard deviations from which a sample is downweighted; rounding never leaves more than 1.7."""
     threads: int = 8
-    """At most so many tries run side by side; the result does not depend on it."""
+    """Maximum number of parallel tries; the result does not depend on it."""
 
 
 @dataclass(frozen=True)
@@ -226,4 +226,4 @@ class SelectionOptions:
     ripple_evidence: float = 0.05
     """Of the score test, from which ripple is tried: where it repeats is found roughly, so that a fit sees more."""
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
-    """Chance at which nothing is taken for something, in turn until the motion is explained as well."""
+    """Significance levels, tried in turn until the motion is explained as well."""

@@ -2,7 +2,7 @@
 
 
 def register() -> None:
-    """Register with pyserial the URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Harmless when repeated."""
+    """Register the pyserial URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Harmless when repeated."""
     import serial
 
     if __name__ not in serial.protocol_handler_packages:

@@ -42,11 +42,11 @@ class Peer:
     parameters: dict[str, float]
     """Base parameters, and what its simulation needs beside them, by name [SI]."""
     std: dict[str, float]
-    """Standard errors by its own account."""
+    """Standard errors as reported by the method."""
     seconds: float
     """Of the kept setting."""
     settings: str
-    """What was kept, in words."""
+    """The chosen settings, in words."""
     tried: int
     """Settings tried."""
 

@@ -47,7 +47,7 @@ class InverseDynamics:
     std: Array
     """Standard errors if the residual were white (parameters,)."""
     relative_residual: Array
-    """RMS of the torque left over that of the torque (joints,)."""
+    """RMS of the torque residual over that of the torque (joints,)."""
 
 
 def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, float]:

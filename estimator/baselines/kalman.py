@@ -162,7 +162,7 @@ def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
 
 
 def _root(P: Any) -> Any:
-    """Lower triangular root of a covariance that rounding may have made a little indefinite."""
+    """Lower triangular root of a covariance that rounding may have made slightly indefinite."""
     n = P.shape[0]
     root = np.zeros((n, n))
     for j in range(n):

@@ -23,7 +23,7 @@ class LinearisedEstimate:
     """Base parameters by name [SI]; friction is viscous alone."""
     std: dict[str, float]
     remark: str
-    """How far the linearisation was stretched."""
+    """How far the motion exceeded the linear range."""
 
 
 def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) -> LinearisedEstimate:

@@ -33,9 +33,9 @@ class ChainEstimate:
     start: Array
     """Angles and velocities at the first sample (2, joints)."""
     position: Array
-    """As foreseen from the past samples (joints, samples) [rad]."""
+    """One-step-ahead prediction (joints, samples) [rad]."""
     residual: Array
-    """Measured minus foreseen position (joints, samples) [rad]; NaN where a sample is missing."""
+    """Measured minus predicted position (joints, samples) [rad]; NaN where a sample is missing."""
     position_step: Array
     """The encoders' steps (joints,) [rad]."""
     iterations: int
@@ -45,7 +45,7 @@ class ChainEstimate:
     softness: float
     """Natural frequency of the observer that the simulation was drawn to the measurements by [Hz]."""
     from_prior: tuple[str, ...]
-    """Base parameters of which the data say little: their values are the description's."""
+    """Base parameters that the data hardly determine: their values come from the description."""
 
     @property
     def std(self) -> Array:

@@ -32,7 +32,7 @@ class ChainLinear:
     motions: tuple[PeriodicMotion, ...]
     """Each period's motion from its lines."""
     relative_residual: Array
-    """RMS of the torque left over that of the torque (joints,)."""
+    """RMS of the torque residual over that of the torque (joints,)."""
 
 
 def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainLinear:

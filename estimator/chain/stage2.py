@@ -78,7 +78,7 @@ class ChainFit:
     starts: tuple[Array, ...]
     """Of each period, angles and velocities at the first sample (2, joints)."""
     positions: tuple[Array, ...]
-    """Of each period, foreseen positions (joints, samples) [rad]."""
+    """Of each period, predicted positions (joints, samples) [rad]."""
     outliers: int
     """Samples that were downweighted."""
     correlation_time: float

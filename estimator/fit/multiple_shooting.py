@@ -50,11 +50,11 @@ class ShootingEstimate:
     covariance: Array
     """(parameters, parameters), robust against model error: see `Segmented.covariance`."""
     zeros: Array
-    """True less measured angle of each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
+    """True minus measured angle of each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
     zeros_std: Array
     """Their standard errors, shaped alike."""
     residual_rms: Array
-    """Measured less simulated position (joints,) [rad]."""
+    """Measured minus simulated position (joints,) [rad]."""
     segments: int
     segment_length: float
     """[s]."""

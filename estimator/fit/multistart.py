@@ -52,9 +52,9 @@ class Search:
 
     periods: Sequence[SettledPeriod]
     fine: Objective
-    """In the integration steps of the result."""
+    """With the integration steps of the result."""
     rough: Objective
-    """In coarse ones."""
+    """With coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
     """Whether a model is only tried: what leaves much more than the noise is given up before its last digits."""

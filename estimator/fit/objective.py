@@ -29,12 +29,12 @@ class Objective:
     weights: tuple[Array, ...]
     """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
     prior: Prior
-    """What is expected of the parameters before."""
+    """Prior of the parameters."""
     minimiser: MinimiserOptions
     max_relative_decrease: float
     """Of the width of friction's step, in one iteration."""
     horizon: float = 1.0
-    """Share of each run, from its beginning, that is looked at."""
+    """Fraction of each run, from its beginning, that is used."""
     tracking_stiffness: Array | None = None
     """Of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
     fixed_parameters: bool = False

@@ -36,7 +36,7 @@ class Fit:
     value: Array
     """In the order of `Model.names` [SI]."""
     covariance: Array
-    """Of `value`, right for errors that are correlated too. Infinite for what leaves no trace."""
+    """Of `value`, also valid for correlated errors. Infinite for parameters without influence."""
     starts: tuple[Array, ...]
     """Of each run, angles and velocities at the first sample (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]

@@ -1,18 +1,19 @@
 """Checks sample by sample, without accelerations, whether an arm's motion is consistent with its model.
 
-The planar arm's equations, integrated once, are linear in its parameters and hold angles, velocities and torques alone:
+The planar arm's equations, integrated once, are linear in its parameters and contain only angles, velocities and
+torques:
 
     torque = d/dt momentum(q, v) theta + rest(q, v) theta
 
 Passed through a first-order low-pass both sides become sums over the past (generalised momentum: A. De Luca and
 R. Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li,
 "On the adaptive control of robot manipulators", 1987). The parameters are known as a mean and a covariance, those of an
-ensemble of arms; from sample to sample they are learnt (recursive least squares, that is, a Kalman filter on constants
-that drift slowly). So what the arm may do is wide for an arm hardly known, and narrows as it moves.
+ensemble of arms; they are updated from sample to sample (recursive least squares, that is, a Kalman filter on constants
+that drift slowly). The admissible motion is thus wide for a poorly known arm and narrows as it moves.
 
 Alarm: for `HOLD_S` the torque lacking in a joint is more than `TIMES` standard deviations of what parameters and noise
-leave open, more than friction can hold while the joint stands, and more than a share of the largest planned torque.
-Noise is learnt too: what the model lacks (Stribeck friction, play, flexibility) widens what is allowed.
+leave open, more than friction can hold while the joint stands, and more than a fraction of the largest planned
+torque. Noise is estimated too: model error (Stribeck friction, play, flexibility) widens the bounds.
 """
 
 import math
@@ -80,7 +81,7 @@ class MomentumObserver:
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
         """One sample: angles [rad], velocities [rad/s], the torques that were commanded since the sample before
-        [N m], and the time since then [s]. The joint (from 0) whose motion no arm explains, -1 for none.
+        [N m], and the time since then [s]. Returns the joint (from 0) whose motion no arm explains, -1 for none.
         """
         if self._joints == 1:
             return _observe(self._memory, self._constants, position[0], 0.0, velocity[0], 0.0, torque[0], 0.0, seconds)
@@ -88,7 +89,7 @@ class MomentumObserver:
 
     @property
     def lacking(self) -> list[float]:
-        """Torque per joint that the commanded one lacks to explain the motion, latest (joints,) [N m]."""
+        """Latest torque per joint that is missing from the commanded one to explain the motion (joints,) [N m]."""
         return [float(value) for value in self._memory[_SINGLE, _LACKING : _LACKING + self._joints]]
 
     @property
@@ -121,7 +122,7 @@ def _regressors(momentum: Any, rest: Any, q1: float, q2: float, v1: float, v2: f
 
 # Compiled code takes its arguments by position; m is the observer's memory, k its constants, j a joint.
 def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
-    """Forget the past: nothing is known of what the arm did since the sample before."""
+    """Restart: nothing is known about the motion since the previous sample."""
     single = m[_SINGLE]
     for j in range(2):
         for i in range(_COUNT):
@@ -179,7 +180,7 @@ def _of_rounding(m: Any, j: int, slope: float) -> float:
 
 
 def _alarms(single: Any, j: int, is_beyond: bool, dt: float) -> bool:
-    """Whether this lasts long enough."""
+    """Whether the discrepancy has lasted long enough for an alarm."""
     if not is_beyond:
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
         return False

@@ -56,7 +56,7 @@ class Term:
     unit: str
     """SI; "1" for a ratio."""
     meaning: str
-    """A phrase for a person."""
+    """Human-readable description."""
     _: KW_ONLY
     part: str
     """What of a model brings it: "base" (the linear regression's, always there), a law of FRICTIONS, one of OPTIONS or

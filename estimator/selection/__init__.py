@@ -1,1 +1,1 @@
-"""Friction chosen by held-out error, and what the result is worth."""
+"""Friction model selection by held-out error, and validation of the result."""

@@ -1,9 +1,9 @@
-"""What a model leaves out, judged without fitting it: the score test, and what leaving it out does to error bars.
+"""Missing model terms, judged without fitting them: the score test, and the effect of omission on standard errors.
 
 About an estimate the motion is linear in small changes of any parameter, those of terms that the model lacks too. One
-simulation with the derivatives by all of them tells by how much the sum of squares would fall if a term were added
+simulation with the derivatives by all of them gives the decrease of the sum of squares if a term were added
 (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50), and how far the fitted parameters would move. Terms
-that nobody can rule out, such as an encoder's zero or torque that saturates, so widen the error bars even where the
+that cannot be ruled out, such as an encoder's zero or torque saturation, thus widen the standard errors even where the
 motion does not show them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with what is
 usual of them as the prior and what the motion says of them on top.
 """
@@ -34,7 +34,7 @@ COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model with one thing more than the estimate's, and what the score test says of it."""
+    """A model with one term more than the estimate's, and its score test."""
 
     model: Model
     part: str
@@ -42,7 +42,7 @@ class Candidate:
     names: tuple[str, ...]
     """The parameters that it adds."""
     evidence: float
-    """By how much it lowers the sum of squares, over what chance would: above 1 it is seen."""
+    """Decrease of the sum of squares relative to that expected by chance: above 1 it is significant."""
     explained: float
     """Share of the sum of squares that it explains."""
     values: Mapping[str, float]
@@ -56,11 +56,11 @@ class Linearised:
     names: tuple[str, ...]
     """Of the parameters: those of the estimate and those of candidates."""
     value: Array
-    """Where it is expanded (parameters,) [SI]."""
+    """Point of expansion (parameters,) [SI]."""
     normal: Array
     """J'WJ (causes, causes)."""
     gradient: Array
-    """J'Wr, r simulated less measured (causes,)."""
+    """J'Wr, r simulated minus measured (causes,)."""
     samples: int
     """Of all joints: the sum of squares, weighted by the residual as it is."""
     colour: float
@@ -78,7 +78,7 @@ class Linearised:
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
-        """By how much the sum of squares falls when these parameters and the first state move, and how far they do."""
+        """Decrease of the sum of squares when these parameters and the first state are freed, and their changes."""
         at = [*self.places(names), *self.states]
         normal, gradient = self.normal[np.ix_(at, at)], self.gradient[at]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -125,7 +125,7 @@ def linearised(
 
 
 def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
-    """What could be added to the estimate's model, the best seen first.
+    """Terms that could be added to the estimate's model, most significant first.
 
     `known`: where ripple repeats (`ripple_cycles`), by parameter name; without it ripple is none of them.
     """
@@ -156,7 +156,7 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 
 
 def considered(period: SettledPeriod, estimate: Estimate) -> Array:
-    """The estimate's covariance (parameters, parameters) with what its model leaves out and nobody can rule out.
+    """The estimate's covariance (parameters, parameters) including omitted terms that cannot be ruled out.
 
     Of each such parameter the prior and what the motion says of it are taken together. It is as if it were fitted too,
     but for the value, which stays where it is: by how far it would move comes on top.
@@ -189,7 +189,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def simulated_run(period: SettledPeriod) -> Run:
-    """A period as it is simulated here, in the steps of a fit's result."""
+    """A period as simulated here, with the integration steps of a fit's result."""
     if period.stabiliser is None:
         return SimulatedRun.of(period, INTEGRATION)
     return StabilisedRun.of(period, period.stabiliser, INTEGRATION)

@@ -1,11 +1,11 @@
-"""Noise, nonlinear distortion and model error told apart by the lines on which they stand.
+"""Noise, nonlinear distortion and model error, separated by the lines on which they appear.
 
 Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. Driven on odd lines only, an arm answers on
 them and, as far as it is nonlinear, on others: what turns its sign with the motion (friction, gravity about a hanging
 pose) makes odd lines, what does not (an offset, friction that differs with direction, a pose aside) even ones. A driven
 odd line is left out here and there to see the former: a detection line. With even lines driven too, odd distortion
-lands everywhere, and lines that were not driven cannot be told odd from even: they are then all of one group. What a
-fit leaves on each group beyond the noise is the error of its model there.
+lands everywhere, and lines that were not driven cannot be told odd from even: they are then all of one group. The
+residual of a fit on each group beyond the noise is its model error there.
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ def excited_lines(period: SettledPeriod) -> Mask:
 
 
 def distortion(period: SettledPeriod, estimate: Estimate) -> Distortion:
-    """The levels of one period, and of what `estimate` leaves of it."""
+    """The levels of one period, and of the residual of `estimate`."""
     lines = lines_of(period.filled())
     left = lines_of(np.nan_to_num(estimate.residual))
     order = np.arange(lines.shape[1])

@@ -35,7 +35,7 @@ class Drift:
 
     @property
     def is_seen(self) -> bool:
-        """Whether any joint's friction changed beyond chance, and by more than half a percent."""
+        """Whether any joint's friction changed significantly and by more than half a percent."""
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def at_the_later(self, estimate: Estimate) -> Estimate:

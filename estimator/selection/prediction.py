@@ -1,4 +1,4 @@
-"""How well given parameters foretell a recording that was not used to find them."""
+"""How well given parameters predict a recording that was not used to estimate them."""
 
 from collections.abc import Mapping, Sequence
 
@@ -28,7 +28,7 @@ def prediction_rms(
     zeros: Array | None = None,
     of: slice = ALL,
 ) -> Array:
-    """RMS of measured less simulated position (joints,) [rad] over all that `prediction_errors` looks at.
+    """RMS of measured minus simulated position (joints,) [rad] over all that `prediction_errors` looks at.
 
     Arguments as there.
     """
@@ -45,14 +45,14 @@ def prediction_errors(
     zeros: Array | None = None,
     of: slice = ALL,
 ) -> tuple[Array, Array]:
-    """RMS of measured less simulated position (segments, joints) [rad], and samples (segments,) of each segment.
+    """RMS of measured minus simulated position (segments, joints) [rad], and samples (segments,) of each segment.
 
-    The simulation is set on its way every `length` [s].
+    The simulation is restarted every `length` [s].
 
     It starts from angle and velocity as the samples right around the start show them, and then sees the torque
-    only. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true less measured
-    angle of each recording, in place of what `parameters` say; `of`: which segments. A simulation that runs away
-    counts as wrong by pi.
+    only. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true minus measured
+    angle of each recording, overriding `parameters`; `of`: which segments. A diverging simulation counts
+    as an error of pi.
     """
     problem = Shooting(recordings, Model(joints), length, of=of)
     known = _complete(parameters, joints)
@@ -69,7 +69,7 @@ def prediction_errors(
 
 
 def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, float]) -> Array:
-    """RMS of measured less freely predicted position over the RMS of the motion (joints,) of a settled period.
+    """RMS of measured minus open-loop predicted position over the RMS of the motion (joints,) of a settled period.
 
     The arm starts at rest where the period's positions lie on average and is simulated under the period's torque
     until its motion repeats; no measurement enters. Raises PeriodicityError when it does not repeat.

@@ -1,7 +1,7 @@
-"""Which friction model: fitted one after the other, from plain to rich, and judged by a motion none of them saw.
+"""Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
 
-A richer model always leaves less of the motion it was fitted to. What it predicts of another motion, freely, from
-rest, gets better only by what is true in it, or by chance: so it must also leave less of its own motion than terms
+A richer model always has a smaller residual on the motion it was fitted to. What it predicts of another motion, freely,
+from rest, gets better only by what is true in it, or by chance: so it must also leave less of its own motion than terms
 without meaning would. Without another motion the Bayesian information criterion judges (Schwarz, Annals of Statistics 6
 (1978) 461), samples counted as far as the residual is not correlated.
 """
@@ -39,7 +39,7 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 
 @dataclass(frozen=True)
 class Trial:
-    """One model and how it did."""
+    """One model and its performance."""
 
     model: Model
     estimate: Estimate | None
@@ -53,7 +53,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Choice:
-    """The models tried, in order, and the one chosen."""
+    """The models tried, in order, and the chosen one."""
 
     trials: tuple[Trial, ...]
     chosen: Trial
@@ -94,14 +94,14 @@ def choose(
     starts: Sequence[Mapping[str, float]] = (),
     options: SelectionOptions = DEFAULTS,
 ) -> Choice:
-    """Fit `periods` with what the motion asks for, and leave out what it does not.
+    """Fit `periods` with the terms that the data support.
 
     Stribeck friction comes first, with the encoders' zeros and the ratio of two torque constants, which nobody knows
     exactly. If that does not explain the motion, or if the score test sees something in what is left
     (`hil.estimator.selection.candidates`), all else that is smooth comes at once: load, direction, saturation, cables,
     encoders that are not linear. Added one by one they mislead, since each takes over what the others lack; together,
     with what is usual of them as a prior, they are told apart. Then come friction that yields before it slides and
-    ripple over the angle, and in the end what does not differ from nothing is taken out. A model that predicts
+    ripple over the angle, and finally insignificant terms are removed. A model that predicts
     `held_out` worse than a plainer one is not chosen.
 
     Args:
@@ -141,7 +141,7 @@ class Selection:
         """In the order in which they were made."""
 
     def grow(self, model: Model) -> Trial:
-        """From `model` to the richest one that the motion asks for. Raises ConvergenceError."""
+        """Extend `model` to the richest one that the data support. Raises ConvergenceError."""
         unknown: set[Option] = {"zeros"}
         if model.joints == 2:
             unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
@@ -196,7 +196,7 @@ class Selection:
         return richer if self._gain(richer, plainer) > self._worth(richer, plainer) else plainer
 
     def prune(self, best: Trial) -> Trial:
-        """Take out what is not told from nothing, if the motion is explained as well without it."""
+        """Remove insignificant terms if the motion is explained as well without them."""
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
             return best  # what is missing would be taken for what is there
@@ -229,7 +229,7 @@ class Selection:
         return int(sum(period.valid.sum() for period in self._periods))
 
     def _left(self, trial: Trial) -> float:
-        """Mean square of what it leaves, in units of the noise."""
+        """Mean square of the residual, in units of the noise."""
         assert trial.estimate is not None
         return float(np.nanmean((trial.estimate.residual / self._periods[0].noise[:, None]) ** 2))
 
@@ -243,7 +243,7 @@ class Selection:
         return independent * float(np.log(max(self._left(plainer), 1e-12) / max(self._left(richer), 1e-12)))
 
     def _worth(self, richer: Trial, plainer: Trial) -> float:
-        """What more terms must gain: the Bayesian information criterion's penalty."""
+        """The gain required of additional terms: the penalty of the Bayesian information criterion."""
         assert richer.estimate is not None
         independent = max(self._samples / colour(richer.estimate.residual), 3.0)
         return max(1, len(richer.model.names) - len(plainer.model.names)) * float(np.log(independent))
@@ -305,8 +305,8 @@ def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
 def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
     """The model without what is not told from nothing, the least sure taken out first.
 
-    What a part lacks in significance is A. Wald's test (Trans. AMS 54 (1943) 426): its distance from nothing in
-    standard errors, squared, against chi^2 at `level`. What is left is then known as far as a linear model has it.
+    What a part lacks in significance is A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero
+    in standard errors, compared with chi^2 at `level`. The remaining parameters follow from a linearised model.
     """
     model, value, covariance = estimate.model, estimate.value.copy(), estimate.covariance.copy()
     names = list(estimate.names)
@@ -328,7 +328,7 @@ def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) ->
 
 
 def _parts(model: Model) -> list[tuple[str, Model]]:
-    """What could be taken out of a model, each with the model that is left; presliding has no test against nothing."""
+    """The removable terms of a model, each with the reduced model; presliding has no significance test."""
     parts: list[tuple[str, Model]] = [
         (option, model.without(option)) for option in sorted(model.options) if option != "presliding"
     ]
@@ -345,7 +345,7 @@ def _tested(model: Model, plainer: Model) -> list[str]:
 
 
 def relative_error(period: SettledPeriod, predicted: Array) -> Array:
-    """RMS of measured less predicted position over the RMS of the motion about its mean (joints,)."""
+    """RMS of measured minus predicted position over the RMS of the motion about its mean (joints,)."""
     motion = period.position - np.nanmean(period.position, axis=1, keepdims=True)
     error: Array = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1) / np.nanmean(motion**2, axis=1))
     return error

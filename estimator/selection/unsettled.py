@@ -1,8 +1,8 @@
-"""Which friction model, for recordings that hold no settled period: judged by segments that were not fitted.
+"""Friction model selection for recordings without a settled period, judged on held-out segments.
 
-Every other segment of each recording is fitted and the others are predicted, each from the state that its first samples
-show. The model that predicts them best is fitted once more to all. (The short segments that only find a start are not
-kept apart so; what is judged has seen none but its own half.)
+Every other segment of each recording is fitted and the others are predicted, each from the state given by its first
+samples. The model that predicts them best is fitted once more to all. (The short segments that only find a start are
+not kept apart so; what is judged has seen none but its own half.)
 """
 
 import time
@@ -27,7 +27,7 @@ FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
 
 @dataclass(frozen=True)
 class SegmentTrial:
-    """One model and how it predicted the segments left out."""
+    """One model and its prediction error on the held-out segments."""
 
     model: Model
     held_out: Array | None
@@ -61,7 +61,7 @@ def choose_by_shooting(
     torque_scale: bool = False,
     options: SelectionOptions = DEFAULTS,
 ) -> SegmentChoice:
-    """Fit richer and richer friction, presliding and asymmetry on the best, as long as segments left out are predicted
+    """Fit richer and richer friction, presliding and asymmetry on the best, as long as held-out segments are predicted
     better.
 
     Arguments as of `estimate_by_shooting`; `torque_scale` is part of every model, or of none. Raises RecordingError for

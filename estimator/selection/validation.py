@@ -19,7 +19,7 @@ LITTLE_TORQUE = 0.1  # of the RMS torque: less gravity than that is as good as n
 
 @dataclass(frozen=True)
 class Levels:
-    """RMS by where it comes from, in encoder steps (joints,)."""
+    """RMS by source, in encoder steps (joints,)."""
 
     excited: Array
     """Motion on the lines that some joint was driven with."""
@@ -37,7 +37,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class Validation:
-    """What the checks found."""
+    """Results of the checks."""
 
     residual_over_floor: Array
     """RMS residual over the noise that is known, rounding and scatter (joints,); 1 explains everything."""
@@ -57,7 +57,7 @@ class Validation:
 
     @property
     def weakest(self) -> str:
-        """The base parameter known least well for its size."""
+        """The base parameter with the largest relative standard error."""
         return max(self.relative_std, key=lambda name: self.relative_std[name])
 
 
@@ -85,7 +85,7 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
 def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
     """Standard error over value of each base parameter but offsets.
 
-    Gravity may be nothing, on an arm that lies flat: then its error counts against the torque that moved the arm.
+    Gravity may be zero, on a horizontal arm: then its error is compared with the torque that moved the arm.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean(period.torque**2, axis=1))
     relative = {}
@@ -99,7 +99,7 @@ def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]
 
 
 def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
-    """Noise, distortion and model error of one period told apart."""
+    """Noise, distortion and model error of one period, separated."""
     lines = lines_of(period.filled())
     order = np.arange(lines.shape[1])
     excited = excited_lines(period)

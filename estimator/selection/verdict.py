@@ -1,9 +1,10 @@
-"""A verdict in words: trust the estimate or not, what is weak, what spoils it, which experiment would improve it.
+"""A verdict in words: whether to trust the estimate, its weaknesses and their causes, and which experiment would
+improve it.
 
 "Yes" means that every inertia, gravity and friction parameter is, as far as can be judged, within 2 % or three of its
 standard errors. So it rests on standard errors that hold: those of the estimate are widened by what its model leaves
 out (`hil.estimator.selection.candidates.considered`) and by what it leaves of the motion
-(`hil.estimator.fit.covariance`). No sentence advises what the tool has tried already.
+(`hil.estimator.fit.covariance`). No sentence advises what the tool has already tried.
 """
 
 from collections.abc import Sequence
@@ -51,16 +52,16 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known beside the estimate and its validation."""
+    """Evidence besides the estimate and its validation."""
 
     held_out: Array | None = None
     """RMS error of the free prediction of a motion not fitted, over that motion's RMS (joints,)."""
     candidates: Sequence[Candidate] = ()
-    """What the model leaves out, best seen first."""
+    """Missing terms, most significant first."""
     drift: Drift | None = None
     """How friction changed while the arm moved."""
     doubts: tuple[str, ...] = field(default=())
-    """What cannot be, or does not agree with what is known of the arm: sentences."""
+    """Implausible or contradictory values, as sentences."""
     tried_all: bool = False
     """Whether the tool chose the model from all that it knows."""
 
@@ -118,7 +119,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence)
 
 
 def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
-    """What it looks like, with what speaks for it."""
+    """The most likely cause, with the evidence."""
     seen = [each for each in evidence.candidates if each.evidence > 1.0]
     if seen:
         what = _in_words(seen[0].part)
@@ -137,7 +138,7 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation) -> str:
-    """The parameters that what is missing may have spoilt, by their widened errors."""
+    """The parameters that model error may have biased, by their widened errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst:
         return "It does not affect the parameters significantly: including it, each is known to 2 % or better."

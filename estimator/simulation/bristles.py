@@ -1,10 +1,10 @@
-"""Dry friction that yields before it slides: bristles between the surfaces, which bend, and slip when bent far enough.
+"""Presliding friction: bristles between the surfaces, which bend, and slip when bent far enough.
 
     friction = b + damping (1 - b / +-level(v)) v        b' = stiffness v (1 - b / +-level(v))
 
 with the sign of the velocity v and the level of `hil.estimator.simulation.arm`: C. Canudas de Wit, H. Olsson, K. J.
 Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic Control 40
-(1995) 419, its b being the bristles' torque here. Viscous friction comes on top, as ever.
+(1995) 419, its b being the bristles' torque here. Viscous friction is added as usual.
 
 A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506): the bristles bend for half of it
 at the velocity where it starts, exactly; the arm moves with their torque, which then is one more offset, and their
@@ -41,7 +41,7 @@ def has_bristles(physics: Physics) -> bool:
 def first_bend(physics: Physics, velocity: Array) -> Array:
     """The bristles' torque (joints,) [N m] where a simulation starts: as they are bent once a joint slides.
 
-    `velocity` (joints,) [rad/s]. Of a joint that hardly moves nobody knows how they are bent: hardly, this says.
+    `velocity` (joints,) [rad/s]. For a joint that hardly moves their bend is unknown and taken as small.
     """
     joints = velocity.size
     p = physics.vector

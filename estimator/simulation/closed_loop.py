@@ -1,7 +1,7 @@
 """The arm's motion under commands that depend on its motion: a spring and damper in software, a brake.
 
-The equations and the integration step are those of `hil.estimator.simulation.arm`, torque scale and all. A command is
-worked out once a sample from the state of the sample before, as the computer on the bus does it, clipped, and held;
+The equations and the integration step are those of `hil.estimator.simulation.arm`, torque scale and all. A command
+is computed once per sample from the state at the previous sample, as on the bus, clipped, and held;
 the motor follows it with a first-order lag. A pure delay of the drive is taken as more of that lag, which is the same
 to first order.
 """
@@ -67,7 +67,7 @@ class Stabilised:
 
     feedback: Feedback
     excitation: Array
-    """Commanded torque less what the feedback gave of it (joints, samples) [N m]."""
+    """Commanded torque minus the feedback's contribution (joints, samples) [N m]."""
     former: Array
     """Angles and velocities at the sample before the first (2, joints) [rad, rad/s]."""
     former_torque: Array

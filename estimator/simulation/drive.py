@@ -1,4 +1,4 @@
-"""From commanded torque to what the motors give: held, late, averaged over each integration step.
+"""From commanded to motor torque: held, delayed, averaged over each integration step.
 
 Compiled, since the likelihood asks for it with every simulation, beside which numpy takes a third of the time.
 """

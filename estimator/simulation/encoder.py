@@ -1,4 +1,4 @@
-"""What encoders make of the joints' angles: errors that repeat once and twice a turn, and their derivatives."""
+"""Encoder errors: errors that repeat once and twice a turn, and their derivatives."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Many arms under the same commands, in one call of compiled code: what a dry run asks for.
+"""Many arms under the same commands, in one call of compiled code, as a dry run needs.
 
 Equations, integration and feedback are those of `hil.estimator.simulation.closed_loop`, in longer steps: peaks are
 off by a few milliradians at most, for a tenth of the time.
@@ -35,7 +35,7 @@ class Commands:
 
 @dataclass(frozen=True)
 class Settling:
-    """How a stream goes on from period to period: until two differ by at most `within` of the motion's RMS, for at
+    """Stopping rule of a stream's periods: until two differ by at most `within` of the motion's RMS, for at
     most `most_periods` more than the first; then `periods` settled ones in all are played."""
 
     within: float
@@ -45,10 +45,10 @@ class Settling:
 
 @dataclass(frozen=True)
 class ManyArms:
-    """Arms and how each feels the commands.
+    """Arms and the effect of the commands on each.
 
-    scale: true over supposed torque of each command (arms, joints). pose: where each starts, at rest (arms, joints)
-    [rad]. feedback: by supposed torques.
+    scale: ratio of true to assumed torque of each command (arms, joints). pose: where each starts, at rest (arms,
+    joints) [rad]. feedback: in terms of assumed torques.
     """
 
     physics: Sequence[Physics]
@@ -160,7 +160,7 @@ def _raise(values: Any, position: Any, velocity: Any, torque: Any, scale: Any) -
 
 @_inner
 def _difference(former: Any, latest: Any) -> float:
-    """RMS between the later halves of two periods over the motion's RMS, the worse joint."""
+    """RMS difference between the later halves of two periods, relative to the motion's RMS, worst joint."""
     samples = former.shape[1]
     half = samples // 2
     count = samples - half

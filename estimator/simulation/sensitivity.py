@@ -1,7 +1,7 @@
-"""Forward sensitivities: the simulated motion and its derivatives by parameters and starting state, in one go.
+"""Forward sensitivities: the simulated motion and its derivatives by parameters and initial state, in one pass.
 
-The derivative is that of the discrete scheme of `hil.estimator.simulation.arm` itself, step by step, so that it is the
-gradient of what is minimised and not of something close to it. One step is, with W = M + gamma h S (M mass
+The derivative is that of the discrete scheme of `hil.estimator.simulation.arm` itself, step by step, so that it
+is the exact gradient of the objective. One step is, with W = M + gamma h S (M mass
 matrix, S slopes of friction) and primes where stage 1 foresees the end,
 
     W k = f        M' a = f'        W l = M (a - 2 k)        v += h (3 k + l) / 2        q += h v + h^2 k / 2
@@ -109,7 +109,7 @@ class Sensitive:
         self._turn = np.zeros(1, dtype=np.int64)
 
     def advance(self, torque: Array, torque_slopes: Array, tracked: Array | None = None) -> tuple[Array, Array]:
-        """Go on by as many samples as `torque` has.
+        """Advance by as many samples as `torque` has.
 
         `torque` (joints, samples, steps): mean motor torque over each step after each sample [N m];
         `torque_slopes` (2, joints, samples, steps): its derivatives by delay and by each joint's lag [N m/s]; `tracked`

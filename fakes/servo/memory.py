@@ -83,7 +83,7 @@ class Memory:
         return any(first <= address < first + count for _, first, count in self._blocks)
 
     def _stretches(self, address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """What a write through indirect data writes really: stretches of successive addresses."""
+        """The stretches of addresses that a write through indirect data actually covers."""
         start = end = -1
         stretch = b""
         for offset, byte in enumerate(data):

@@ -13,7 +13,7 @@ from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
 
 PRESENT_START = 120
 PRESENT_END = 147
-"""First address of the present registers, and the first behind them."""
+"""Address of the first present register, and the first address after the last."""
 
 STATE_START = 126
 STATE_END = 136

@@ -177,7 +177,7 @@ def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> 
 
 
 def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
-    """The only branch's joints that turn."""
+    """The rotating joints, if there is only one branch."""
     names: list[str] = []
     link = base
     while True:

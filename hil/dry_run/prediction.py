@@ -142,7 +142,7 @@ def predict(
 
 
 def _extreme(peaks: Array) -> Array:
-    """Of several multisines (multisines, arms, peaks, joints), the most of each peak (arms, peaks, joints)."""
+    """Of several multisines (multisines, arms, peaks, joints), the maximum of each peak (arms, peaks, joints)."""
     most: Array = peaks.max(axis=0)
     most[:, LOWEST] = peaks[:, :, LOWEST].min(axis=0)
     return most

@@ -147,7 +147,7 @@ class Belief:
         return replace(self, coordinates=x + change)
 
     def _without_strays(self, left: Array, random: np.random.Generator) -> "Belief":
-        """Arms that fit far worse than the others are replaced by others, moved a little."""
+        """Arms that fit far worse than the rest are replaced by slightly perturbed copies of others."""
         strays = left > _HOPELESS * np.median(left) + 1.0
         if not strays.any() or strays.all():
             return self

@@ -62,7 +62,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class RunRecord(RunFacts):
-    """run.json: the facts, and what was run on what. started: ISO 8601 with the offset from UTC."""
+    """run.json: the facts, versions and machine. started: ISO 8601 with the offset from UTC."""
 
     started: str
     versions: Mapping[str, str]
@@ -184,7 +184,7 @@ class RunFolder:
             raise RunFolderError(f"{folder.path} cannot be written: {error.strerror}.") from error
 
     def write_facts(self, facts: RunFacts, plan: Plan) -> None:
-        """Write run.json: the facts, and what was run on what."""
+        """Write run.json: the facts, versions and machine."""
         record = RunRecord(
             **{each.name: getattr(facts, each.name) for each in fields(RunFacts)},
             started=datetime.now().astimezone().isoformat(timespec="seconds"),

@@ -29,7 +29,7 @@ def parameters(data: RunData) -> Section:
 def _table(
     entries: Mapping[str, Quantity], truth: Mapping[str, float], groups: Mapping[str, str], caption: str
 ) -> Table:
-    """groups: what base parameters of an arm in space are made of, by name."""
+    """groups: the composition of a spatial arm's base parameters, by name."""
     head = ("parameter", "meaning", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
     return Table(head, tuple(_row(name, entry, truth, groups) for name, entry in entries.items()), 3, caption, 1)
 
