@@ -1,7 +1,7 @@
-"""One control cycle, ours against others', over a pty with the same responder in C at its far end.
+"""Benchmark of one control cycle against other clients, over a pty with the same C responder at the far end.
 
     python benchmarks/bus_cycle.py            prints tables and ratios
-    python benchmarks/bus_cycle.py --json     one JSON object on standard output and nothing else there
+    python benchmarks/bus_cycle.py --json     one JSON object on standard output and nothing else
 
 Each cycle is a Sync Write of 2 bytes and a Sync Read of 10 bytes with 2 servos (`--servos`). The clients take turns, a
 short round each, so that variations of the machine's speed affect all of them: medians of the rounds, and for the

@@ -51,7 +51,7 @@ viscous = [0.045, 0.040]
 coulomb = [0.055, 0.050]
 """
 ARMS_IN_PRIOR = 192
-"""Arms of the ensemble that predicts, none of which is one of the arms that are run."""
+"""Size of the predicting ensemble, which contains none of the arms that are run."""
 
 
 def study_config() -> Config:

@@ -42,7 +42,7 @@ class Recorded:
     step: float = STEP
 
     def period(self, position: np.ndarray) -> SettledPeriod:
-        """As if these positions (joints, samples) [rad] had been read."""
+        """A period with these positions (joints, samples) [rad] as measurements."""
         steps = np.full(len(position), self.step)
         return SettledPeriod(RATE, self.torque, position, COMMAND_TO_SAMPLE, steps)
 
@@ -58,7 +58,7 @@ def servo_arm(friction: dict[str, float], joints: int = 2) -> Arm:
 
 
 def wave(seed: int, peak: Sequence[float], period: float = PERIOD) -> Multisine:
-    """A multisine for as many joints as `peak` has [N m]."""
+    """A multisine with peaks `peak` (joints,) [N m]."""
     return design_multisine(RATE, period, zippered_lines(period, BAND, len(peak)), peak, seed)
 
 

@@ -130,7 +130,7 @@ class LikelihoodOptions:
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
     """Shares of the run that this beginning has, one after the other."""
     min_horizon_samples: int = 10
-    """For each unknown, of all joints: a shorter beginning is skipped."""
+    """Samples per unknown over all joints; a shorter beginning is skipped."""
 
     max_relative_decrease: float = 0.8
     """Of a Coulomb width in one iteration: in fine steps, near the minimum, the sum is nearly quadratic in it."""
@@ -200,12 +200,12 @@ class SettlingOptions:
     atol: float = 1e-7
     """[rad and rad/s] from one period's end to the next."""
     acceptable: float = 1e-5
-    """What will do after `max_periods`: far below any encoder's step."""
+    """Accepted after `max_periods`: far below any encoder step."""
 
 
 @dataclass(frozen=True)
 class SelectionOptions:
-    """Of the choice of a friction model by held-out error."""
+    """Options for choosing a friction model by held-out error."""
 
     keep_ratio: float = 0.98
     """Of the error of the best model so far: what a richer one must reach to be kept."""

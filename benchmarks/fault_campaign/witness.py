@@ -70,7 +70,7 @@ class Witness:
 
 
 def _told(servo: Servo) -> tuple[bool, bool, int]:
-    """Whether the servo drives its motor, whether its torque is on, and the goal of its mode [ticks]."""
+    """Whether the servo drives its motor, whether torque is on, and the goal of its mode [ticks]."""
     memory = servo.memory
     torque = memory.get("Torque Enable") == 1
     mode = memory.get("Operating Mode")

@@ -68,7 +68,8 @@ def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DE
 
 
 def structured_share(residual: Array) -> Array:
-    """Share of each residual's power (joints, samples) that is not white (joints,); 0 within chance of white.
+    """Fraction (joints,) of the power of each residual (joints, samples) that is not white; 0 if not significantly
+    different from white.
 
     White noise has the same power in every Fourier line; the upper half of the lines, far above the motion, tells
     how much.

@@ -80,7 +80,7 @@ class MomentumObserver:
         self.observe((0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf)  # compiled, and begun anew
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
-        """One sample: angles [rad], velocities [rad/s], the torques that were commanded since the sample before
+        """One sample: angles [rad], velocities [rad/s], the torques commanded since the previous sample
         [N m], and the time since then [s]. Returns the joint (from 0) whose motion no arm explains, -1 for none.
         """
         if self._joints == 1:

@@ -38,7 +38,7 @@ class Candidate:
 
     model: Model
     part: str
-    """The option or law of friction that it adds."""
+    """The option or friction law that it adds."""
     names: tuple[str, ...]
     """The parameters that it adds."""
     evidence: float

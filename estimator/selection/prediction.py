@@ -49,8 +49,8 @@ def prediction_errors(
 
     The simulation is restarted every `length` [s].
 
-    It starts from angle and velocity as the samples right around the start show them, and then sees the torque
-    only. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true minus measured
+    It starts from the angle and velocity estimated from the surrounding samples, and then uses only the
+    torque. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true minus measured
     angle of each recording, overriding `parameters`; `of`: which segments. A diverging simulation counts
     as an error of pi.
     """

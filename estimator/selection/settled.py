@@ -96,8 +96,8 @@ def choose(
 ) -> Choice:
     """Fit `periods` with the terms that the data support.
 
-    Stribeck friction comes first, with the encoders' zeros and the ratio of two torque constants, which nobody knows
-    exactly. If that does not explain the motion, or if the score test sees something in what is left
+    Stribeck friction comes first, with the encoders' zeros and the ratio of two torque constants, which are never known
+    exactly. If that does not explain the motion, or if the score test finds something in the residual
     (`hil.estimator.selection.candidates`), all else that is smooth comes at once: load, direction, saturation, cables,
     encoders that are not linear. Added one by one they mislead, since each takes over what the others lack; together,
     with what is usual of them as a prior, they are told apart. Then come friction that yields before it slides and

@@ -52,7 +52,7 @@ class Validation:
     confounded: tuple[str, str, float]
     """The two base parameters that are hardest to tell apart, and their correlation."""
     relative_std: dict[str, float]
-    """Standard error over value of each base parameter but offsets."""
+    """Relative standard error of each base parameter except offsets."""
     levels: Levels
 
     @property
@@ -83,7 +83,7 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
 
 
 def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
-    """Standard error over value of each base parameter but offsets.
+    """Relative standard error of each base parameter except offsets.
 
     Gravity may be zero, on a horizontal arm: then its error is compared with the torque that moved the arm.
     """

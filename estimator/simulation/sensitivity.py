@@ -306,7 +306,7 @@ def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any
 
 
 def follow(rows: Any, numbers: Any, Z: Any, before: int, count: int) -> None:
-    """The state's derivatives Z after the step at `before`."""
+    """Propagate the state's derivatives Z through the step at `before`."""
     # That this is 0 or 1 tells the compiler that no index is negative, which Python would count from the end.
     before &= 1
     w, v = 2 * before * STAGE, before * NUMBERS

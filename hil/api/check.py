@@ -56,7 +56,7 @@ class CheckReport:
 def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckReport:
     """Look at port, servos, pose and rate, with torque off: `hil check` as a function. Nothing moves.
 
-    What cannot be looked at is a finding, not an exception.
+    A check that cannot be made is a finding, not an exception.
 
     Raises:
         ConfigError: the configuration is wrong.

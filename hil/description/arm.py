@@ -79,7 +79,7 @@ class ArmJoint:
     limits: tuple[float, float] | None
     """[rad]; None for a joint that turns on and on."""
     body: Body
-    """The link with all that is fixed to it."""
+    """The link merged with everything fixed to it."""
     fixed: tuple[str, ...]
     """Names of the links that are fixed to it, or held."""
 

@@ -24,7 +24,7 @@ PRIOR_ROOM = 0.9
 _ROUNDS = 12
 _LAST_ROUNDS = 4
 _CLOSE = 0.94
-"""Of the limits, at the wanted chance: where the search is content."""
+"""Fraction of the limits, at the required probability, at which the search stops."""
 
 _LARGEST_STEP = 2.0
 _BACK_OFF = 0.93

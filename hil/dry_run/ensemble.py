@@ -63,7 +63,7 @@ def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
 def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
     """From a result, its covariance widened by the model error that the residual indicates.
 
-    farther: range of motion that will be simulated over the range that the result was identified on.
+    farther: ratio of the range of motion to be simulated to the range used for identification.
     """
     names = result.covariance.names
     covariance = result.covariance.array()

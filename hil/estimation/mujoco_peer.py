@@ -81,7 +81,7 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
 
 @dataclass(frozen=True)
 class _Arm:
-    """The arm in MuJoCo's own quantities; the masses are free to choose, for only their moments can be seen."""
+    """The arm in MuJoCo's own quantities; the masses are arbitrary, since only their moments are identifiable."""
 
     masses: tuple[float, ...]
     values: dict[str, float]

@@ -8,7 +8,7 @@ _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torq
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per parameter of the model that no description has a place for, but for what this one `carried`."""
+    """One sentence per model parameter that the format cannot represent, except those in `carried`."""
     said = []
     for name, value in model.values.items():
         term = term_of(name)

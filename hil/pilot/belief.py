@@ -78,7 +78,7 @@ class Belief:
         return float(self.coordinates[:, self.names.index(name)].std())
 
     def ensemble(self, farther: float = 1.0) -> Ensemble:
-        """For a dry run; farther: range of motion that will be simulated over the one that was seen."""
+        """Ensemble for a dry run. farther: ratio of the range of motion to be simulated to the observed range."""
         belief = self if not self.learned else self._widened(_LEAST_SPREAD * (1.0 + np.log2(max(1.0, farther))))
         parameters = belief.parameters
         joints = 2 if "torque_scale_2" in parameters[0] else 1

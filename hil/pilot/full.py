@@ -18,7 +18,7 @@ MOST_TRIES = 3
 """Full runs, where one passes a limit or does not settle."""
 
 _BACK_OFF = 0.85
-"""Of the torque of a run that never settled: large motion of little friction need not settle at all."""
+"""Torque factor after a run that never settled: large motion with little friction need not settle at all."""
 
 
 def identify_in_steps(

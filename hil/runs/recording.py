@@ -1,6 +1,6 @@
-"""Samples on file as they are taken: a preallocated, memory-mapped `.npy` of a structured type.
+"""Samples written to disk as they are taken: a preallocated, memory-mapped `.npy` of a structured type.
 
-What has been sampled is on file even if the process is killed (not if the machine loses power: the pages are the
+The samples survive even if the process is killed (not if the machine loses power: the pages are the
 kernel's until it writes them). A row whose phase is 0 has not been recorded.
 """
 

@@ -168,7 +168,7 @@ class RunFolder:
         return starts
 
     def write_played(self, played: Config) -> None:
-        """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found; and gains."""
+        """Save an [experiment] that differs from the file's (a pilot's, or one with computed torque), and the gains."""
         write_json(self.played_path, played.experiment.model_dump())
         if played.stabiliser is not None:
             write_json(self.stabiliser_path, played.stabiliser.model_dump())

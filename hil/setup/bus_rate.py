@@ -13,7 +13,7 @@ from hil.drivers.servo_model import Mode
 CYCLES = 200
 SLOW_EVERY = 10
 SHARE = 0.9
-"""How much of a period the exchange may take; the rest is the computer's."""
+"""Fraction of a period that the exchange may take; the rest is for the computer."""
 
 
 @dataclass(frozen=True)
