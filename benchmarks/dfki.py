@@ -129,7 +129,7 @@ def filtered_fit(sines: list[Recording], swings: list[Recording], cutoffs: tuple
 
 def shooting_fit(recordings: list[Recording]) -> ShootingEstimate:
     config = load_csv_config(CONFIG)
-    model = replace(wanted_model(config.model, 2), zeros=False)
+    model = wanted_model(config.model, 2).without("zeros")
     start = fit_inverse_dynamics(recordings, START_CUTOFF, WIDTH).value
     return estimate_by_shooting(recordings, model, start, length=config.columns.segment, zeros=True)
 

@@ -69,7 +69,8 @@ class Outcome:
         return {n: e for n, e in self.errors.items() if abs(e[0]) > TOLERANCE and not abs(e[1]) <= DEVIATIONS}
 
     def __str__(self) -> str:
-        head = f"{self.seed:5d} {self.name:44s} cpu {self.cpu_seconds:6.1f} s  arm {self.arm_seconds:5.0f} s in {self.steps}"
+        head = f"{self.seed:5d} {self.name:44s} cpu {self.cpu_seconds:6.1f} s, arm {self.arm_seconds:5.0f} s"
+        head += f" in {self.steps}"
         passed = f"  BEYOND by {self.beyond:.3f}, {self.beyond_predicted:.3f} predicted" if self.beyond else ""
         if not self.finished:
             return f"{head}{passed}  FAILED: {self.message}"

@@ -37,7 +37,7 @@ def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding
     """All infinite where the fit, or the prediction, finds no end."""
     keys = (*(f"{group}_error" for group in GROUPS), "held_out_rms", "residual_ticks")
     try:
-        found = identify(period, Model(2, "stribeck", "lag", presliding=presliding))
+        found = identify(period, Model(2, "stribeck", "lag", ("presliding",) if presliding else ()))
         predicted = predict(found, held_out.torque, held_out.rate, held_out.command_to_sample)
     except (ConvergenceError, PeriodicityError):
         return dict.fromkeys(keys, math.inf)

@@ -82,7 +82,7 @@ class FakeServo(BaseModel):
 
     @model_validator(mode="after")
     def _known_registers(self) -> Self:
-        table = load_model(self.model).registers
+        table = load_model(self.model, self.firmware).registers
         for name, value in self.registers.items():
             register = table.get(name)
             if register is None or not register.eeprom or not register.writable:
@@ -164,7 +164,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     """
     servos = [
         Servo(
-            load_model(servo.model),
+            load_model(servo.model, servo.firmware),
             servo.id,
             zero_ticks=servo.zero_ticks,
             direction=servo.direction,

@@ -9,20 +9,9 @@ from typing import Any
 
 from hil.arm_model import ArmModel, JointFacts
 from hil.errors import ResultError
+from hil.estimator.models.terms import RIGID_BODY, base_names, extra_names
 
 SCHEMA = 1
-
-_RIGID_BODY = {
-    1: ("inertia_1", "gravity_1"),
-    2: ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
-}
-_PER_JOINT = ("viscous", "coulomb", "offset")
-_OPTIONAL_PER_JOINT = (
-    *("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry"),
-    *("ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale"),
-    *("presliding_stiffness", "presliding_damping"),
-)
-_DRIVE = ("lag", "delay")
 
 
 def read_result(path: Path) -> dict[str, Any]:
@@ -103,11 +92,10 @@ def _joint(entry: dict[str, Any]) -> JointFacts:
 
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
     """Every term must be there and known: a model that left one out would be wrong without a word."""
-    if joints not in _RIGID_BODY:
+    if joints not in RIGID_BODY:
         raise ResultError(f"{path}: an arm of {joints} joints; this hil has models of one and two.")
-    numbers = range(1, joints + 1)
-    needed = {*_RIGID_BODY[joints], *(f"{term}_{joint}" for term in _PER_JOINT for joint in numbers)}
-    possible = {*needed, *_DRIVE, *(f"{term}_{joint}" for term in _OPTIONAL_PER_JOINT for joint in numbers)}
+    needed = set(base_names(joints))
+    possible = {*needed, *extra_names(joints)}
     missing, unknown = sorted(needed - values.keys()), sorted(values.keys() - possible)
     if missing:
         raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")

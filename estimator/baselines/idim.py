@@ -16,7 +16,8 @@ from scipy.signal import butter, sosfiltfilt
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError, UnidentifiableError
-from hil.estimator.models.regressor import parameter_names, regressor
+from hil.estimator.models.regressor import regressor
+from hil.estimator.models.terms import base_names
 
 ORDER = 4  # of the Butterworth filter, doubled by running it both ways
 TRIM = 1.5  # cycles of the cut-off left out at either end, where the filter sees nothing beyond
@@ -110,7 +111,7 @@ def fit_inverse_dynamics(
         left = np.sqrt(np.mean((tau - Y @ theta) ** 2, axis=1))
         weight = 1.0 / np.maximum(left, 1e-12)
     level = np.sqrt(np.mean(tau**2, axis=1))
-    return InverseDynamics(parameter_names(len(Y)), theta, std, left / np.where(level > 0.0, level, 1.0))
+    return InverseDynamics(base_names(len(Y)), theta, std, left / np.where(level > 0.0, level, 1.0))
 
 
 def _solve(Y: Array, tau: Array, weight: Array) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.models.parameters import ABSENT, CONSTANTS
-from hil.estimator.models.regressor import parameter_names
+from hil.estimator.models.terms import base_names
 
 PASSES = 3
 LONGEST_STEP = 1.3e-3  # s
@@ -61,7 +61,7 @@ def fit_by_kalman(
     ConvergenceError when the filter diverges.
     """
     joints = recording.joints
-    names = parameter_names(joints)
+    names = base_names(joints)
     dt = recording.interval
     position = recording.filled().T.copy()
     torque = recording.mean_torque(np.append(recording.time, recording.time[-1] + dt), delay).T

@@ -13,7 +13,8 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import InverseDynamics, uniform
 from hil.estimator.data.recording import Recording
-from hil.estimator.models.regressor import parameter_names, regressor
+from hil.estimator.models.regressor import regressor
+from hil.estimator.models.terms import base_names
 
 ORDER = 4  # of the filter
 WIDE = 1e3  # standard deviation of the parameters before the first sample, in units of SI
@@ -36,7 +37,7 @@ def fit_recursively(
         theta, P = _run(Y, tau, deviation)
         deviation = np.sqrt(np.mean((tau - Y @ theta) ** 2, axis=1))
     level = np.sqrt(np.mean(tau**2, axis=1))
-    return InverseDynamics(parameter_names(len(Y)), theta, np.sqrt(np.diag(P)), deviation / level)
+    return InverseDynamics(base_names(len(Y)), theta, np.sqrt(np.diag(P)), deviation / level)
 
 
 def _causal_rows(recording: Recording, cutoff: float, width: float, delay: float) -> tuple[Array, Array]:

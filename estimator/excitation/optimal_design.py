@@ -16,6 +16,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.models.parameters import ABSENT, CONSTANTS, Physics
+from hil.estimator.models.terms import extra_names
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
 
 KNOTS = 4  # of each joint's amplitude spectrum, over the logarithm of the line
@@ -24,10 +25,6 @@ PHASE_TRIALS = 60
 DIFFERENCE = 1e-3  # relative, of a parameter; for the state [rad, rad/s]
 SCALING_ROUNDS = 12
 LEAST_SHARE = 1e-3
-NUISANCES = (
-    *("coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "torque_scale"),
-    *("presliding_stiffness", "presliding_damping"),
-)
 THREADS = 2
 LEAST_WIDTH = 0.02  # rad/s
 
@@ -168,7 +165,7 @@ class Problem:
 
     def _nuisances(self, joints: int) -> list[str]:
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
-        terms = [f"{term}_{joint + 1}" for term in NUISANCES for joint in range(joints)]
+        terms = [name for name in extra_names(joints) if name in known]
         present = [name for name in terms if known[name] not in {0.0, ABSENT[name]}]
         return [*present, "lag"]
 

@@ -26,6 +26,7 @@ from hil.estimator.fit.reparametrisation import Coordinates, scales_of
 from hil.estimator.fit.segmented_least_squares import Segmented, minimise_segmented
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import term_of
 from hil.estimator.simulation.arm import simulate
 from hil.estimator.simulation.presliding_sensitivity import sensitive
 
@@ -33,7 +34,6 @@ WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a secon
 STARTING_WIDTH = 0.05  # rad/s
 STARTING_BEND = 0.003  # rad, of friction that yields before it slides
 RISES_FADE = (0.2, 2.0)  # rad/s
-START = {"stribeck_rise": 0.2, "load": 0.02, "delay": 0.0, "lag": 1e-3}
 SHORT = 0.25  # of the segments' length, to begin with
 COARSE = 1e-3
 FINE = 3e-5
@@ -286,6 +286,6 @@ def _starts(problem: Shooting, coordinates: Coordinates, model: Model, base: Arr
         known[f"presliding_damping_{joint}"] = abs(known[f"viscous_{joint}"])
     rising = "stribeck_velocity_1" in model.names
     for velocity in RISES_FADE if rising else RISES_FADE[:1]:
-        unknown = START | {"stribeck_velocity": velocity}
-        value = np.array([known.get(name, unknown.get(name.rstrip("_12"), 0.0)) for name in model.names])
+        known |= {f"stribeck_velocity_{joint}": velocity for joint in range(1, model.joints + 1)}
+        value = np.array([known.get(name, term_of(name).initial) for name in model.names])
         yield np.concatenate((coordinates.coordinates(value), np.zeros(problem.zeros)))

@@ -1,27 +1,24 @@
 """Unconstrained coordinates for the likelihood: no step of it can leave the physical parameters.
 
-Positive parameters are exponentials. Coupling is sqrt(inertia_1 inertia_2) tanh(z), which every arm of
-positive masses obeys and which keeps the mass matrix positive definite; the asymmetry of viscous friction is
+What range a parameter has, its scale and its longest step is declared in `hil.estimator.models.terms`. Positive
+parameters are exponentials. Coupling is a share of its bound, sqrt(inertia_1 inertia_2) tanh(z), which every arm of
+positive masses obeys and which keeps the mass matrix positive definite; so is the asymmetry of viscous friction,
 viscous tanh(z), which keeps friction positive both ways. The width of the Coulomb step stays above a floor.
-Gravity, offsets, ripple, the joints' zeros and delay may have either sign.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.models.terms import Scale, joint_of, term_of
 
 LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
 MOST_COUPLING = 0.95  # of its bound, at the start
 BEND = 0.01  # rad: much of it, for friction that yields before it slides
 NEAREST = 1e-3  # of a width's floor: what always stays above it, or no step would lead back
 WIDENING = 2.0  # of a width, in one step
-STRIBECK = ("stribeck_rise", "stribeck_velocity")
-RESHAPING = 1.0  # of the logarithms of these, in one step
-EITHER_SIGN = ("gravity", "offset", "delay", "ripple_sin", "ripple_cos", "ripple_cycles", "zero")
 
 
 @dataclass(frozen=True)
@@ -64,12 +61,13 @@ class Coordinates:
         return y
 
     def limit(self, x: Array, least: Array, most: Array, narrowing: float) -> None:
-        """Lower in place what coordinates may change by in one step from `x` (coordinates,), if it is the shape of
-        friction near standstill: a width by no more than its share `narrowing` and by WIDENING, others by RESHAPING.
+        """Lower in place what coordinates may change by in one step from `x` (coordinates,), where less is declared of
+        them: a width by no more than its share `narrowing` and by WIDENING, others by their `Term.max_step`.
 
         One that shrinks to nothing in a single step leaves no trace in the motion that would bring it back.
         """
-        least[self._shapes], most[self._shapes] = -RESHAPING, RESHAPING
+        least[: x.size] = np.maximum(least[: x.size], -self._longest)
+        most[: x.size] = np.minimum(most[: x.size], self._longest)
         widths = np.flatnonzero(self._floors)
         share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
         least[widths], most[widths] = np.maximum(-1.0, -narrowing * share), WIDENING * share
@@ -86,24 +84,26 @@ class Coordinates:
 
     @cached_property
     def _either_sign(self) -> Array:
-        return np.array([_kind(name) in EITHER_SIGN for name in self.names])
+        return np.array([term_of(name).range == "any" for name in self.names])
 
     @cached_property
     def _floors(self) -> Array:
-        return np.array([self.width_floor if _kind(name) == "coulomb_width" else 0.0 for name in self.names])
+        return np.array([self.width_floor if term_of(name).range == "floor" else 0.0 for name in self.names])
 
     @cached_property
-    def _shapes(self) -> list[int]:
-        return [i for i, name in enumerate(self.names) if _kind(name) in STRIBECK]
+    def _longest(self) -> Array:
+        return np.array([term_of(name).max_step or np.inf for name in self.names])
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
         """Indices of what is bounded by the geometric mean of two others, and of the two."""
-        bounds = {"coupling": ("inertia_1", "inertia_2")}
-        for joint in (1, 2):
-            bounds[f"viscous_asymmetry_{joint}"] = (f"viscous_{joint}", f"viscous_{joint}")
-        index = self.names.index
-        return [(index(name), index(a), index(b)) for name, (a, b) in bounds.items() if name in self.names]
+        shares = []
+        for share, name in enumerate(self.names):
+            bounds, joint = term_of(name).share_of, joint_of(name)
+            if bounds is not None:
+                first, second = (bound if joint is None else f"{bound}_{joint}" for bound in bounds)
+                shares.append((share, self.names.index(first), self.names.index(second)))
+        return shares
 
 
 def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: float) -> Array:
@@ -111,20 +111,12 @@ def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: f
 
     From RMS torque [N m], RMS velocity [rad/s] and an inertia [kg m^2] of the arm and its motion.
     """
-    scale: Mapping[str, float] = {
-        **dict.fromkeys(("inertia", "coupling", "armature"), inertia),
-        **dict.fromkeys(("gravity", "coulomb", "offset"), torque),
-        **dict.fromkeys(("viscous", "viscous_asymmetry", "presliding_damping"), torque / velocity),
-        "presliding_stiffness": torque / BEND,
-        **dict.fromkeys(("ripple_sin", "ripple_cos", "ripple_cycles", "zero"), 0.02),
-        "stribeck_velocity": velocity,
-        "coulomb_width": 0.05,
-        **dict.fromkeys(("stribeck_rise", "load", "torque_scale"), 1.0),
-        **dict.fromkeys(("delay", "lag"), 1e-3),
+    arm: dict[Scale, float] = {
+        "inertia": inertia,
+        "torque": torque,
+        "velocity": velocity,
+        "damping": torque / velocity,
+        "stiffness": torque / BEND,
     }
-    return np.array([scale[_kind(name)] for name in names])
-
-
-@cache
-def _kind(name: str) -> str:
-    return name.rstrip("_12")
+    scales = [term_of(name).scale for name in names]
+    return np.array([scale if isinstance(scale, float) else arm[scale] for scale in scales])

@@ -14,7 +14,8 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import Lines, Motion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ShapeError, UnidentifiableError
-from hil.estimator.models.regressor import parameter_names, regressor
+from hil.estimator.models.regressor import regressor
+from hil.estimator.models.terms import base_names
 
 COULOMB_WIDTH = 0.05  # rad/s: about the velocity that the dropped lines leave in a sticking joint
 WORST_CONDITION = 1e8
@@ -66,7 +67,7 @@ def fit_lines(*periods: SettledPeriod) -> LinearEstimate:
     # The second time each joint counts by what the first left unexplained of it.
     left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
     theta, std = _solve(A, torque, 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max()))
-    return LinearEstimate(parameter_names(joints), theta[:-1], std[:-1], float(theta[-1]), motions, harmonics)
+    return LinearEstimate(base_names(joints), theta[:-1], std[:-1], float(theta[-1]), motions, harmonics)
 
 
 def _equations(period: SettledPeriod, motion: Motion, harmonics: int) -> tuple[Lines, Lines]:

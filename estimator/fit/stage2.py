@@ -28,12 +28,13 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import LEAST_DAMPING, Minimum
 from hil.estimator.fit.objective import Problem, Run
-from hil.estimator.fit.reparametrisation import STRIBECK, Coordinates, scales_of
+from hil.estimator.fit.reparametrisation import Coordinates, scales_of
 from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
-from hil.estimator.models.model import PRESLIDING, Model
+from hil.estimator.models.model import Model
+from hil.estimator.models.terms import TERMS, kind_of, term_of
 
 WIDTH_FLOOR = 1e-4  # rad/s: friction that sticks is not told from this, and from 3e-4 by half a standard error
 # From a narrow step the fit of a wide one may end in a local minimum, and the other way round: try both. With
@@ -63,9 +64,9 @@ EXPLAINED = 1.03  # sum of squares per sample in units of the noise: nothing is 
 # Far from the end the sum is anything but quadratic in friction's width; in the short steps near the end it is nearly.
 CAUTIOUS = 0.5
 ANGLE_SCALE = 0.1  # rad
-# Where the terms start that the regression does not see.
-START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
-SHAPE = ("coulomb_width", *PRESLIDING, *STRIBECK)  # of friction near standstill
+# Terms that shape friction near standstill, and of these the rise alone.
+SHAPE = tuple(name for name, term in TERMS.items() if term.standstill)
+STRIBECK = tuple(name for name, term in TERMS.items() if term.part == "stribeck")
 LEAST_LAG = 1e-4  # s, at the start
 LEAST_WINDOW = 0.005  # of a run: rounding is correlated, a little, over more lags than its autocorrelation shows
 OUTLIER = 4.0  # standard deviations; rounding never leaves more than 1.7
@@ -109,7 +110,7 @@ def fit_runs(
     problem, states = _problem(periods, model, linear)
     rough = replace(problem, runs=tuple(run.roughly() for run in problem.runs), narrowing=CAUTIOUS)
     samples = int(sum(period.valid.sum() for period in periods))
-    ripple = find_ripple(periods, linear) if model.ripple else {}
+    ripple = find_ripple(periods, linear) if "ripple" in model.options else {}
     own = [_start(model, linear, ripple, shape) for shape in _shapes(linear)]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
@@ -296,7 +297,7 @@ def _polished(problem: Problem, x: Array, enough: float, likely: float) -> Minim
 
 def _reshaped(problem: Problem, x: Array, other: Array, kinds: tuple[str, ...] = SHAPE) -> Array:
     """The coordinates `x` with these kinds of parameters as the coordinates `other` have them."""
-    shape = [name.rstrip("_12") in kinds for name in problem.coordinates.names]
+    shape = [kind_of(name) in kinds for name in problem.coordinates.names]
     reshaped = x.copy()
     reshaped[: len(shape)][shape] = other[: len(shape)][shape]
     return reshaped
@@ -325,7 +326,7 @@ def _start(model: Model, linear: LinearEstimate, ripple: dict[str, float], shape
     if model.drive == "delay":
         known["delay"] = linear.delay
     known |= {"lag": max(linear.delay, LEAST_LAG)}
-    return np.array([known.get(name, START.get(name.rstrip("_12"), 0.0)) for name in model.names])
+    return np.array([known.get(name, term_of(name).initial) for name in model.names])
 
 
 def _weights(periods: Sequence[SettledPeriod], positions: Sequence[Array]) -> tuple[tuple[Array, ...], int]:

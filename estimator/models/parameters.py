@@ -7,20 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.models.terms import TERMS, constants, term_of
 
-RIGID = ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2")
-# Of each joint; the angle's zero is an error of the encoder's: true angle = measured angle + zero.
-PER_JOINT = (
-    *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
-    *("viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale"),
-    *("presliding_stiffness", "presliding_damping"),
-)
-# The order in which the compiled simulation takes them.
-CONSTANTS = (*RIGID, *(f"{name}_{joint}" for name in PER_JOINT for joint in (1, 2)))
-# What stands for a term the model lacks; a pendulum's second joint is a wheel that nothing turns.
-ONE_WHERE_ABSENT = ("armature", "coulomb_width", "stribeck_velocity", "torque_scale")
+CONSTANTS = constants()
+"""The order in which the compiled simulation takes them."""
+ABSENT = {name: term_of(name).absent for name in CONSTANTS}
+"""What stands for a term that the model lacks; a pendulum's second joint is a wheel that nothing turns."""
 SLIDING = 0.05  # rad/s: faster than this a joint slides, and its friction's bristles are bent that way
-ABSENT = {name: 1.0 if name.rstrip("_12") in ONE_WHERE_ABSENT else 0.0 for name in CONSTANTS}
+
+
+def place_of(term: str) -> int:
+    """Where a term's constant stands in `Physics.vector`, joint 1's if each joint has one; joint 2's comes next."""
+    return CONSTANTS.index(term if TERMS[term].scope == "arm" else f"{term}_1")
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Physics:
     """Constants of one simulation."""
 
     vector: Array
-    """In the order of CONSTANTS (36,) [SI]."""
+    """In the order of CONSTANTS (constants,) [SI]."""
     delay: float
     """Pure delay of the torque [s]."""
     lag: float

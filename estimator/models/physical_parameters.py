@@ -13,9 +13,9 @@ from scipy.optimize import least_squares
 
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ModelError
-from hil.estimator.models.regressor import RIGID_BODY
+from hil.estimator.models.terms import RIGID_BODY
 
-UNITS = {"length": "m", "mass": "kg", "centre": "m", "link_inertia": "kg m^2", "armature": "kg m^2"}
+QUANTITY_UNITS = {"length": "m", "mass": "kg", "centre": "m", "link_inertia": "kg m^2", "armature": "kg m^2"}
 QUANTITIES = {
     1: ("mass_1", "centre_1", "link_inertia_1", "armature_1"),
     2: (

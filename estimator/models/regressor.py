@@ -15,34 +15,8 @@ One joint is the same without all that belongs to the second: inertia_1, gravity
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.errors import ModelError, ShapeError
-
-RIGID_BODY = {
-    1: ("inertia_1", "gravity_1"),
-    2: ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
-}
-UNITS = {
-    "inertia": "kg m^2",
-    "coupling": "kg m^2",
-    "armature": "kg m^2",
-    "gravity": "N m",
-    "viscous": "N m s/rad",
-    "coulomb": "N m",
-    "offset": "N m",
-}
-
-
-def parameter_names(joints: int) -> tuple[str, ...]:
-    """Names of the base parameters, in the order of every vector of them. Raises ModelError."""
-    if joints not in RIGID_BODY:
-        raise ModelError(f"an arm of {joints} joints: the arm model has one or two")
-    friction = (f"{term}_{joint + 1}" for term in ("viscous", "coulomb", "offset") for joint in range(joints))
-    return (*RIGID_BODY[joints], *friction)
-
-
-def parameter_units(joints: int) -> tuple[str, ...]:
-    """Units of the base parameters."""
-    return tuple(UNITS[name.split("_")[0]] for name in parameter_names(joints))
+from hil.estimator.errors import ShapeError
+from hil.estimator.models.terms import base_names
 
 
 def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0) -> Array:
@@ -58,8 +32,7 @@ def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_wid
             "must have one shape (joints, samples)"
         )
     joints, samples = position.shape
-    names = parameter_names(joints)
-    Y = np.zeros((joints, samples, len(names)))
+    Y = np.zeros((joints, samples, len(base_names(joints))))
     rigid = _pendulum(position, acceleration) if joints == 1 else _two_link(position, velocity, acceleration)
     Y[:, :, : rigid.shape[2]] = rigid
     signs = _signs(velocity, np.broadcast_to(coulomb_width, (joints,)))
@@ -76,7 +49,8 @@ def inverse_dynamics(
 ) -> Array:
     """Joint torques [N m] (joints, samples) of this motion, from the equations at the head of this module.
 
-    `theta`: base parameters in the order of `parameter_names`; the rest as in `regressor`, errors too.
+    `theta`: base parameters in the order of `hil.estimator.models.terms.base_names`; the rest, and what is raised, as
+    in `regressor`.
     """
     torque: Array = regressor(position, velocity, acceleration, coulomb_width) @ theta
     return torque

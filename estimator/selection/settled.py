@@ -8,7 +8,7 @@ without meaning would. Without another motion the Bayesian information criterion
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -17,7 +17,8 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.identify import Estimate, identify, predict
-from hil.estimator.models.model import Drive, Model
+from hil.estimator.models.model import Model
+from hil.estimator.models.terms import Drive
 
 WORTH = 0.98  # of the score of the best so far: what another term must reach to be kept
 EXPLAINED = 1.05  # error of prediction in units of the noise: nothing is left for another term
@@ -91,7 +92,7 @@ def choose(
     tried = partial(_try, periods, held_out, starts)
     joints = periods[0].joints
     for step in _ladder(joints, drive):
-        model = replace(step, torque_scale=torque_scale)
+        model = step.having("torque_scale") if torque_scale else step
         trial = tried(model if best is None else _on_top(model, best.model), hasty=True)
         trials.append(trial)
         if best is None or (trial.score < WORTH * best.score and _beyond_chance(trial.estimate, best.estimate)):
@@ -109,16 +110,16 @@ def _ladder(joints: int, drive: Drive) -> Iterator[Model]:
     yield Model(joints, "coulomb", drive)
     yield Model(joints, "stribeck", drive)
     yield Model(joints, "stribeck_load", drive)
-    yield Model(joints, "stribeck_load", drive, ripple=True)
-    yield Model(joints, "stribeck_load", drive, presliding=True)
-    yield Model(joints, "coulomb", drive, asymmetry=True)
+    yield Model(joints, "stribeck_load", drive, {"ripple"})
+    yield Model(joints, "stribeck_load", drive, {"presliding"})
+    yield Model(joints, "coulomb", drive, {"asymmetry"})
 
 
 def _on_top(model: Model, best: Model) -> Model:
     """Direction is added to the best so far; presliding and ripple only show with all of friction in place."""
-    if model.asymmetry:
-        return replace(best, asymmetry=True)
-    return replace(model, ripple=model.ripple or best.ripple)
+    if "asymmetry" in model.options:
+        return best.having("asymmetry")
+    return model.having("ripple") if "ripple" in best.options else model
 
 
 def _beyond_chance(richer: Estimate | None, plainer: Estimate | None) -> bool:

@@ -7,8 +7,7 @@ kept apart so; what is judged has seen none but its own half.)
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,11 +16,11 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.data.segments import Grid, cut
 from hil.estimator.errors import ConvergenceError, RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
-from hil.estimator.models.model import Drive, Friction, Model
+from hil.estimator.models.model import Model
+from hil.estimator.models.terms import FRICTIONS, Drive, Option
 from hil.estimator.selection.prediction import prediction_errors
 
 WORTH = 0.98  # of the error of the best so far: what another term must reach to be kept
-FRICTIONS: tuple[Friction, ...] = ("coulomb", "stribeck", "stribeck_load")
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
 
 
@@ -76,12 +75,14 @@ def choose_by_shooting(
         return _try(recordings, model, start, length, zeros)
 
     joints = recordings[0].joints
-    trials = [tried(Model(joints, friction, drive, torque_scale=torque_scale)) for friction in FRICTIONS]
+    always: tuple[Option, ...] = ("torque_scale",) if torque_scale else ()
+    trials = [tried(Model(joints, friction, drive, always)) for friction in FRICTIONS]
     best = trials[0]
     for trial in trials[1:]:
         best = trial if trial.score < WORTH * best.score else best
-    for more in (partial(replace, presliding=True), partial(replace, asymmetry=True)):
-        trials.append(tried(more(best.model)))
+    further: tuple[Option, ...] = ("presliding", "asymmetry")
+    for option in further:
+        trials.append(tried(best.model.having(option)))
         best = trials[-1] if trials[-1].score < WORTH * best.score else best
     if best.held_out is None:
         raise ConvergenceError("no friction model could be fitted: look at the recording and its units")

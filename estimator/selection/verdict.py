@@ -72,7 +72,7 @@ def _explained(estimate: Estimate, validation: Validation) -> str:
     joint = int(np.argmax(validation.residual_over_floor)) + 1
     error = float(validation.levels.model_error.max())
     model = estimate.model
-    ratio = "set torque_scale = true there, " if model.joints == 2 and not model.torque_scale else ""
+    ratio = "set torque_scale = true there, " if model.joints == 2 and "torque_scale" not in model.options else ""
     return (
         f"Joint {joint} moves in a way that the model does not have: {left:.1f} times the noise is left, a model error "
         f'of {error:.2g} encoder steps RMS. Let [model] friction = "auto" choose, {ratio}and look for play, a '

@@ -25,8 +25,16 @@ import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.models.parameters import Physics
+from hil.estimator.models.parameters import Physics, place_of
 from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
+
+# Of joint 1 in `Physics.vector`; joint 2 follows.
+VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING = map(
+    place_of, ("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity")
+)
+LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
+    place_of, ("load", "viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale")
+)
 
 LONGEST_STEP = 0.85e-3  # s
 MOST_PIECES = 64
@@ -90,22 +98,22 @@ def bend_at(v: float, sharp: float) -> tuple[float, float]:
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
 def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, float]:
     """Torque that a drive leaves its joint after friction, and the slope of that friction."""
-    c = 6 + joint
-    t *= p[c + 24]
-    if p[c + 20] != 0.0:
-        t *= 1.0 + p[c + 16] * math.sin(p[c + 20] * q) + p[c + 18] * math.cos(p[c + 20] * q)
-    level = p[c + 2] * (1.0 + p[c + 8] * bump_at(v / p[c + 10])) + p[c + 12] * abs(t)
-    bend, bent = bend_at(v, 1.0 / p[c + 6])
-    left = t - p[c + 4] - p[c] * v - (p[c + 14] * v + level) * bend
-    return left, p[c] + level * bent
+    viscous, cycles = p[VISCOUS + joint], p[CYCLES + joint]
+    t *= p[SCALE + joint]
+    if cycles != 0.0:
+        t *= 1.0 + p[SINE + joint] * math.sin(cycles * q) + p[COSINE + joint] * math.cos(cycles * q)
+    level = p[COULOMB + joint] * (1.0 + p[RISE + joint] * bump_at(v / p[FADING + joint])) + p[LOAD + joint] * abs(t)
+    bend, bent = bend_at(v, 1.0 / p[WIDTH + joint])
+    left = t - p[OFFSET + joint] - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
+    return left, viscous + level * bent
 
 
 def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:
     """Mass matrix's first row, torques left for acceleration, and the slopes of friction."""
     left_1, slope_1 = _drive(p, 0, q1, v1, t1)
     left_2, slope_2 = _drive(p, 1, q2, v2, t2)
-    q1 += p[28]
-    q2 += p[29]
+    q1 += p[ZERO]
+    q2 += p[ZERO + 1]
     cos_1, sin_1, cos_2, sin_2 = math.cos(q1), math.sin(q1), math.cos(q2), math.sin(q2)
     across = p[1] * cos_2
     turning = p[1] * sin_2
@@ -126,8 +134,9 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
     From velocities [rad/s] and the last accelerations [rad/s^2].
     """
     ahead = 2.0 * left * piece
-    near_1 = (p[8] > 0.0) & ((min(abs(v1), abs(v1 + ahead * a1)) < 6.0 * p[12]) | (v1 * (v1 + ahead * a1) < 0.0))
-    near_2 = (p[9] > 0.0) & ((min(abs(v2), abs(v2 + ahead * a2)) < 6.0 * p[13]) | (v2 * (v2 + ahead * a2) < 0.0))
+    u1, u2 = v1 + ahead * a1, v2 + ahead * a2
+    near_1 = (p[COULOMB] > 0.0) & ((min(abs(v1), abs(u1)) < 6.0 * p[WIDTH]) | (v1 * u1 < 0.0))
+    near_2 = (p[COULOMB + 1] > 0.0) & ((min(abs(v2), abs(u2)) < 6.0 * p[WIDTH + 1]) | (v2 * u2 < 0.0))
     return 1 if near_1 | near_2 else left
 
 

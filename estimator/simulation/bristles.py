@@ -21,15 +21,15 @@ import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.models.parameters import CONSTANTS, SLIDING, Physics
+from hil.estimator.models.parameters import SLIDING, Physics, place_of
 
 # Of joint 1 in `Physics.vector`; joint 2 follows.
-VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING = (
-    CONSTANTS.index(f"{name}_1")
-    for name in (
+VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING = map(
+    place_of,
+    (
         *("viscous", "coulomb", "offset", "stribeck_rise", "stribeck_velocity", "load", "torque_scale"),
         *("presliding_stiffness", "presliding_damping"),
-    )
+    ),
 )
 
 

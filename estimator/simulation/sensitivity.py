@@ -25,14 +25,33 @@ import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, Physics
-from hil.estimator.simulation.arm import GAMMA, MOST_PIECES, bend_at, bump_at, finer_pieces, pieces_now
+from hil.estimator.simulation.arm import (
+    ASYMMETRY,
+    COSINE,
+    COULOMB,
+    CYCLES,
+    FADING,
+    GAMMA,
+    LOAD,
+    MOST_PIECES,
+    OFFSET,
+    RISE,
+    SCALE,
+    SINE,
+    VISCOUS,
+    WIDTH,
+    ZERO,
+    bend_at,
+    bump_at,
+    finer_pieces,
+    pieces_now,
+)
 
 # What can be differentiated by: the constants, the drive's times, the state at the first sample.
 CAUSES = (*CONSTANTS, "delay", "lag", "position_1", "position_2", "velocity_1", "velocity_2")
 DELAY, STATE = len(CONSTANTS), len(CONSTANTS) + 2
-COUPLING, GRAVITY_1, GRAVITY_2, ZERO_1, ZERO_2 = map(
-    CONSTANTS.index, ("coupling", "gravity_1", "gravity_2", "zero_1", "zero_2")
-)
+COUPLING, GRAVITY_1, GRAVITY_2 = map(CONSTANTS.index, ("coupling", "gravity_1", "gravity_2"))
+ZERO_1, ZERO_2 = ZERO, ZERO + 1
 
 AT_ONCE = 8  # causes that a processor may take at once: they are filled up to that, so that none is left over
 NOWHERE = AT_ONCE * math.ceil(len(CAUSES) / AT_ONCE)  # the column of what nobody asked for
@@ -126,11 +145,10 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     with."""
     rows, numbers, here, left, slope, dt, _, at = room
     q, v = here[0, joint], here[1, joint]
-    c = 6 + joint
-    viscous, coulomb, offset, width = p[c], p[c + 2], p[c + 4], p[c + 6]
-    rise, fading, load, asymmetry = p[c + 8], p[c + 10], p[c + 12], p[c + 14]
-    ripple_sin, ripple_cos, cycles = p[c + 16], p[c + 18], p[c + 20]
-    commanded, scale = t, p[c + 24]
+    viscous, coulomb, offset, width = p[VISCOUS + joint], p[COULOMB + joint], p[OFFSET + joint], p[WIDTH + joint]
+    rise, fading, load, asymmetry = p[RISE + joint], p[FADING + joint], p[LOAD + joint], p[ASYMMETRY + joint]
+    ripple_sin, ripple_cos, cycles = p[SINE + joint], p[COSINE + joint], p[CYCLES + joint]
+    commanded, scale = t, p[SCALE + joint]
     t *= scale
     sine, cosine, shape = 0.0, 1.0, 1.0
     if cycles != 0.0:
@@ -140,7 +158,8 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     loaded = load if motor > 0.0 else -load
     sharp, slow = 1.0 / width, 1.0 / fading
     bump = bump_at(v * slow)
-    level = coulomb * (1.0 + rise * bump) + load * abs(motor)
+    raised = 1.0 + rise * bump
+    level = coulomb * raised + load * abs(motor)
     dry = asymmetry * v + level
     level_v = -2.0 * coulomb * rise * bump * v * slow * slow
     level_f = -level_v * v * slow
@@ -149,24 +168,24 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     passed = 1.0 - loaded * bend
     f = (2 * now + stage) * STAGE + joint * WIDE
     s = f + SLOPES
-    rows[f + at[c]], rows[s + at[c]] = -v, 1.0
-    rows[f + at[c + 2]], rows[s + at[c + 2]] = -(1.0 + rise * bump) * bend, (1.0 + rise * bump) * bent
-    rows[f + at[c + 4]] = -1.0
-    rows[f + at[c + 6]] = -dry * bend_w
-    rows[s + at[c + 6]] = -level * (bent + 2.0 * bend * bend_w) * sharp
-    rows[f + at[c + 8]], rows[s + at[c + 8]] = -coulomb * bump * bend, coulomb * bump * bent
-    rows[f + at[c + 10]], rows[s + at[c + 10]] = -level_f * bend, level_f * bent
+    rows[f + at[VISCOUS + joint]], rows[s + at[VISCOUS + joint]] = -v, 1.0
+    rows[f + at[COULOMB + joint]], rows[s + at[COULOMB + joint]] = -raised * bend, raised * bent
+    rows[f + at[OFFSET + joint]], rows[f + at[WIDTH + joint]] = -1.0, -dry * bend_w
+    rows[s + at[WIDTH + joint]] = -level * (bent + 2.0 * bend * bend_w) * sharp
+    rows[f + at[RISE + joint]], rows[s + at[RISE + joint]] = -coulomb * bump * bend, coulomb * bump * bent
+    rows[f + at[FADING + joint]], rows[s + at[FADING + joint]] = -level_f * bend, level_f * bent
     # Writing all this takes longer than working it out: what nobody asked for is left alone.
-    if at[c + 12] != NOWHERE:
-        rows[f + at[c + 12]], rows[s + at[c + 12]] = -abs(motor) * bend, abs(motor) * bent
-    if at[c + 14] != NOWHERE:
-        rows[f + at[c + 14]] = -v * bend
-    if min(at[c + 16], at[c + 18], at[c + 20]) < NOWHERE:
-        rows[f + at[c + 16]], rows[s + at[c + 16]] = t * sine * passed, t * sine * loaded * bent
-        rows[f + at[c + 18]], rows[s + at[c + 18]] = t * cosine * passed, t * cosine * loaded * bent
-        rows[f + at[c + 20]], rows[s + at[c + 20]] = q * turn * passed, q * turn * loaded * bent
-    if at[c + 24] != NOWHERE:
-        rows[f + at[c + 24]], rows[s + at[c + 24]] = commanded * shape * passed, commanded * shape * loaded * bent
+    if at[LOAD + joint] != NOWHERE:
+        rows[f + at[LOAD + joint]], rows[s + at[LOAD + joint]] = -abs(motor) * bend, abs(motor) * bent
+    if at[ASYMMETRY + joint] != NOWHERE:
+        rows[f + at[ASYMMETRY + joint]] = -v * bend
+    if min(at[SINE + joint], at[COSINE + joint], at[CYCLES + joint]) < NOWHERE:
+        rows[f + at[SINE + joint]], rows[s + at[SINE + joint]] = t * sine * passed, t * sine * loaded * bent
+        rows[f + at[COSINE + joint]], rows[s + at[COSINE + joint]] = t * cosine * passed, t * cosine * loaded * bent
+        rows[f + at[CYCLES + joint]], rows[s + at[CYCLES + joint]] = q * turn * passed, q * turn * loaded * bent
+    if at[SCALE + joint] != NOWHERE:
+        given = commanded * shape
+        rows[f + at[SCALE + joint]], rows[s + at[SCALE + joint]] = given * passed, given * loaded * bent
     for cause in range(2):
         rows[f + at[DELAY + cause]] = scale * shape * passed * dt[cause, joint]
         rows[s + at[DELAY + cause]] = scale * shape * loaded * bent * dt[cause, joint]

@@ -79,12 +79,16 @@ class FakeBus:
 
     @property
     def baud(self) -> int:
-        """The host's baud. Servos set to another one hear nothing and are not heard."""
+        """The host's baud. Servos set to another one make nothing of what they hear, and say nothing.
+
+        Set while a reply is on its way, what is left of it arrives as the garbage that a receiver makes of it.
+        """
         return self._wire.baud
 
     @baud.setter
     def baud(self, baud: int) -> None:
-        self._wire.baud = baud
+        if baud != self._wire.baud:
+            self._wire.change_baud(baud, self.clock.now())
 
     @property
     def servos(self) -> dict[int, Servo]:

@@ -8,7 +8,7 @@ Where the manual is silent:
 - To a broadcast Ping the servos answer one directly after the other by rising ID.
 - Two servos with one ID that answer at once are heard as nothing; both act on what they are told.
 - The status of a write to ID or Baud Rate still comes from the old ID at the old baud, and a Factory Reset's too.
-- A servo executes what is addressed to its Secondary ID and does not answer it.
+- A servo executes what is addressed to its Secondary ID and does not answer it; its EEPROM stays as it is.
 - In a fast read a servo that refuses sends its error and zeros.
 """
 
@@ -114,7 +114,7 @@ class Instructions:
         if packet.id in self._shadows:
             for servo in self._shadows[packet.id]:
                 if servo.id != packet.id and servo.heard_at == now:
-                    self._execute(servo, instruction, body, now)
+                    self._execute(servo, instruction, body, now, shadow=True)
         if instruction == Instruction.READ:
             if len(body) != 4:
                 self._address(packet.id, lambda _: (StatusError.DATA_LENGTH, b""), now, least_level=1)
@@ -143,8 +143,10 @@ class Instructions:
         elif answers:
             self._line.count_collision()
 
-    def _execute(self, servo: Servo, instruction: int, body: bytes, now: float) -> tuple[int, bytes]:
-        return servo.execute(instruction, body, now, self._line.is_moving(servo))
+    def _execute(
+        self, servo: Servo, instruction: int, body: bytes, now: float, *, shadow: bool = False
+    ) -> tuple[int, bytes]:
+        return servo.execute(instruction, body, now, self._line.is_moving(servo), shadow=shadow)
 
     def _read(self, servo: Servo, address: int, length: int) -> tuple[int, bytes]:
         self._line.measure(servo, address, length)
@@ -167,7 +169,8 @@ class Instructions:
         for at in range(4, len(body) - length, length + 1):
             for servo in writers.get(body[at], ()):
                 if servo.heard_at == now:
-                    servo.write(address, body[at + 1 : at + 1 + length])
+                    write = servo.write if servo.id == body[at] else servo.write_as_shadow
+                    write(address, body[at + 1 : at + 1 + length])
 
     def _bulk_write(self, body: bytes, now: float) -> None:
         at = 0
@@ -177,7 +180,7 @@ class Instructions:
             if len(data) == length:
                 for servo in self._writers.get(body[at], ()):
                     if servo.heard_at == now:
-                        servo.write(address, data)
+                        (servo.write if servo.id == body[at] else servo.write_as_shadow)(address, data)
             at += 5 + length
 
     def _sync_read(self, body: bytes, now: float) -> None:

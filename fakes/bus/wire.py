@@ -3,6 +3,8 @@
 from collections import deque
 from typing import NamedTuple
 
+from hil.fakes.bus.uart import heard
+
 BITS_PER_BYTE = 10
 
 ROUNDING_S = 1e-9
@@ -54,6 +56,19 @@ class Wire:
     def baud(self, baud: int) -> None:
         self._baud = baud
         self.byte_s = BITS_PER_BYTE / baud
+
+    def change_baud(self, baud: int, now: float) -> None:
+        """The host listens at another baud from `now` [s] on: what is still on its way comes as garbage."""
+        sent_baud, self.baud = self._baud, baud
+        kept: deque[Arriving] = deque()
+        for segment in self._arriving:
+            count = segment.count_by(now)
+            if count:
+                kept.append(segment._replace(data=segment.data[:count]))
+            starts = segment.first + (count - 1) * segment.byte_s
+            for byte, at in heard(segment.data[count:], sent_baud, baud):
+                kept.append(Arriving(bytes((byte,)), starts + at, self.byte_s))
+        self._arriving = deque(sorted(kept, key=lambda segment: segment.first))
 
     def put(self, data: bytes, start: float, late_s: float = 0.0) -> float:
         """A servo speaks from time `start`; the time at which it is done. `late_s`: how much longer the adapter takes.

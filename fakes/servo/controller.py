@@ -19,6 +19,7 @@ POSITION_MODE = 3
 EXTENDED_POSITION_MODE = 4
 CURRENT_POSITION_MODE = 5
 PWM_MODE = 16
+POSITION_MODES = frozenset({POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE})
 
 FULL_PWM = 885
 """Goal PWM at which the motor sees the whole supply voltage."""
@@ -140,7 +141,7 @@ class Controller:
     def _moving_status(self, position_ticks: float) -> int:
         """The register Moving Status. When the firmware calls a following error one is unsure."""
         goals = self.goals
-        if goals is None or goals.mode not in (POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE):
+        if goals is None or goals.mode not in POSITION_MODES:
             return 0
         status = _IN_POSITION if abs(goals.position - position_ticks) <= IN_POSITION_TICKS else 0
         if self.trajectory.velocity:

@@ -39,6 +39,8 @@ class ModelFacts:
     """Whether Present Current is the supply's current and not the motor's (330 series)."""
     indirect: tuple[tuple[int, int, int], ...] = ((168, 224, 28), (578, 634, 28))
     """Blocks of indirect addressing: first address register, first data register, how many."""
+    older_indirect: tuple[tuple[int, int, int], ...] | None = None
+    """The same before the firmware `INDIRECT_MOVED_FIRMWARE`, where it was elsewhere."""
 
 
 _Facts = RegisterFacts
@@ -46,6 +48,16 @@ _GAIN = (0, 16_383)
 _READ_ONLY = _Facts(writable=False)
 NEVER = 256
 """A firmware that no servo has."""
+
+INDIRECT_MOVED_FIRMWARE = 52
+"""From this firmware on the 330 series keeps its indirect data at 208.
+
+Source: dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have one control table for older
+330 servos, with the data at 224, and a second one named fw52, with the data at 208. The e-Manual knows 208 alone.
+"""
+
+REVERSES_ALL = ("XM540", "XH540", "XD540", "XW540", "XW430")
+"""Series whose Reverse Mode inverts velocity, current and PWM beside positions (e-Manual, Drive Mode, by series)."""
 
 X_SERIES: Mapping[str, RegisterFacts] = {
     "Model Number": _READ_ONLY,
@@ -152,6 +164,7 @@ FACTS: Mapping[str, ModelFacts] = {
         },
         nominal_voltage_v=5.0,
         indirect=((168, 208, 20),),
+        older_indirect=((168, 224, 20),),
     ),
     "XC330-T288": ModelFacts(
         1.0e-3,
@@ -172,6 +185,7 @@ FACTS: Mapping[str, ModelFacts] = {
         nominal_voltage_v=11.1,
         senses_supply=True,
         indirect=((168, 208, 20),),
+        older_indirect=((168, 224, 20),),
     ),
     "XL430-W250": ModelFacts(
         0.0,
@@ -213,3 +227,31 @@ STANDS_FOR: Mapping[str, str] = {
     "XC430-W240": "XL430-W250",
 }
 """Models without facts of their own, and the sister model whose factory values and ranges they are given: unsure."""
+
+_STRENGTH = (0, 1023)
+
+OTHER_SERIES: Mapping[str, Mapping[str, RegisterFacts]] = {
+    "XL320": {
+        "Baud Rate": _Facts(3, (0, 3)),
+        "Return Delay Time": _Facts(250, (0, 254)),
+        "CW Angle Limit": _Facts(0, _STRENGTH),
+        "CCW Angle Limit": _Facts(1023, _STRENGTH),
+        "Control Mode": _Facts(2, (1, 2)),
+        "Temperature Limit": _Facts(65, (0, 150)),
+        "Min Voltage Limit": _Facts(60, (50, 250)),
+        "Max Voltage Limit": _Facts(90, (50, 250)),
+        "Max Torque": _Facts(1023, _STRENGTH),
+        "Status Return Level": _Facts(2, (0, 2)),
+        "Shutdown": _Facts(3, (0, 7)),
+        "Torque Enable": _Facts(0, (0, 1)),
+        "LED": _Facts(0, (0, 7)),  # three bits: red, green, blue
+        "D Gain": _Facts(0, (0, 254)),
+        "I Gain": _Facts(0, (0, 254)),
+        "P Gain": _Facts(32, (0, 254)),
+        "Goal Position": _Facts(0, _STRENGTH),
+        "Moving Speed": _Facts(0, (0, 2047)),
+        "Torque Limit": _Facts(1023, _STRENGTH),
+        "Punch": _Facts(32, _STRENGTH),
+    }
+}
+"""Registers of models outside the X series' control table, as far as their page of the e-Manual gives them."""

@@ -6,6 +6,7 @@ from random import Random
 from struct import Struct
 
 from hil.drivers.packet import StatusError
+from hil.fakes.servo.controller import POSITION_MODE
 from hil.fakes.servo.encoder import Reading
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
@@ -22,6 +23,8 @@ _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 _REALTIME_TICK_WRAP = 32_768
 _REVERSE = 0x01  # of Drive Mode
+_MOST_HOMING_TICKS = 1024
+"""A Homing Offset beyond this is ignored in Position Control Mode (e-Manual, Homing Offset)."""
 _CLEAR_TURNS = b"\x01DXL\x22"
 
 # Realtime Tick, Moving, Moving Status, Present PWM; Present Current (or Load), Velocity, Position; the trajectories.
@@ -50,7 +53,9 @@ class Present:
         self.zero_ticks = zero_ticks
         self.direction = direction
         self.sign = direction
-        """+1 or -1: the servo's sense of rotation as it reports it, against the joint's."""
+        """+1 or -1: the sense of the servo's current, velocity and PWM against the joint's."""
+        self.position_sign = direction
+        """The same of its positions, which Reverse Mode inverts on every model."""
         self.jump_ticks = 0
         """By how much the encoder is wrong."""
         self._memory = memory
@@ -75,7 +80,8 @@ class Present:
     def derive(self, share: Share) -> None:
         """Take over what registers say; share: of time in which the bridge is on for a current and a velocity."""
         self._reversed = bool(self._memory.get("Drive Mode") & _REVERSE)
-        self.sign = -self.direction if self._reversed else self.direction
+        self.position_sign = -self.direction if self._reversed else self.direction
+        self.sign = self.position_sign if self._model.reverses_all else self.direction
         self._moving_threshold = self._memory.get("Moving Threshold")
         self._share = share
         self._shift_changed()
@@ -83,7 +89,7 @@ class Present:
     def power_up(self, now: float, position: float) -> None:
         """Count time and turns from here."""
         self._booted_at = now
-        self._forget_turns(position)
+        self.forget_turns(position)
 
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """The instruction Clear: forget the turns; the error number. Errors but Result Fail are unsure."""
@@ -93,13 +99,20 @@ class Present:
             return StatusError.DATA_RANGE
         if moving:
             return StatusError.RESULT_FAIL
-        self._forget_turns(position)
+        self.forget_turns(position)
         return StatusError.NONE
 
     def ticks(self, position: float) -> float:
         """Present Position at a joint angle [rad], before rounding and without noise."""
         ticks = self._encoder.steady(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
         return (TICKS_PER_TURN - ticks if self._reversed else ticks) + self._shift
+
+    def angle(self, ticks: float) -> float:
+        """The joint angle [rad] at a Present Position."""
+        ticks -= self._shift
+        if self._reversed:
+            ticks = TICKS_PER_TURN - ticks
+        return self.direction * (ticks - self.zero_ticks) / _TICKS_PER_RAD
 
     def velocity_ticks(self, velocity: float) -> float:
         """Present Velocity at a joint velocity [rad/s], before rounding."""
@@ -160,12 +173,18 @@ class Present:
         tick = int((now - self._booted_at) * self._clock_rate * 1000) % _REALTIME_TICK_WRAP
         self._memory.set("Realtime Tick", tick)
 
-    def _forget_turns(self, position: float) -> None:
+    def forget_turns(self, position: float) -> None:
+        """Reset Present Position to its value within one turn (before Homing Offset), the joint being at `position`."""
         self._turn_ticks = 0
         self._shift_changed()
-        raw = round(self.ticks(position)) - self._memory.get("Homing Offset")
+        raw = round(self.ticks(position)) - self._homing_ticks()
         self._turn_ticks = -(raw // TICKS_PER_TURN) * TICKS_PER_TURN
         self._shift_changed()
 
+    def _homing_ticks(self) -> int:
+        offset = self._memory.get("Homing Offset")
+        ignored = abs(offset) > _MOST_HOMING_TICKS and self._memory.get("Operating Mode") == POSITION_MODE
+        return 0 if ignored else offset
+
     def _shift_changed(self) -> None:
-        self._shift = self._turn_ticks + self._memory.get("Homing Offset")
+        self._shift = self._turn_ticks + self._homing_ticks()

@@ -2,8 +2,8 @@
 
 Addresses, sizes and signs come from `hil.drivers.control_table`; area, access, factory values and ranges from
 `hil.fakes.servo.model_facts`. Indirect addresses and data, Startup Configuration and Backup Ready, which the SDK's
-tables leave out, are added here from the e-Manual (pages x/<model>). On the 330 series the indirect data begin at 208,
-as that manual and the SDK's file for firmware 52 say; the SDK's file for older firmware says 224: unsure.
+tables leave out, are added here from the e-Manual (pages x/<model>). Where the 330 series keeps its indirect data
+depends on the firmware: see `hil.fakes.servo.model_facts.INDIRECT_MOVED_FIRMWARE`.
 
 A model outside the X series answers with what its table in the SDK says: its registers hold what is written to them,
 within their size, and its motor does not move.
@@ -14,7 +14,17 @@ from dataclasses import dataclass
 from functools import cache
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.fakes.servo.model_facts import FACTS, NEVER, STANDS_FOR, X_SERIES, ModelFacts, RegisterFacts
+from hil.fakes.servo.model_facts import (
+    FACTS,
+    INDIRECT_MOVED_FIRMWARE,
+    NEVER,
+    OTHER_SERIES,
+    REVERSES_ALL,
+    STANDS_FOR,
+    X_SERIES,
+    ModelFacts,
+    RegisterFacts,
+)
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud by the value of the register Baud Rate. The 330 models end at 4 M."""
@@ -60,6 +70,8 @@ class Model:
     senses_supply: bool
     indirect: tuple[tuple[int, int, int], ...]
     """Blocks of indirect addressing: first address register, first data register, how many."""
+    reverses_all: bool
+    """Whether Reverse Mode inverts velocity, current and PWM too, not positions alone."""
     registers: Mapping[str, Register]
 
 
@@ -72,19 +84,28 @@ def all_model_names() -> tuple[str, ...]:
     return (*MODEL_NAMES, *sorted(name for name in model_names().values() if name not in FACTS))
 
 
-@cache
-def load_model(name: str) -> Model:
-    """The control table of one model, e.g. "XM430-W350".
+DEFAULT_FIRMWARE = 48
+
+
+def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> Model:
+    """The control table of one model, e.g. "XM430-W350", as this firmware has it.
 
     Raises KeyError when no table describes the model; `all_model_names` lists those that are.
     """
+    return _load_model(name, firmware < INDIRECT_MOVED_FIRMWARE)
+
+
+@cache
+def _load_model(name: str, older: bool) -> Model:
     if name not in model_names().values():
         raise KeyError(name)
     facts = FACTS.get(STANDS_FOR.get(name, name))
-    return _x_series(name, facts) if facts is not None else _unknown(name)
+    if facts is None:
+        return _unknown(name)
+    return _x_series(name, facts, (facts.older_indirect or facts.indirect) if older else facts.indirect)
 
 
-def _x_series(name: str, facts: ModelFacts) -> Model:
+def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int], ...]) -> Model:
     table = {**X_SERIES, **facts.differs}
     addresses = load_control_table(name)
     registers = [
@@ -94,7 +115,7 @@ def _x_series(name: str, facts: ModelFacts) -> Model:
     ]
     known = {register.name for register in registers}
     registers += [_register(*added, False, table[added[0]]) for added in _ADDED if added[0] not in known]
-    registers += _indirect_registers(facts.indirect)
+    registers += _indirect_registers(indirect)
     return Model(
         name=name,
         number=addresses.number,
@@ -105,7 +126,8 @@ def _x_series(name: str, facts: ModelFacts) -> Model:
         resistance_ohm=facts.resistance_ohm,
         back_emf_v_s=facts.back_emf_v_s,
         senses_supply=facts.senses_supply,
-        indirect=facts.indirect,
+        indirect=indirect,
+        reverses_all=name.startswith(REVERSES_ALL),
         registers={register.name: register for register in sorted(registers, key=lambda r: r.address)},
     )
 
@@ -134,7 +156,7 @@ def _unknown(name: str) -> Model:
         if span & taken:
             continue  # the SDK's second name for the same bytes
         taken |= span
-        facts = RegisterFacts(
+        facts = OTHER_SERIES.get(name, {}).get(entry.name) or RegisterFacts(
             initial={"ID": 1, "Baud Rate": 1, "Status Return Level": 2}.get(entry.name, 0),
             limits=(0, 252) if entry.name == "ID" else None,
             writable=not entry.name.startswith(_NOT_WRITABLE),
@@ -151,6 +173,7 @@ def _unknown(name: str) -> Model:
         back_emf_v_s=1.0,
         senses_supply=False,
         indirect=(),
+        reverses_all=False,
         registers=registers,
     )
 

@@ -3,7 +3,9 @@
 What it does is written in the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent this
 module decides as follows, choosing what asks more of a client:
 
-- A write that covers several registers is checked as a whole; if one refuses, none is written.
+- A write that covers several registers asks each of them: those that can be written are, and the status has the error
+  of the first that refused. ROBOTIS' own example indirect_address writes Goal Position and an LED of 255 together and
+  waits until the servo moves.
 - A write must begin and end on register boundaries: in the middle of a register it is a Data Length error, at an
   undefined address an Access error. A read may begin inside a register; undefined bytes between two registers read 0,
   and a read that begins or ends at an undefined address is an Access error.
@@ -14,7 +16,9 @@ module decides as follows, choosing what asks more of a client:
 - At power-up, as after a change of Operating Mode, Goal Current and Goal PWM are at their limits: a client that enables
   torque in current mode without writing a goal first gets full current. Goal Velocity is 0.
 - When torque comes on, Goal Position becomes Present Position.
-- Reverse mode (Drive Mode bit 0) mirrors Present Position about half a turn.
+- Reverse mode (Drive Mode bit 0) mirrors positions about half a turn, on the 540 series and XW430 velocity, current and
+  PWM too.
+- Through the Secondary ID nothing of the EEPROM changes (e-Manual): writes, Factory Reset and Restore are ignored.
 
 A model without a current sensor (XL430-W250) has no current mode and reads a Present Load of 0.
 """
@@ -24,10 +28,11 @@ from random import Random
 
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.fakes.servo.backup import Backup, factory_reset
-from hil.fakes.servo.controller import CURRENT_MODE, Controller, Goals
+from hil.fakes.servo.controller import CURRENT_MODE, POSITION_MODE, POSITION_MODES, Controller, Goals
 from hil.fakes.servo.encoder import PERFECT, Encoder, Reading
 from hil.fakes.servo.health import Health, Overload, Thermal
 from hil.fakes.servo.memory import Memory
+from hil.fakes.servo.power import Powered
 from hil.fakes.servo.present import Present
 from hil.fakes.servo.registers import BAUD_RATES, Model, Register
 from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, WATCHDOG_TRIPPED, refusal
@@ -47,7 +52,7 @@ _TORQUE_ON_AT_BOOT = 0x01
 _RESTORE_AT_BOOT = 0x02
 
 
-class Servo:
+class Servo(Powered):
     """A servo on its own: registers, what may be done to them, and what the motor is told to do.
 
     Times are seconds on the bus's clock; what it is made with is said in `hil.fakes.description.FakeServo`.
@@ -75,7 +80,9 @@ class Servo:
         overload: Overload | None = None,
         seed: int = 0,
     ) -> None:
-        self.model = model
+        supply_v = model.nominal_voltage_v if input_voltage_v is None else input_voltage_v
+        health = Health(model.resistance_ohm, temperature_c, thermal, overload)
+        super().__init__(model, Memory(model), health, supply_v)
         self.firmware = firmware
         self.has_fast_reads = firmware >= model.fast_read_firmware
         """Whether it knows Fast Sync Read, Fast Bulk Read and Control Table Backup."""
@@ -85,7 +92,6 @@ class Servo:
         """When the last instruction packet reached it [s]; the Bus Watchdog counts from here."""
         self.ready_at = 0.0
         """When it has booted [s]; deaf before."""
-        self.memory = Memory(model)
         self.present = Present(
             *(self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a),
             Random(f"current {seed} {servo_id}") if current_noise_a else None,
@@ -93,13 +99,9 @@ class Servo:
             model.senses_supply if senses_supply is None else senses_supply,
         )
         self.controller = Controller()
-        self.health = Health(model.resistance_ohm, temperature_c, thermal, overload)
         self.motor_current_a = 0.0
         """Current that the motor is told to carry, in the joint's direction [A]."""
         self._voltage_limited = voltage_limited
-        self._input_voltage_v = model.nominal_voltage_v if input_voltage_v is None else input_voltage_v
-        self._sag_v = 0.0
-        self._dip_v = 0.0
         self._set_baud = baud
         self._registered: bytes | None = None
         self._backup = Backup()
@@ -191,8 +193,10 @@ class Servo:
             return
         if self._mode != CURRENT_MODE or self._voltage_limited:
             ticks = self.present.ticks(position)
-            wanted = self.controller.motor_current(self.model, self.supply_v, ticks, self.present.sign * velocity)
-            self.motor_current_a = self.present.sign * wanted
+            sign = self.present.position_sign if self._mode in POSITION_MODES else self.present.sign
+            self.motor_current_a = sign * self.controller.motor_current(
+                self.model, self.supply_v, ticks, sign * velocity
+            )
             self.present.tell_trajectory(*self.controller.state(ticks))
 
     # What a test asks of it
@@ -225,56 +229,15 @@ class Servo:
     def hardware_error(self) -> HardwareError:
         return HardwareError(self.memory.get("Hardware Error Status"))
 
-    @property
-    def supply_v(self) -> float:
-        """The voltage at the servo's plug [V]."""
-        return max(0.0, self._input_voltage_v - self._sag_v - self._dip_v)
-
-    @property
-    def input_voltage_v(self) -> float:
-        """The supply's voltage without load [V]."""
-        return self._input_voltage_v
-
-    @input_voltage_v.setter
-    def input_voltage_v(self, volt: float) -> None:
-        self._input_voltage_v = volt
-        self._check_health()
-        self._derive()
-
-    @property
-    def sag_v(self) -> float:
-        """What the load takes off the supply's voltage [V]."""
-        return self._sag_v
-
-    @sag_v.setter
-    def sag_v(self, volt: float) -> None:
-        self._sag_v = volt
-        if round(10 * self.supply_v) != self.memory.get("Present Input Voltage"):
-            self._check_health()
-            self._derive()
-
-    def dip(self, volt: float) -> None:
-        """Take so much off the supply's voltage [V]; 0 ends it."""
-        self._dip_v = volt
-        self._check_health()
-        self._derive()
-
-    @property
-    def temperature_c(self) -> float:
-        return self.health.temperature_c
-
-    @temperature_c.setter
-    def temperature_c(self, celsius: float) -> None:
-        self.health.temperature_c = celsius
-        self._check_health()
-        self._derive()
-
     # Instructions
 
-    def execute(self, instruction: int, body: bytes, now: float, moving: bool) -> tuple[int, bytes]:
+    def execute(
+        self, instruction: int, body: bytes, now: float, moving: bool, *, shadow: bool = False
+    ) -> tuple[int, bytes]:
         """Act on an instruction addressed to this servo; the error number (Alert bit aside) and the data of its status.
 
-        Read is not among them: the bus answers it with `read`, after measuring.
+        shadow: it was addressed by its Secondary ID. Read is not among the instructions: the bus answers it with
+        `read`, after measuring.
         """
         if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
             return StatusError.DATA_LENGTH, b""
@@ -284,13 +247,16 @@ class Servo:
             case Instruction.PING:
                 data = self.model.number.to_bytes(2, "little") + bytes((self.firmware,))
             case Instruction.WRITE:
-                error = self.write(body[0] | body[1] << 8, body[2:])
+                address = body[0] | body[1] << 8
+                error = self.write_as_shadow(address, body[2:]) if shadow else self.write(address, body[2:])
             case Instruction.REG_WRITE:
-                error = self._register_write(body)
+                error = self._register_write(body, shadow)
             case Instruction.ACTION:
                 error = self._act()
             case Instruction.REBOOT:
                 self.reboot(now)
+            case Instruction.FACTORY_RESET | Instruction.CONTROL_TABLE_BACKUP if shadow:
+                error = StatusError.ACCESS
             case Instruction.FACTORY_RESET:
                 error = factory_reset(self.memory, body)
                 if not error:
@@ -313,15 +279,23 @@ class Servo:
         """Write a stretch of the control table; the error number."""
         if address == _GOAL_CURRENT and len(data) == 2 and self._takes_goal_current:
             return self._write_goal_current(data)
+        return self._write_stretch(address, data, shadow=False)
+
+    def write_as_shadow(self, address: int, data: bytes) -> int:
+        """The same, addressed by its Secondary ID."""
+        return self._write_stretch(address, data, shadow=True)
+
+    def _write_stretch(self, address: int, data: bytes, *, shadow: bool) -> int:
         writes, error = self.memory.split(address, data)
-        for register, value in writes:
-            error = error or refusal(self.memory, self.model, register, value)
         if error:
             return error
         for register, value in writes:
-            self._write(register, value)
+            refused = refusal(self.memory, self.model, register, value, shadow)
+            if not refused:
+                self._write(register, value)
+            error = error or refused
         self._derive()
-        return StatusError.NONE
+        return error
 
     def _write(self, register: Register, value: int) -> None:
         self.memory.store(register, value)
@@ -330,8 +304,9 @@ class Servo:
             self._after[name]()
         elif name.startswith("Indirect Address"):
             self.memory.follow_indirect_addresses()
-        if name in GOALS and self.memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE:
+        if name in GOALS and self.memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE and not self.torque_enabled:
             self.memory.set("Torque Enable", 1)
+            self._forget_turns_in_position_mode()
             self._shut_down_if_masked()
 
     def _write_goal_current(self, data: bytes) -> int:
@@ -345,10 +320,10 @@ class Servo:
             self.motor_current_a = ticks * self._current_per_tick
         return StatusError.NONE
 
-    def _register_write(self, body: bytes) -> int:
+    def _register_write(self, body: bytes, shadow: bool) -> int:
         writes, error = self.memory.split(body[0] | body[1] << 8, body[2:])
         for register, value in writes:
-            error = error or refusal(self.memory, self.model, register, value)
+            error = error or refusal(self.memory, self.model, register, value, shadow)
         if not error:
             self._registered = body
             self.memory.set("Registered Instruction", 1)
@@ -366,13 +341,20 @@ class Servo:
     def _torque_enable_written(self) -> None:
         self._shut_down_if_masked()
         if self.torque_enabled and not self._torque:
+            self._forget_turns_in_position_mode()
             self._hold_position()
 
     def _operating_mode_written(self) -> None:
+        self._forget_turns_in_position_mode()
+        self.present.derive(self.supply_share)  # the mode decides whether Homing Offset counts
         self._reset_goals()
         for name in GAINS:
             if name in self.memory:
                 self.memory.set(name, self.memory.registers[name].initial)
+
+    def _forget_turns_in_position_mode(self) -> None:
+        if self.operating_mode == POSITION_MODE and self.model.operating_modes:
+            self.present.forget_turns(self._angle())
 
     def _reset_goals(self) -> None:
         for goal, limit in LIMIT_OF_GOAL.items():
@@ -385,26 +367,6 @@ class Servo:
         if self.model.operating_modes:
             self.memory.set("Goal Position", round(ticks))
         self.controller.start(ticks)
-
-    def _check_health(self) -> None:
-        """Compare supply and temperature with their limits; what is found stays in Hardware Error Status."""
-        memory = self.memory
-        decivolt, celsius = max(0, round(10 * self.supply_v)), max(0, min(255, round(self.temperature_c)))
-        memory.set("Present Input Voltage", decivolt)
-        memory.set("Present Temperature", celsius)
-        if not self.model.operating_modes:
-            return  # nothing is known of its limits
-        error = memory.value("Hardware Error Status")
-        if not memory.value("Min Voltage Limit") <= decivolt <= memory.value("Max Voltage Limit"):
-            error |= HardwareError.INPUT_VOLTAGE
-        if celsius > memory.value("Temperature Limit"):
-            error |= HardwareError.OVERHEATING
-        memory.set("Hardware Error Status", error)
-        self._shut_down_if_masked()
-
-    def _shut_down_if_masked(self) -> None:
-        if self.memory.get("Hardware Error Status") & self.memory.get("Shutdown"):
-            self.memory.set("Torque Enable", 0)
 
     def _derive(self) -> None:
         """Work out once, after any change, what every packet asks for."""

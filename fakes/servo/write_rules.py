@@ -24,10 +24,13 @@ WATCHDOG_TRIPPED = 0xFF
 _MULTI_TURN_LIMIT_TICKS = 256 * TICKS_PER_TURN
 
 
-def refusal(memory: Memory, model: Model, register: Register, value: int) -> int:
-    """Why this value may not be written to this register now; 0 when it may."""
+def refusal(memory: Memory, model: Model, register: Register, value: int, shadow: bool = False) -> int:
+    """Why this value may not be written to this register now; 0 when it may.
+
+    shadow: it came through the Secondary ID, which does not reach the EEPROM.
+    """
     name = register.name
-    if not register.writable or (register.eeprom and memory.get("Torque Enable")):
+    if not register.writable or (register.eeprom and (shadow or memory.get("Torque Enable"))):
         return StatusError.ACCESS
     in_range = register.minimum <= value <= register.maximum
     known = bool(model.operating_modes)

@@ -18,6 +18,7 @@ from hil.drivers.bus import BusConfig
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
+from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm
 from hil.fakes.table_errors import describe
 
@@ -185,20 +186,18 @@ class ExperimentConfig(_Table):
 class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
-    friction: Literal["auto", "coulomb", "stribeck", "stribeck_load"] = Field(
+    friction: Literal["auto"] | Friction = Field(
         "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
     )
-    drive: Literal["delay", "lag", "delay_lag"] = "lag"
-    presliding: bool = Field(False, description="dry friction that yields like a spring before it slides")
-    asymmetry: bool = Field(False, description="viscous friction that differs with direction")
-    ripple: bool = Field(False, description="torque ripple over the joint's angle")
-    zeros: bool = Field(False, description="errors of the joints' zeros; the first joint's shows only under gravity")
-    torque_scale: bool = Field(
-        False, description="the ratio of the joints' torque constants; one of them has to be believed"
-    )
+    drive: Drive = "lag"
+    presliding: bool = Field(False, description=OPTIONS["presliding"])
+    asymmetry: bool = Field(False, description=OPTIONS["asymmetry"])
+    ripple: bool = Field(False, description=OPTIONS["ripple"])
+    zeros: bool = Field(False, description=OPTIONS["zeros"])
+    torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
 
     @property
-    def fixed_friction(self) -> Literal["coulomb", "stribeck", "stribeck_load"]:
+    def fixed_friction(self) -> Friction:
         """What fits that make no choice take: "stribeck" where the file says "auto"."""
         return "stribeck" if self.friction == "auto" else self.friction
 

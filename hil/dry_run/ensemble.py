@@ -11,6 +11,7 @@ from hil.dry_run.prior import base_draws
 from hil.errors import RunFolderError
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import term_of
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,6 @@ many times farther than it was identified the model is to be trusted.
 _LEAST_SHARE = 0.05  # of its value, below which no draw of a positive parameter may fall
 _LEAST_WIDTH = 0.01  # rad/s of friction's step: narrower ones move the arm alike and take longer to simulate
 _MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2)
-_EITHER_SIGN = ("offset", "gravity", "delay", "coupling")
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ def nominal(result: dict[str, Any]) -> Physics:
 def _physical(drawn: dict[str, float], known: dict[str, Any]) -> dict[str, float]:
     """A draw moved into the range of real arms."""
     for name, value in drawn.items():
-        if not name.startswith(_EITHER_SIGN):
+        if term_of(name).range in {"positive", "floor"}:
             centre = abs(known[name]["value"])
-            least = _LEAST_WIDTH if name.startswith("coulomb_width") else 1e-9
+            least = _LEAST_WIDTH if term_of(name).range == "floor" else 1e-9
             drawn[name] = max(value, _LEAST_SHARE * centre, least)
     if "coupling" in drawn:
         most = _MOST_COUPLING * float(np.sqrt(drawn["inertia_1"] * drawn["inertia_2"]))

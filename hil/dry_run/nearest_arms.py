@@ -12,14 +12,12 @@ from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import scaled_feedback
 from hil.dry_run.rollout import commands_of, simulate_experiment
 from hil.estimator.models.parameters import CONSTANTS, Physics
+from hil.estimator.models.terms import term_of
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import feedback_of
 from hil.runs.recording import Phase
 
 Array = NDArray[np.float64]
-
-_TORQUES = ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb", "offset", "viscous_asymmetry")
-"""What doubles when all torques are twice as large as supposed."""
 
 
 def likely_arms(
@@ -47,6 +45,8 @@ def _as_supposed(physics: Physics, scale: Array) -> dict[str, float]:
     """The arm's parameters as one sees them who supposes torques 1 / `scale` (joints,) as large as they are."""
     known = dict(zip(CONSTANTS, physics.vector.tolist(), strict=True))
     supposed = {
-        name: value / float(scale[0]) if name.rstrip("_12") in _TORQUES else value for name, value in known.items()
+        # What doubles when all torques are twice as large as supposed.
+        name: value / float(scale[0]) if term_of(name).of_torque else value
+        for name, value in known.items()
     }
     return supposed | {"torque_scale_2": float(scale[-1] / scale[0]), "lag": physics.lag}

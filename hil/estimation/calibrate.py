@@ -1,6 +1,5 @@
 """`hil calibrate`: each joint's torque constant from two runs, one of them with a known mass bolted on."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
         for each, run in ((config, without), (other, with_mass))
     ]
     # The ratio of the torque constants is what the mass tells, and each of them.
-    model = replace(wanted_model(config.model, len(config.joints)), torque_scale=False)
+    model = wanted_model(config.model, len(config.joints)).without("torque_scale")
     first = identify(periods[0], model)
     found = calibrate(periods[0], periods[1], first, known, config.arm.gravity)
     return _described(config, found)

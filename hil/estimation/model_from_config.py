@@ -2,6 +2,7 @@
 
 from hil.config.schema import ModelConfig
 from hil.estimator.models.model import Model
+from hil.estimator.models.terms import OPTIONS
 
 
 def wanted_model(wanted: ModelConfig, joints: int) -> Model:
@@ -10,9 +11,5 @@ def wanted_model(wanted: ModelConfig, joints: int) -> Model:
         joints,
         wanted.fixed_friction,
         wanted.drive,
-        presliding=wanted.presliding,
-        asymmetry=wanted.asymmetry,
-        ripple=wanted.ripple,
-        zeros=wanted.zeros,
-        torque_scale=wanted.torque_scale,
+        {option for option in OPTIONS if getattr(wanted, option)},
     )

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.estimator.models.physical_parameters import UNITS, Known, physical_quantities
-from hil.estimator.models.regressor import RIGID_BODY
+from hil.estimator.models.physical_parameters import QUANTITY_UNITS, Known, physical_quantities
+from hil.estimator.models.terms import RIGID_BODY
 
 
 def physical_entries(result: Mapping[str, Any], known: Mapping[str, Known], gravity: float) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def physical_entries(result: Mapping[str, Any], known: Mapping[str, Known], grav
 
 def unit_of(name: str) -> str:
     """SI unit of a quantity by its name."""
-    return UNITS[name.rsplit("_", 1)[0]]
+    return QUANTITY_UNITS[name.rsplit("_", 1)[0]]
 
 
 def physical_lines(entries: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +77,7 @@ def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: flo
         estimate = choice.estimate
     else:
         # The encoders' zeros are each recording's own here.
-        model = replace(wanted_model(wanted, recordings[0].joints), zeros=False)
+        model = wanted_model(wanted, recordings[0].joints).without("zeros")
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
     result["warnings"] = any_warnings(recordings, estimate)

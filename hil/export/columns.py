@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from hil.export.source import Source
 
-UNITS = {
+COLUMN_UNITS = {
     "deadline": "s",
     "time_before_write": "s",
     "time_after_read": "s",
@@ -34,4 +34,4 @@ def columns(source: Source) -> dict[str, NDArray[np.generic]]:
 
 def unit(column: str) -> str:
     """The unit of a column; empty for counts."""
-    return UNITS.get(column.rstrip("0123456789").rstrip("_"), UNITS.get(column, ""))
+    return COLUMN_UNITS.get(column.rstrip("0123456789").rstrip("_"), COLUMN_UNITS.get(column, ""))

@@ -1,51 +1,20 @@
 """What a robot description has no place for, in words: said on the terminal and in the file, never dropped silently."""
 
 from hil.arm_model import ArmModel
+from hil.estimator.models.terms import term_of
 
-MEANING = {
-    "armature": "inertia of the rotor through the gears, seen by its own joint only",
-    "offset": "constant torque",
-    "coulomb_width": "width of the Coulomb step",
-    "stribeck_rise": "friction at low speed above Coulomb, as a fraction of it",
-    "stribeck_velocity": "velocity where that rise has fallen off",
-    "load": "friction per motor torque",
-    "presliding_stiffness": "of the spring as which dry friction yields before it slides",
-    "presliding_damping": "of that spring",
-    "viscous_asymmetry": "viscous friction that is more one way than the other",
-    "ripple_sin": "torque ripple over the angle, sine part",
-    "ripple_cos": "torque ripple over the angle, cosine part",
-    "ripple_cycles": "its cycles per turn",
-    "zero": "error of the joint's zero angle",
-    "lag": "time constant of the current loop",
-    "delay": "delay of the torque",
-}
-UNITS = {
-    "armature": "kg m^2",
-    "offset": "N m",
-    "coulomb_width": "rad/s",
-    "stribeck_rise": "",
-    "stribeck_velocity": "rad/s",
-    "load": "",
-    "presliding_stiffness": "N m/rad",
-    "presliding_damping": "N m s/rad",
-    "viscous_asymmetry": "N m s/rad",
-    "ripple_sin": "",
-    "ripple_cos": "",
-    "ripple_cycles": "",
-    "zero": "rad",
-    "lag": "s",
-    "delay": "s",
-}
+_SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
+"""Every robot description has a place for these, or `torque_constants` says them."""
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per parameter of the model that has a meaning here, unless the format has `carried` its kind."""
+    """One sentence per parameter of the model that no description has a place for, but for what this one `carried`."""
     said = []
     for name, value in model.values.items():
-        kind = name.rstrip("0123456789").rstrip("_")
-        if kind in MEANING and kind not in carried:
-            amount = f"{value:.6g} {UNITS[kind]}".rstrip()
-            said.append(f"{name} = {amount} ({MEANING[kind]})")
+        term = term_of(name)
+        if term.name not in (*_SAID_ELSEWHERE, *carried):
+            unit = "" if term.unit == "1" else f" {term.unit}"
+            said.append(f"{name} = {value:.6g}{unit} ({term.meaning})")
     return said
 
 

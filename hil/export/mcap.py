@@ -7,7 +7,7 @@ from typing import Any
 
 from hil import __version__, strict_json
 from hil.errors import ExportError, RunFolderError
-from hil.export.columns import UNITS
+from hil.export.columns import COLUMN_UNITS
 from hil.export.source import Source
 
 _WHOLE = ("phase", "segment", "period", "error", "missing")
@@ -66,6 +66,6 @@ def _schema() -> dict[str, Any]:
     properties: dict[str, Any] = {}
     for name in (*_SHARED, *_PER_JOINT):
         properties[name] = {"type": "integer"} if name in _WHOLE else {"type": ["number", "null"]}
-        if name in UNITS:
-            properties[name]["description"] = UNITS[name]
+        if name in COLUMN_UNITS:
+            properties[name]["description"] = COLUMN_UNITS[name]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "type": "object", "properties": properties}

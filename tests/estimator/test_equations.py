@@ -12,7 +12,8 @@ from hil.estimator.errors import ModelError, ShapeError
 from hil.estimator.fit.reparametrisation import Coordinates, scales_of
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
-from hil.estimator.models.regressor import inverse_dynamics, parameter_names, parameter_units, regressor
+from hil.estimator.models.regressor import inverse_dynamics, regressor
+from hil.estimator.models.terms import base_names, units_of
 from hil.estimator.simulation.arm import simulate
 from hil.estimator.simulation.drive import motor_torque
 
@@ -33,15 +34,15 @@ def test_regressor_gives_the_torque_of_the_written_equations(theta: np.ndarray, 
 
 
 def test_names_units_and_errors() -> None:
-    assert len(parameter_units(2)) == len(parameter_names(2)) == 12
-    assert parameter_names(1) == ("inertia_1", "gravity_1", "viscous_1", "coulomb_1", "offset_1")
+    assert len(units_of(base_names(2))) == len(base_names(2)) == 12
+    assert base_names(1) == ("inertia_1", "gravity_1", "viscous_1", "coulomb_1", "offset_1")
     assert Model(2, "stribeck_load", "lag").names[12:] == (
         *("coulomb_width_1", "coulomb_width_2", "stribeck_rise_1", "stribeck_rise_2"),
         *("stribeck_velocity_1", "stribeck_velocity_2", "load_1", "load_2", "lag"),
     )
     assert len(Model(2, "stribeck_load", "lag").units) == 21
     with pytest.raises(ModelError, match="3 joints"):
-        parameter_names(3)
+        base_names(3)
     with pytest.raises(ModelError, match="'dahl'"):
         Model(2, "dahl")  # type: ignore[arg-type]
     with pytest.raises(ShapeError):
@@ -126,7 +127,7 @@ def test_every_coordinate_is_a_physical_arm(x: np.ndarray) -> None:
 
 def test_simulation_obeys_inverse_dynamics() -> None:
     """Torques that inverse dynamics asks for along a chosen motion bring that motion about."""
-    names = parameter_names(2)
+    names = base_names(2)
     theta = np.array([0.018, 0.0033, 0.0028, 0.01, 0.55, 0.22, 0.045, 0.04, 0.055, 0.05, 0.004, -0.003])
     width, rate, steps, samples = 0.2, 400.0, 8, 400
     t = (np.arange(samples * steps) + 0.5) / (rate * steps)

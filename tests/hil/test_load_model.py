@@ -13,7 +13,8 @@ import pytest
 from hil import load_model
 from hil.arm_model import ArmModel
 from hil.errors import ResultError
-from hil.estimator.models.regressor import inverse_dynamics, parameter_names
+from hil.estimator.models.regressor import inverse_dynamics
+from hil.estimator.models.terms import base_names
 from hil.model_file import read_result
 from hil.runs.run_folder import RunFolder
 
@@ -25,7 +26,7 @@ def motions(shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
 
 def test_it_has_the_estimators_equations(identified: Path) -> None:
     model = load_model(identified)
-    names = parameter_names(2)
+    names = base_names(2)
     sharp = dataclasses.replace(model, values={name: model.values[name] for name in names})
     q, dq, ddq = motions((500, 2))
     theta = np.array([model.values[name] for name in names])

@@ -3,34 +3,12 @@
 import math
 from typing import Any
 
+from hil.estimator.models.terms import term_of
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import number, percent
 
 TWO_SIDED_95 = 1.96
-_MEANING = {
-    "inertia": "all that the joint turns",
-    "coupling": "how link 2's weight hangs on link 1",
-    "armature": "rotor through the gears",
-    "gravity": "weight, arm level",
-    "viscous": "friction per speed",
-    "coulomb": "dry friction",
-    "offset": "constant torque",
-    "coulomb_width": "width of the dry friction's step",
-    "stribeck_rise": "more dry friction at low speed",
-    "stribeck_velocity": "speed where that has fallen off",
-    "load": "friction per torque",
-    "presliding_stiffness": "how dry friction yields before it slides",
-    "presliding_damping": "of that yielding",
-    "viscous_asymmetry": "more friction one way",
-    "ripple_sin": "torque ripple over the angle",
-    "ripple_cos": "torque ripple over the angle",
-    "ripple_cycles": "of it per turn",
-    "zero": "error of the zero angle",
-    "torque_scale": "true over supposed torque, against joint 1",
-    "lag": "of the current loop",
-    "delay": "of the torque",
-}
 
 
 def parameters(data: RunData) -> Section:
@@ -57,7 +35,7 @@ def _row(name: str, entry: dict[str, Any], truth: dict[str, float]) -> tuple[str
     value, std = entry["value"], entry["std"]
     known = (number(truth[name]) if name in truth else "",) if truth else ()
     unit = "" if entry["unit"] == "1" else entry["unit"].replace("^2", "²")
-    meaning = _MEANING.get(name.rstrip("0123456789").rstrip("_"), "")
+    meaning = term_of(name).meaning
     if not math.isfinite(std):
         return (name, meaning, unit, number(value), "not determined", "", *known)
     relative = percent(std / abs(value)) if value else ""

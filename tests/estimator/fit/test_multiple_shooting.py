@@ -67,7 +67,7 @@ def test_a_motion_that_never_settles_gives_the_arm_and_honest_errors(ideal_arm: 
 
 def test_torque_constants_that_are_off_by_different_factors_are_told_apart(recording: Recording) -> None:
     believed = replace(recording, torque=recording.torque / np.array([[1.0], [1.1]]))
-    estimate = estimate_by_shooting([believed], Model(2, torque_scale=True), start(believed))
+    estimate = estimate_by_shooting([believed], Model(2, options={"torque_scale"}), start(believed))
     assert estimate.parameters["torque_scale_2"] == pytest.approx(1.1, rel=2e-3)
     assert np.all(estimate.residual_rms < 0.32 * STEP)
 

@@ -59,7 +59,7 @@ def test_friction_that_yields_before_it_slides_is_found_out(recorded: Recorder, 
     periods = [recorded(arm, wave(seed, (0.8, 0.42))) for seed in (1, 2)]
     choice = choose(periods[:1], periods[1], "lag")
     found = choice.estimate
-    assert found.model.presliding
+    assert "presliding" in found.model.options
     assert worst(found.parameters, arm) < 0.005
     assert found.residual_steps.max() <= 0.30
     assert choice.chosen.held_out is not None and choice.chosen.held_out.max() < 0.001
@@ -95,19 +95,19 @@ def test_two_runs_together_tell_more_than_one(
 
 def test_the_zeros_of_the_encoders_are_found(ideal_period: SettledPeriod) -> None:
     shifted = replace(ideal_period, position=ideal_period.position - np.array([[0.03], [-0.02]]))
-    found = identify(shifted, Model(2, zeros=True)).parameters
+    found = identify(shifted, Model(2, options={"zeros"})).parameters
     assert found["zero_1"] == pytest.approx(0.03, abs=2e-4)
     assert found["zero_2"] == pytest.approx(-0.02, abs=2e-4)
 
 
 def test_the_ratio_of_two_torque_constants_is_found(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
     believed = replace(ideal_period, torque=ideal_period.torque / np.array([[1.0], [1.1]]))
-    without, found = identify(believed, Model(2), hasty=True), identify(believed, Model(2, torque_scale=True))
+    without, found = identify(believed, Model(2), hasty=True), identify(believed, Model(2, options={"torque_scale"}))
     assert without.residual_steps.max() > 1.0, "no arm is like this one with equal torque constants"
     assert found.parameters["torque_scale_2"] == pytest.approx(1.1, rel=1e-3)
     assert worst(found.parameters, ideal_arm) < 0.002
     elsewhere = {name: 1.5 * value for name, value in found.parameters.items()}
-    again = identify(believed, Model(2, torque_scale=True), starts=[elsewhere])
+    again = identify(believed, Model(2, options={"torque_scale"}), starts=[elsewhere])
     assert again.parameters == pytest.approx(found.parameters, rel=0.01), "only a place to start"
 
 

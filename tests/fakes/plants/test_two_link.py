@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from hil.estimator.models.regressor import inverse_dynamics, parameter_names
+from hil.estimator.models.regressor import inverse_dynamics
+from hil.estimator.models.terms import base_names
 from hil.fakes.plants.arm import Arm, armature, base_parameters
 from hil.fakes.plants.pendulum import Pendulum
 from hil.fakes.plants.plant import make_plant
@@ -93,8 +94,8 @@ def test_plant_and_regressor_are_the_same_arm(
 
 
 def test_truth_has_the_estimators_names() -> None:
-    assert tuple(base_parameters(arm())) == parameter_names(2)
-    assert tuple(base_parameters(arm(1))) == parameter_names(1)
+    assert tuple(base_parameters(arm())) == base_names(2)
+    assert tuple(base_parameters(arm(1))) == base_names(1)
 
 
 @settings(max_examples=30, deadline=None)

@@ -24,14 +24,14 @@ def test_read_and_write(bench: Any) -> None:
     assert bench.read(1, 0, 2) == 1020
 
 
-def test_write_of_several_registers_is_whole_or_not_at_all(bench: Any) -> None:
+def test_write_of_several_registers_asks_each_of_them(bench: Any) -> None:
     address = (76).to_bytes(2, "little")
     gains = (100).to_bytes(2, "little") + (200).to_bytes(2, "little")
     assert bench.ask(1, Instruction.WRITE, address + gains).error == 0
     assert (bench.servo().value("Velocity I Gain"), bench.servo().value("Velocity P Gain")) == (100, 200)
-    too_much = (1).to_bytes(2, "little") + (16_384).to_bytes(2, "little")
+    too_much = (16_384).to_bytes(2, "little") + (7).to_bytes(2, "little")
     assert bench.ask(1, Instruction.WRITE, address + too_much).error == StatusError.DATA_RANGE
-    assert bench.servo().value("Velocity I Gain") == 100
+    assert (bench.servo().value("Velocity I Gain"), bench.servo().value("Velocity P Gain")) == (100, 7)
 
 
 @pytest.mark.parametrize(
@@ -163,12 +163,30 @@ def test_homing_offset_shifts_present_position(bench: Any) -> None:
     assert bench.read(1, 132, 4, signed=True) == -500
 
 
-def test_reverse_mode_turns_every_sign(bench: Any) -> None:
+@pytest.mark.parametrize(("model", "sign"), [("XM430-W350", 1), ("XL330-M288", 1), ("XM540-W270", -1)])
+def test_reverse_mode_turns_positions_and_by_series_all_else(make_bench: Make, model: str, sign: int) -> None:
+    bench = make_bench({"model": load_model(model)})
+    bench.plant.position[0] = 0.1
+    before = bench.read(1, 132, 4, signed=True)
     assert bench.write(1, 10, 1) == 0
+    assert bench.read(1, 132, 4, signed=True) == 4096 - before
     bench.plant.velocity[0] = 1.0
-    assert bench.read(1, 128, 4, signed=True) == -42
+    assert bench.read(1, 128, 4, signed=True) == sign * 42
     bench.arm(goal_ticks=100)
-    assert bench.servo().motor_current_a == pytest.approx(-0.269)
+    assert bench.servo().motor_current_a == pytest.approx(sign * 100 * load_model(model).current_unit_a)
+
+
+@pytest.mark.parametrize("mode", [3, 4, 5])
+def test_a_reversed_servo_moves_to_its_goal(make_bench: Make, mode: int) -> None:
+    bench = make_bench({"registers": {"Drive Mode": 1, "Operating Mode": mode}, "zero_ticks": 2048})
+    bench.plant.gain = 5.0
+    assert bench.write(1, 112, 100, 4) == 0
+    assert bench.write(1, 80, 2000, 2) == 0  # damping: the inertia on this bench has no friction
+    assert bench.write(1, 64, 1) == 0
+    assert bench.write(1, 116, 2148, 4) == 0
+    bench.wait(2.0)
+    assert bench.read(1, 132, 4, signed=True) == pytest.approx(2148, abs=40)
+    assert bench.plant.position[0] < -0.1
 
 
 def test_torque_on_by_goal_update(make_bench: Make) -> None:

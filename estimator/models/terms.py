@@ -1,0 +1,269 @@
+"""Every parameter that a model may hold, declared once: adding a term is one entry here and its equations.
+
+Fits, results, reports, exports and the configuration take names, units, words, ranges, initial guesses and scales from
+here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, joints from 1,
+and terms of the whole arm plainly `term`. Standard library only: what reads a result imports nothing heavy.
+"""
+
+import re
+from dataclasses import KW_ONLY, dataclass
+from functools import cache
+from typing import Literal, get_args
+
+from hil.estimator.errors import ModelError
+
+Friction = Literal["coulomb", "stribeck", "stribeck_load"]
+Drive = Literal["delay", "lag", "delay_lag"]
+Option = Literal["presliding", "asymmetry", "ripple", "zeros", "torque_scale"]
+Scope = Literal["arm", "joint"]
+Range = Literal["any", "positive", "floor", "share"]
+Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness"]
+
+FRICTIONS: tuple[Friction, ...] = get_args(Friction)
+"""Laws of dry friction; each holds the terms of those before it."""
+DRIVES: dict[Drive, tuple[str, ...]] = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
+"""The drive's terms."""
+OPTIONS: dict[Option, str] = {
+    "presliding": "dry friction that yields like a spring before it slides",
+    "asymmetry": "viscous friction that differs with direction",
+    "ripple": "torque ripple over the joint's angle",
+    "zeros": "errors of the joints' zeros; the first joint's shows only under gravity",
+    "torque_scale": "the ratio of the joints' torque constants; one of them has to be believed",
+}
+"""What a model may have besides its laws of friction and drive, each in words: keys of `[model]` too."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """One kind of parameter."""
+
+    name: str
+    """Without the joint's number."""
+    unit: str
+    """SI; "1" for a ratio."""
+    meaning: str
+    """A phrase for a person."""
+    _: KW_ONLY
+    part: str
+    """What of a model brings it: "base" (the linear regression's, always there), a law of FRICTIONS, one of OPTIONS or
+    a drive's term."""
+    scope: Scope = "joint"
+    first_joint: int = 1
+    """The first joint that has one: 2 for what is relative to joint 1 or contained in its other terms."""
+    range: Range = "positive"
+    """"any" sign; "positive"; above the fit's "floor" (a width); or a "share" of the geometric mean of `share_of`,
+    with either sign."""
+    share_of: tuple[str, str] | None = None
+    """Names of the two; for a term of each joint, terms of the same joint."""
+    scale: Scale | float = 1.0
+    """Size of a typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
+    initial: float = 0.0
+    """Initial guess where neither the regression nor the caller gives one [unit]."""
+    absent: float = 0.0
+    """What the simulation takes for it in a model without it [unit]: 1 for factors and divisors."""
+    max_step: float | None = None
+    """The most that its coordinate, a logarithm if it is positive, changes in one iteration; None: the fit's own."""
+    standstill: bool = False
+    """Whether it shapes friction near standstill, whose fit has local minima and is started from several guesses."""
+    replaced_by: str | None = None
+    """The option in whose presence the model does without it."""
+    simulated: bool = True
+    """Whether it is one of the constants of the equations of motion, and not of the torque before them."""
+
+    @property
+    def of_torque(self) -> bool:
+        """Whether it doubles when all torques are twice as large as assumed."""
+        return self.unit.startswith(("N m", "kg m^2"))
+
+
+_DECLARED = (
+    Term("inertia", "kg m^2", "all that the joint turns", part="base", scale="inertia"),
+    Term(
+        "coupling",
+        "kg m^2",
+        "first moment of link 2 times the length of link 1",
+        part="base",
+        scope="arm",
+        range="share",
+        share_of=("inertia_1", "inertia_2"),
+        scale="inertia",
+    ),
+    Term(
+        "armature",
+        "kg m^2",
+        "rotor inertia through the gears, seen by its own joint only",
+        part="base",
+        first_joint=2,
+        scale="inertia",
+        absent=1.0,
+    ),
+    Term("gravity", "N m", "weight torque with the arm level", part="base", range="any", scale="torque"),
+    Term("viscous", "N m s/rad", "friction per speed", part="base", scale="damping"),
+    Term("coulomb", "N m", "dry friction while sliding", part="base", scale="torque"),
+    Term("offset", "N m", "constant torque", part="base", range="any", scale="torque"),
+    Term(
+        "coulomb_width",
+        "rad/s",
+        "width of the step of dry friction",
+        part="coulomb",
+        range="floor",
+        scale=0.05,
+        absent=1.0,
+        standstill=True,
+        replaced_by="presliding",
+    ),
+    Term(
+        "stribeck_rise",
+        "1",
+        "dry friction at low speed above Coulomb, as a fraction of it",
+        part="stribeck",
+        initial=0.2,
+        max_step=1.0,
+        standstill=True,
+    ),
+    Term(
+        "stribeck_velocity",
+        "rad/s",
+        "speed at which that rise has fallen to 1/e",
+        part="stribeck",
+        scale="velocity",
+        initial=0.2,
+        absent=1.0,
+        max_step=1.0,
+        standstill=True,
+    ),
+    Term("load", "1", "dry friction per motor torque", part="stribeck_load", initial=0.02),
+    Term(
+        "presliding_stiffness",
+        "N m/rad",
+        "stiffness of dry friction before it slides",
+        part="presliding",
+        scale="stiffness",
+        standstill=True,
+    ),
+    Term(
+        "presliding_damping",
+        "N m s/rad",
+        "damping of dry friction before it slides",
+        part="presliding",
+        scale="damping",
+        standstill=True,
+    ),
+    Term(
+        "viscous_asymmetry",
+        "N m s/rad",
+        "viscous friction that differs with direction",
+        part="asymmetry",
+        range="share",
+        share_of=("viscous", "viscous"),
+        scale="damping",
+    ),
+    Term("ripple_sin", "1", "torque ripple over the angle, sine part", part="ripple", range="any", scale=0.02),
+    Term("ripple_cos", "1", "torque ripple over the angle, cosine part", part="ripple", range="any", scale=0.02),
+    Term("ripple_cycles", "1", "cycles of that ripple per turn", part="ripple", range="any", scale=0.02),
+    Term("zero", "rad", "true minus measured angle", part="zeros", range="any", scale=0.02),
+    Term(
+        "torque_scale",
+        "1",
+        "true over assumed torque, relative to joint 1",
+        part="torque_scale",
+        first_joint=2,
+        initial=1.0,
+        absent=1.0,
+    ),
+    Term(
+        "delay",
+        "s",
+        "delay of the torque",
+        part="delay",
+        scope="arm",
+        range="any",
+        scale=1e-3,
+        simulated=False,
+    ),
+    Term(
+        "lag",
+        "s",
+        "time constant of the current loop",
+        part="lag",
+        scope="arm",
+        scale=1e-3,
+        initial=1e-3,
+        simulated=False,
+    ),
+)
+TERMS: dict[str, Term] = {term.name: term for term in _DECLARED}
+"""The terms by name, in the order of every vector of parameters."""
+
+RIGID_BODY: dict[int, tuple[str, ...]] = {
+    1: ("inertia_1", "gravity_1"),
+    2: ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
+}
+"""The base parameters of the links, by the number of joints."""
+BASE_FRICTION = ("viscous", "coulomb", "offset")
+"""The other base terms, one of each joint."""
+
+
+def kind_of(name: str) -> str:
+    """The term of a parameter: its name without the joint's number."""
+    return _split(name)[0]
+
+
+def term_of(name: str) -> Term:
+    """What is declared of a parameter. Raises ModelError for a name that no model has."""
+    try:
+        return TERMS[kind_of(name)]
+    except KeyError:
+        raise ModelError(f"{name}: no model has this parameter") from None
+
+
+def joint_of(name: str) -> int | None:
+    """The joint, from 1, of a parameter; None for one of the whole arm."""
+    return _split(name)[1]
+
+
+def base_names(joints: int) -> tuple[str, ...]:
+    """Names of the base parameters, in the order of every vector of them. Raises ModelError."""
+    if joints not in RIGID_BODY:
+        raise ModelError(f"an arm of {joints} joints: the arm model has one or two")
+    friction = (f"{term}_{joint + 1}" for term in BASE_FRICTION for joint in range(joints))
+    return (*RIGID_BODY[joints], *friction)
+
+
+def extra_names(joints: int, parts: frozenset[str] | None = None) -> tuple[str, ...]:
+    """Names of what a model of these `parts` has beside the base parameters; by default of all that there is."""
+    return tuple(
+        name
+        for term in _DECLARED
+        if term.part != "base" and (parts is None or (term.part in parts and term.replaced_by not in parts))
+        for name in _names_of(term, joints)
+    )
+
+
+def constants() -> tuple[str, ...]:
+    """Names of the constants of the equations of motion of two joints, each term for joint 1 and then for joint 2."""
+    joints = (1, 2)
+    simulated = [term for term in _DECLARED if term.simulated and term.part != "base"]
+    per_joint = [*BASE_FRICTION, *(term.name for term in simulated if term.scope == "joint")]
+    return (
+        *RIGID_BODY[2],
+        *(f"{name}_{joint}" for name in per_joint for joint in joints),
+        *(term.name for term in simulated if term.scope == "arm"),
+    )
+
+
+def units_of(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Units of parameters."""
+    return tuple(term_of(name).unit for name in names)
+
+
+def _names_of(term: Term, joints: int) -> tuple[str, ...]:
+    if term.scope == "arm":
+        return (term.name,)
+    return tuple(f"{term.name}_{joint}" for joint in range(term.first_joint, joints + 1))
+
+
+@cache
+def _split(name: str) -> tuple[str, int | None]:
+    found = re.fullmatch(r"(.+?)_([1-9][0-9]*)", name)
+    return (found[1], int(found[2])) if found else (name, None)

@@ -1,0 +1,42 @@
+"""What a serial receiver makes of bytes that were sent at another baud than its own."""
+
+_IDLE = 1
+_STOP = 9  # of the ten bits of a byte: start, eight data bits, stop
+
+
+def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float]]:
+    """The bytes that come out of a receiver at `heard_baud` while `data` is sent at `sent_baud`, one after the other.
+
+    Each comes with the moment at which it is complete [s after the first start bit]. The receiver is a plain one: it
+    waits for a falling edge, looks into the middle of each bit, and passes bytes with a broken stop bit on, as USB
+    adapters do.
+    """
+    line = [bit for byte in data for bit in (0, *(byte >> index & 1 for index in range(8)), 1)]
+    ratio = sent_baud / heard_baud
+    """Bits on the line per bit of the receiver."""
+    received: list[tuple[int, float]] = []
+    at = 0.0
+    while (start := _falling_edge(line, at)) is not None:
+        if _level(line, start + 0.5 * ratio) == _IDLE:  # too short for a start bit
+            at = start + 0.5 * ratio
+            continue
+        bits = [_level(line, start + (1.5 + index) * ratio) for index in range(8)]
+        at = start + (_STOP + 0.5) * ratio
+        received.append((sum(bit << index for index, bit in enumerate(bits)), (start + 10 * ratio) / sent_baud))
+    return received
+
+
+def _falling_edge(line: list[int], at: float) -> float | None:
+    """Where the line, idle high before and behind the bits, next goes low at or after `at`."""
+    before = _level(line, at)
+    if before == 0 and at == int(at) and (at == 0 or line[int(at) - 1] == _IDLE):
+        return at
+    for index in range(int(at) + 1, len(line)):
+        if line[index] == 0 and line[index - 1] == _IDLE:
+            return float(index)
+    return None
+
+
+def _level(line: list[int], at: float) -> int:
+    index = int(at)
+    return line[index] if 0 <= index < len(line) else _IDLE
