@@ -67,7 +67,9 @@ def checked_arm(study: Study, run: int) -> Config:
 
 def _folder_bytes(config: Config) -> int:
     experiment = config.experiment
-    played = experiment.period * (experiment.periods + experiment.max_settling_periods) * (2 if experiment.held_out else 1)
+    played = (
+        experiment.period * (experiment.periods + experiment.max_settling_periods) * (2 if experiment.held_out else 1)
+    )
     return int(played * experiment.rate) * _SAMPLE_BYTES * (3 if experiment.pilot else 1) + _REPORT_BYTES
 
 

@@ -13,10 +13,9 @@ from hil.study.schema import EngineTable
 if TYPE_CHECKING:
     from distributed import Client
 
-ONE_THREAD = {
-    name: "1"
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "HIL_THREADS")
-}
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "HIL_THREADS"), "1"
+)
 """A worker is one process with one thread: of BLAS, of numba, and of ours."""
 
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")

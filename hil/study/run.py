@@ -77,7 +77,9 @@ def _opened(study: Study, out: Path, runs: int, resume: bool) -> Dataset:
     text = study.path.read_bytes()
     if copy.is_file():
         if not resume:
-            raise RunFolderError(f"{out} holds a study already: go on with --resume, or name another folder with --out.")
+            raise RunFolderError(
+                f"{out} holds a study already: go on with --resume, or name another folder with --out."
+            )
         if copy.read_bytes() != text:
             raise ConfigError(f"{study.path} is not the study that {out} holds ({copy} differs): it cannot be resumed.")
     elif resume and not out.is_dir():
@@ -110,7 +112,9 @@ def _work_through(
     waiting = specifications(study, out, numbers)
     window = max(1, len(client.scheduler_info()["workers"])) * (1 + _AHEAD)
     futures = as_completed(
-        [client.submit(work, spec, key=_key(spec), pure=False) for spec in islice(waiting, window)], with_results=True
+        [client.submit(work, spec, key=_key(spec), pure=False) for spec in islice(waiting, window)],
+        loop=client.loop,
+        with_results=True,
     )
     rows: list[Row] = []
     done, failed, began, written = runs - len(numbers), _failed(dataset), time.monotonic(), time.monotonic()
@@ -137,7 +141,9 @@ def _key(spec: Spec) -> str:
 
 def _failed(dataset: Dataset) -> int:
     table = dataset.table()
-    return sum(status != "done" for status in table.column("status").to_pylist()) if "status" in table.schema.names else 0
+    return (
+        sum(status != "done" for status in table.column("status").to_pylist()) if "status" in table.schema.names else 0
+    )
 
 
 def read_about(out: Path) -> dict[str, object]:

@@ -1,19 +1,19 @@
 """STUDY.toml: what to vary, what to run, what to keep, on which workers.
 
-    [study]
-    task = "identify"                    # identify, dry_run, estimate, empty
-    config = "fake_two_link"             # an arm's TOML, or a bundled one
-    runs = 200                           # rows; left out: every combination of the lists in [vary]
-    seed = 1
+[study]
+task = "identify"                    # identify, dry_run, estimate, empty
+config = "fake_two_link"             # an arm's TOML, or a bundled one
+runs = 200                           # rows; left out: every combination of the lists in [vary]
+seed = 1
 
-    [vary]                               # keys of the arm's TOML, list entries by number
-    "fake.seed" = { count = 1000 }       # the run's number, from 1000 on
-    "experiment.seed" = [1, 2, 3]
-    "fake.arm.drives.0.coulomb" = { log_uniform = [0.02, 0.1] }
-    "fake.arm.links.1.mass" = { normal = [0.2, 0.02] }
+[vary]                               # keys of the arm's TOML, list entries by number
+"fake.seed" = { count = 1000 }       # the run's number, from 1000 on
+"experiment.seed" = [1, 2, 3]
+"fake.arm.drives.0.coulomb" = { log_uniform = [0.02, 0.1] }
+"fake.arm.links.1.mass" = { normal = [0.2, 0.02] }
 
-    [keep]
-    columns = ["verdict.trust", "parameters.*.value"]
+[keep]
+columns = ["verdict.trust", "parameters.*.value"]
 """
 
 import tomllib
