@@ -18,6 +18,7 @@ from hil.cli import dry_run as cli_dry_run
 from hil.cli import init as cli_init
 from hil.cli import results as cli_results
 from hil.cli import runs as cli_runs
+from hil.cli import study as cli_study
 
 if TYPE_CHECKING:
     from hil.config.schema import Config
@@ -237,6 +238,7 @@ app.command("dry-run", epilog="Example: hil dry-run configs/first_time.toml --pi
 app.command(epilog="Example: hil runs runs")(cli_runs.runs)
 app.command(epilog='Example: hil note runs/20261121-153000-fake_two_link --text "new gearbox"')(cli_runs.note)
 app.command(epilog="Example: hil diff runs/before runs/after --png wear.png")(cli_runs.diff)
+app.command(epilog="Example: hil study studies/seeds.toml --workers 2")(cli_study.study)
 app.command(epilog="Example: hil compare runs/20261121-153000-fake_two_link")(cli_data.compare)
 app.command(epilog="Example: hil calibrate runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147")(
     cli_data.calibrate

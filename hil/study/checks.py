@@ -20,7 +20,7 @@ _LOOKED_AT = 32
 
 
 def check_study(study: Study, out: Path) -> int:
-    """How many runs it has; raises ConfigError for a field that does not exist or is not allowed, or too little disk."""
+    """How many runs it has; raises ConfigError for a field that does not exist, a bad value, or too little disk."""
     runs = run_count(study)
     if study.study.task in ("identify", "dry_run"):
         step = max(1, runs // _LOOKED_AT)
@@ -34,8 +34,8 @@ def check_study(study: Study, out: Path) -> int:
     free = shutil.disk_usage(_existing(out)).free
     if needed > free:
         raise ConfigError(
-            f"{study.path}: {runs} runs would write about {needed / 1e9:.3g} GB and {out} has {free / 1e9:.3g} GB free: "
-            "set keep.run_folders = false, or name another folder with --out."
+            f"{study.path}: {runs} runs would write about {needed / 1e9:.3g} GB, and {out} has {free / 1e9:.3g} GB "
+            "free: set keep.run_folders = false, or name another folder with --out."
         )
     return runs
 

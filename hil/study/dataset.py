@@ -84,12 +84,13 @@ def _alike(parts: list[pa.Table]) -> list[pa.Table]:
             if not pa.types.is_null(field.type):
                 kinds.setdefault(field.name, set()).add(field.type)
     mixed = {name for name, types in kinds.items() if len(types) > 1}
-    for index, part in enumerate(parts):
-        for name in mixed & set(part.column_names):
-            place = part.column_names.index(name)
-            part = part.set_column(place, name, part.column(name).cast(pa.string()))
-        parts[index] = part
-    return parts
+    return [_with_text(part, mixed & set(part.column_names)) for part in parts]
+
+
+def _with_text(part: pa.Table, names: set[str]) -> pa.Table:
+    for name in names:
+        part = part.set_column(part.column_names.index(name), name, part.column(name).cast(pa.string()))
+    return part
 
 
 def _number(path: Path) -> int:

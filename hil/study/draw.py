@@ -49,12 +49,14 @@ def _value(values: list[Scalar] | Draw, run: int, rng: np.random.Generator) -> S
     if values.count is not None:
         return values.count + run
     if values.uniform is not None:
-        return float(rng.uniform(*values.uniform))
+        low, high = values.uniform
+        return float(rng.uniform(low, high))
     if values.log_uniform is not None:
         low, high = values.log_uniform
         return exp(float(rng.uniform(log(low), log(high))))
     if values.normal is not None:
-        return float(rng.normal(*values.normal))
+        mean, std = values.normal
+        return float(rng.normal(mean, std))
     if values.integer is not None:
         return int(rng.integers(values.integer[0], values.integer[1] + 1))
     assert values.choice is not None  # one of them is given, as Draw checks
@@ -84,7 +86,8 @@ def arm_path(study: Study) -> Path:
 def put(values: dict[str, Any], key: str, value: Scalar) -> None:
     """Set `key`, such as "fake.arm.drives.0.coulomb", within `values`; raises KeyError with the part that is not there.
 
-    The last part may be new (a setting that the file leaves at its default), the tables before it may not.
+    Tables may be new (settings that the file leaves at their defaults; the arm's own check knows their names), entries
+    of lists may not.
     """
     *parents, last = key.split(".")
     place: Any = values
@@ -100,8 +103,8 @@ def put(values: dict[str, Any], key: str, value: Scalar) -> None:
 
 
 def _inside(place: Any, part: str) -> Any:
-    if isinstance(place, dict) and part in place:
-        return place[part]
+    if isinstance(place, dict):
+        return place.setdefault(part, {})
     if isinstance(place, list) and part.isdigit() and int(part) < len(place):
         return place[int(part)]
     raise KeyError(part)

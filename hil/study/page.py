@@ -47,4 +47,4 @@ def _histogram(table: pa.Table, name: str) -> list[float]:
     if high <= low:
         return [1.0 if index == _BINS // 2 else 0.0 for index in range(_BINS)]
     counted, _ = np.histogram(values, _BINS, (low, high))
-    return [float(each) for each in counted / counted.max()]
+    return [float(each) for each in counted / max(1, counted.max())]

@@ -7,8 +7,8 @@ import pytest
 
 from hil.config.csv_columns import load_csv_config
 from hil.estimation.csv_recording import read_csv
-from hil.estimator.data.recording import Recording
 from hil.estimator.baselines.signs import Signs, suspect_signs
+from hil.estimator.data.recording import Recording
 from tests.support.paths import CONFIGS, DATA
 
 
