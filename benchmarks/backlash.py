@@ -8,13 +8,14 @@ Play [rad] is from flank to flank, on both joints, between a rotor of its own an
 
 import argparse
 import json
+import math
 import tempfile
 from pathlib import Path
-from typing import Any
 
 from hil.config.schema import load_config
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
+from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
@@ -36,15 +37,16 @@ def measure(play: float, presliding: bool) -> dict[str, float]:
     return figures(result)
 
 
-def figures(result: dict[str, Any]) -> dict[str, float]:
-    found, truth = result["parameters"], result["truth"]
-    errors = {name: abs(found[name]["value"] / true - 1.0) for name, true in truth.items() if true}
+def figures(result: SettledResult) -> dict[str, float]:
+    found, truth = result.parameters, result.truth
+    assert truth is not None  # the arm is a fake one
+    errors = {name: abs(found[name].value / true - 1.0) for name, true in truth.items() if true}
     worst = {
         f"{group}_error": max(error for name, error in errors.items() if name.split("_")[0] in kinds)
         for group, kinds in GROUPS.items()
     }
-    over = {"residual_over_floor": max(result["validation"]["residual_over_floor"])}
-    return {**worst, **over, "held_out_rms": max(result["validation"]["held_out_rms"])}
+    over = {"residual_over_floor": max(result.validation.residual_over_floor or [math.nan])}
+    return {**worst, **over, "held_out_rms": max(result.validation.held_out_rms or [math.nan])}
 
 
 def main() -> None:

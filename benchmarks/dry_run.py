@@ -32,7 +32,9 @@ from hil.dry_run.prior import quantities
 from hil.dry_run.waves import design_problem, plain_wave
 from hil.errors import NotSettled, SafetyStop
 from hil.experiment.run import run_experiment
+from hil.model_file import read_result
 from hil.pilot import identify_in_steps
+from hil.results.result import Result
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
@@ -185,12 +187,12 @@ def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
             except SafetyStop:
                 touched += 1
                 continue
-            pilot = json.loads((folder / "run" / "pilot-1" / "result.json").read_text(encoding="utf-8"))
-        seen, median = (np.array(result["steps"][-1][name]) for name in ("seen", "predicted_median"))
+            pilot = read_result(folder / "run" / "pilot-1")
+        seen, median = map(np.array, (result.steps[-1].seen, result.steps[-1].predicted_median))
         allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
         used.append(float(((seen[1] - seen[0]) / allowed).min()))
         ratios.append(worst_relative_std(pilot) / worst_relative_std(result))
-        least.append(min(pilot["parameters"][n]["std"] / e["std"] for n, e in result["parameters"].items()))
+        least.append(min(pilot.parameters[n].std / e.std for n, e in result.parameters.items()))
         rest = np.array(config.arm.rest_pose)
         moved = np.stack((seen[0] - rest, seen[1] - rest, seen[2]))
         foreseen = np.stack((median[0] - rest, median[1] - rest, median[2]))
@@ -205,11 +207,11 @@ def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
     }
 
 
-def worst_relative_std(result: dict[str, Any]) -> float:
+def worst_relative_std(result: Result) -> float:
     """Over the base parameters; an offset counts against its joint's dry friction, since it may be zero."""
-    entries = result["parameters"]
-    against = {name: entries[name.replace("offset", "coulomb")]["value"] for name in entries}
-    return max(entry["std"] / abs(against[name]) for name, entry in entries.items())
+    entries = result.parameters
+    against = {name: entries[name.replace("offset", "coulomb")].value for name in entries}
+    return max(entry.std / abs(against[name]) for name, entry in entries.items())
 
 
 def design_study(seeds: int = 2) -> dict[str, Any]:

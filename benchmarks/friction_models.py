@@ -54,7 +54,8 @@ def worst_of_seeds(name: str, seeds: int) -> dict[str, Any]:
                 stopped += 1
                 continue
             runs.append(figures(result))
-            chosen[result["model_choice"]["chosen"]] += 1
+            if result.model_choice is not None:
+                chosen[result.model_choice.chosen] += 1
     worst = {key: max(run[key] for run in runs) for key in runs[0]}
     return {**worst, "seeds_stopped_by_guard": stopped, "chosen": dict(chosen)}
 

@@ -9,6 +9,7 @@ guard stopped, because their phases swing the arm past a limit. `demo_seconds` i
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from hil.config.schema import Config, load_config
 from hil.errors import SafetyStop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
+from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -33,26 +35,27 @@ GROUPS = {
 }
 
 
-def identify(config: Config) -> dict[str, Any]:
+def identify(config: Config) -> SettledResult:
     with tempfile.TemporaryDirectory() as folder:
         run = RunFolder.create(Path(folder) / "run", config)
         run_experiment(config, run, config.path, lambda _: None)
         return estimate_run(run)
 
 
-def figures(result: dict[str, Any]) -> dict[str, float]:
-    found, truth = result["parameters"], result["truth"]
+def figures(result: SettledResult) -> dict[str, float]:
+    found, truth = result.parameters, result.truth
+    assert truth is not None  # the arm is a fake one
     worst = {
-        f"{group}_error": max(abs(found[name]["value"] / truth[name] - 1) for name in names)
+        f"{group}_error": max(abs(found[name].value / truth[name] - 1) for name in names)
         for group, names in GROUPS.items()
     }
-    offsets = max(abs(found[n]["value"] - truth[n]) / found[n]["std"] for n in ("offset_1", "offset_2"))
+    offsets = max(abs(found[n].value - truth[n]) / found[n].std for n in ("offset_1", "offset_2"))
     return {
         **worst,
         "offset_error_in_std": offsets,
-        "residual_ticks": max(result["fit"]["residual_rms_ticks"]),
-        "held_out_rms": max(result["validation"]["held_out_rms"]),
-        "estimation_seconds": result["timing"]["estimation_seconds"],
+        "residual_ticks": max(result.fit.residual_rms_ticks),
+        "held_out_rms": max(result.validation.held_out_rms or [math.nan]),
+        "estimation_seconds": result.timing.estimation_seconds,
     }
 
 

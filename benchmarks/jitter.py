@@ -8,9 +8,9 @@ estimated twice: as it is, and with its times put back to the deadlines, as if n
 
 import argparse
 import json
+import math
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from hil.drivers.rate import FixedRate, Tick
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment import stream
 from hil.experiment.run import run_experiment
+from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
@@ -44,14 +45,15 @@ def forget_real_times(run: RunFolder, joints: int) -> None:
     np.save(run.samples_path, samples, allow_pickle=False)
 
 
-def figures(result: dict[str, Any]) -> dict[str, float]:
-    found, truth = result["parameters"], result["truth"]
-    errors = {name: abs(found[name]["value"] / true - 1.0) for name, true in truth.items() if true}
+def figures(result: SettledResult) -> dict[str, float]:
+    found, truth = result.parameters, result.truth
+    assert truth is not None  # the arm is a fake one
+    errors = {name: abs(found[name].value / true - 1.0) for name, true in truth.items() if true}
     worst = max((name for name in errors if not name.startswith("offset")), key=lambda name: errors[name])
     return {
         "worst_error": errors[worst],
-        "residual_ticks": max(result["fit"]["residual_rms_ticks"]),
-        "held_out_rms": max(result["validation"]["held_out_rms"]),
+        "residual_ticks": max(result.fit.residual_rms_ticks),
+        "held_out_rms": max(result.validation.held_out_rms or [math.nan]),
     }
 
 

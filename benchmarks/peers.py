@@ -21,13 +21,14 @@ import json
 import os
 import statistics
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from machine import machine
 
 from hil.config.schema import load_config
-from hil.estimation.compare import OURS, OURS_PLAIN, compare_run
+from hil.estimation.compare import OURS, OURS_PLAIN, MethodResult, compare_run
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
 
@@ -37,7 +38,7 @@ TIMES = 3  # of which every method's median time counts
 KEYS = ("seconds", "worst_relative_error", "held_out_rms")
 
 
-def measure(name: str, seed: int, mujoco: bool) -> dict[str, Any]:
+def measure(name: str, seed: int, mujoco: bool) -> dict[str, MethodResult]:
     config = load_config(CONFIGS / RECORDINGS[name])
     experiment = config.experiment.model_copy(update={"seed": seed})
     config = config.model_copy(update={"experiment": experiment})
@@ -45,10 +46,11 @@ def measure(name: str, seed: int, mujoco: bool) -> dict[str, Any]:
         run = RunFolder.create(Path(folder) / "run", config)
         run_experiment(config, run, config.path, lambda _: None)
         compare_run(run, mujoco=False)  # compiles
-        runs = [compare_run(run, mujoco)["methods"] for _ in range(TIMES)]
-    for method, entry in runs[0].items():
-        entry["seconds"] = statistics.median(each[method]["seconds"] for each in runs)
-    return runs[0]
+        runs = [compare_run(run, mujoco).methods for _ in range(TIMES)]
+    return {
+        method: replace(found, seconds=statistics.median(each[method].seconds for each in runs))
+        for method, found in runs[0].items()
+    }
 
 
 def installed() -> bool:
@@ -73,23 +75,29 @@ def main() -> None:
         show(name, methods)
 
 
-def _by_key(methods: dict[str, Any]) -> dict[str, Any]:
-    return {key: {name: entry[key] for name, entry in methods.items()} for key in KEYS}
+def _by_key(methods: dict[str, MethodResult]) -> dict[str, Any]:
+    return {key: {name: getattr(entry, key) for name, entry in methods.items()} for key in KEYS}
 
 
-def show(recording: str, methods: dict[str, Any]) -> None:
+def worst(found: MethodResult) -> float:
+    """Relative error of the worst parameter; every arm here is a fake one."""
+    assert found.worst_relative_error is not None
+    return found.worst_relative_error
+
+
+def show(recording: str, methods: dict[str, MethodResult]) -> None:
     print(f"\n{recording:14s} {'seconds':>8s} {'worst error':>12s} {'of':12s} {'held out':>9s}  settings")
     for name, entry in methods.items():
-        held_out = entry["held_out_rms"]
+        held_out = entry.held_out_rms
         shown = "-" if held_out is None else f"{100 * held_out:.3f} %"
         print(
-            f"{name:14s} {entry['seconds']:8.3f} {100 * entry['worst_relative_error']:10.3f} % "
-            f"{entry['worst_parameter']:12s} {shown:>9s}  {entry['settings']}"
+            f"{name:14s} {entry.seconds:8.3f} {100 * worst(entry):10.3f} % "
+            f"{entry.worst_parameter:12s} {shown:>9s}  {entry.settings}"
         )
-    others = [entry["worst_relative_error"] for name, entry in methods.items() if name not in {OURS, OURS_PLAIN}]
-    print(f"best of the others over ours: {min(others) / methods[OURS]['worst_relative_error']:.1f} in worst error")
+    others = [worst(entry) for name, entry in methods.items() if name not in {OURS, OURS_PLAIN}]
+    print(f"best of the others over ours: {min(others) / worst(methods[OURS]):.1f} in worst error")
     if "mujoco_sysid" in methods:
-        seconds = {name: methods[name]["seconds"] for name in (OURS, OURS_PLAIN, "mujoco_sysid")}
+        seconds = {name: methods[name].seconds for name in (OURS, OURS_PLAIN, "mujoco_sysid")}
         ratios = (seconds["mujoco_sysid"] / seconds[name] for name in (OURS, OURS_PLAIN))
         print("mujoco.sysid over ours in time: {:.1f}, with Coulomb friction {:.1f}".format(*ratios))
 

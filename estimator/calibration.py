@@ -22,14 +22,12 @@ from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.fit.reparametrisation import Coordinates
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import term_of
+from hil.estimator.options import CalibrationOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
 
-ANGLE_SCALE = 0.1  # rad
-DIFFERENCE = 1e-6  # of a coordinate, all of the size of 1
-FINE = 1e-6
-WIDTH_FLOOR = 3e-4  # rad/s
-STARTING_WIDTH = 0.005  # rad/s: under a wrong torque constant the first estimate's is worth nothing
+DEFAULTS = CalibrationOptions()
 ADDED = {
     1: ("gravity_1", "inertia_1"),
     2: ("gravity_2", "inertia_2", "coupling", "gravity_1", "inertia_1"),
@@ -84,17 +82,34 @@ class Calibration:
 
 
 def calibrate(
-    without: SettledPeriod, with_mass: SettledPeriod, first: Estimate, known: KnownMass, gravity: float
+    without: SettledPeriod,
+    with_mass: SettledPeriod,
+    first: Estimate,
+    known: KnownMass,
+    gravity: float,
+    options: CalibrationOptions = DEFAULTS,
 ) -> Calibration:
     """Torque constants of all joints from two settled periods.
 
-    `first`: the estimate of `without` under the supposed torque constants, its model used for both. Raises
-    ModelError when the periods differ in joints, ConvergenceError.
+    Args:
+        without: the arm as it is.
+        with_mass: the arm with the mass.
+        first: the estimate of `without` under the assumed torque constants; its model is used for both.
+        known: the mass.
+        gravity: in the arm's plane [m/s^2].
+        options: tolerances and limits.
+
+    Returns:
+        Factors of the torque constants, and the arm's parameters in true units.
+
+    Raises:
+        ModelError: when the periods differ in joints.
+        ConvergenceError: when the fit does not converge.
     """
     if without.joints != with_mass.joints:
         raise ModelError(f"one run has {without.joints} joints and the other {with_mass.joints}: they must agree")
-    problem = _Problem((without, with_mass), first, known.change(gravity, without.joints))
-    minimum = minimise(problem.evaluate, problem.start(), FINE)
+    problem = _TwoRuns((without, with_mass), first, known.change(gravity, without.joints), options)
+    minimum = minimise(problem.evaluate, problem.start(), options.ftol, options=options.minimiser)
     x, joints = minimum.x, without.joints
     samples = sum(int(period.valid.sum()) for period in problem.periods)
     variance = minimum.at.cost / max(1, samples - x.size)
@@ -122,20 +137,27 @@ def calibrate(
     )
 
 
-class _Problem:
+class _TwoRuns:
     """Residuals of both periods: log factors, the parameters' coordinates, the two starting states."""
 
-    def __init__(self, periods: tuple[SettledPeriod, SettledPeriod], first: Estimate, change: dict[str, float]) -> None:
+    def __init__(
+        self,
+        periods: tuple[SettledPeriod, SettledPeriod],
+        first: Estimate,
+        change: dict[str, float],
+        options: CalibrationOptions,
+    ) -> None:
+        self._options = options
         self.periods = periods
         self.size = len(first.names)
         self._first = first
         self._change = np.array([change.get(name, 0.0) for name in first.names])
         scales = np.maximum(np.abs(first.value), 1e-6)
-        either = [name.startswith(("gravity", "offset", "delay")) for name in first.names]
+        either = [term_of(name).range == "any" for name in first.names]
         scales[either] = np.maximum(scales[either], 1e-3)
-        self.coordinates = Coordinates(first.names, scales, WIDTH_FLOOR)
+        self.coordinates = Coordinates(first.names, scales, options.coordinates)
         velocity = float(np.sqrt(np.mean(np.gradient(first.position, 1.0 / periods[0].rate, axis=1) ** 2)))
-        self._state_scale = np.repeat([ANGLE_SCALE, velocity], periods[0].joints)
+        self._state_scale = np.repeat([options.angle_scale, velocity], periods[0].joints)
 
     def start(self) -> Array:
         """From the first run's estimate; the second begins where it was measured to."""
@@ -143,8 +165,8 @@ class _Problem:
         filled = self.periods[1].filled()
         value = self._first.value.copy()
         for i, name in enumerate(self._first.names):
-            if name.startswith("coulomb_width"):
-                value[i] = STARTING_WIDTH
+            if term_of(name).range == "floor":
+                value[i] = self._options.initial_width
         speed = (filled[:, 2] - filled[:, -2]) * rate / 4.0
         return np.concatenate(
             (
@@ -159,10 +181,11 @@ class _Problem:
         """The sum of squares at `x` with its normal equations, by finite differences."""
         here = self.residual(x)
         jacobian = np.empty((here.size, x.size))
+        difference = self._options.difference
         for index in range(x.size):
             there = x.copy()
-            there[index] += DIFFERENCE
-            jacobian[:, index] = (self.residual(there) - here) / DIFFERENCE
+            there[index] += difference
+            jacobian[:, index] = (self.residual(there) - here) / difference
         if not (np.all(np.isfinite(here)) and np.all(np.isfinite(jacobian))):
             return Quadratic(np.inf, np.eye(x.size), np.zeros(x.size))
         return Quadratic(float(np.sum(here * here)), *normal_equations(jacobian, here))

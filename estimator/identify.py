@@ -1,7 +1,7 @@
 """The estimator's front door: a settled period in, parameters with standard errors and predictions out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,12 +12,12 @@ from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.fit.stage2 import fit_runs
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
+from hil.estimator.options import LikelihoodOptions, SettlingOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
 
-MOST_PERIODS = 50  # simulated until the motion is periodic
-PERIODIC = 1e-7  # rad and rad/s, from one period's end to the next
-NEARLY = 1e-5  # what is good enough where that is not reached: far below any encoder's step
+LIKELIHOOD = LikelihoodOptions()
+SETTLING = SettlingOptions()
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,6 @@ class Estimate:
     """(parameters,) [SI]."""
     covariance: Array
     """(parameters, parameters)."""
-    linear_value: Array
-    """Stage 1's base parameters (base parameters,) [SI]."""
-    linear_std: Array
-    """Stage 1's standard errors, which count its residual as white."""
     start: Array
     """Angles and velocities at the first sample (2, joints) [rad, rad/s]."""
     position: Array
@@ -57,9 +53,7 @@ class Estimate:
     iterations: int
     """Simulations with derivatives that the likelihood took."""
     outliers: int = 0
-    """Samples left out or weighed down because they are far from their neighbours or from the model."""
-    white_std: Array = field(default_factory=lambda: np.zeros(0))
-    """What `std` would be if every sample's error were independent and of the known noise (parameters,)."""
+    """Samples left out or downweighted because they are far from their neighbours or from the model."""
     correlation_time: float = 1.0
     """Samples over which the residual is seen to be correlated; 1 is white. `covariance` allows for more."""
 
@@ -85,16 +79,29 @@ def identify(
     periods: SettledPeriod | Sequence[SettledPeriod],
     model: Model,
     *,
-    hasty: bool = False,
+    coarse: bool = False,
     starts: Sequence[Mapping[str, float]] = (),
+    options: LikelihoodOptions = LIKELIHOOD,
 ) -> Estimate:
-    """Estimate the parameters of `model` from one settled period, or from several of one arm together:
-    regression on their lines, then maximum likelihood.
+    """Estimate the parameters of `model`: regression on Fourier lines, then maximum likelihood.
 
-    The same periods give the same numbers to the last digit. `hasty` is for trying models: one that leaves much
-    more than the noise is not fitted to its last digits. `starts`: parameters by name, of another experiment or of
-    arms like this one; more places to start from, nothing more. Raises ModelError when `model` has another
-    number of joints than a period, UnidentifiableError and ConvergenceError.
+    The same periods give the same numbers to the last digit.
+
+    Args:
+        periods: one settled period, or several of one arm, which are fitted together.
+        model: what the motion is explained with.
+        coarse: for trying models: one that leaves much more than the noise is not fitted to its last digits.
+        starts: parameters by name [SI], of another experiment or of arms like this one; further initial guesses,
+            nothing more.
+        options: tolerances and limits of the likelihood.
+
+    Returns:
+        Parameters with standard errors, simulated motion and residual of the first period.
+
+    Raises:
+        ModelError: when `model` has another number of joints than a period.
+        UnidentifiableError: when the motion does not tell parameters apart.
+        ConvergenceError: when no initial guess leads to a minimum.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:
@@ -102,7 +109,7 @@ def identify(
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(*used)
-    fit = fit_runs(used, model, linear, hasty=hasty, starts=starts)
+    fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, options=options)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
         model,
@@ -110,28 +117,42 @@ def identify(
         model.units,
         fit.value,
         fit.covariance,
-        linear.value,
-        linear.std,
         fit.starts[0],
         fit.positions[0],
         np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
         used[0].position_step,
         fit.iterations,
         fit.outliers + spikes,
-        np.sqrt(np.diag(fit.white_covariance)),
         fit.correlation_time,
     )
 
 
 def predict(
-    estimate: Estimate, torque: Array, rate: float, command_to_sample: float, pose: Array | None = None
+    estimate: Estimate,
+    torque: Array,
+    rate: float,
+    command_to_sample: float,
+    pose: Array | None = None,
+    settling: SettlingOptions = SETTLING,
 ) -> Array:
-    """Positions (joints, samples) [rad] of the settled period that another multisine brings about.
+    """Predict the settled period that another multisine brings about; no measurement of it is used.
 
-    `torque` (joints, samples) [N m], `rate` [1/s] and `command_to_sample` [s] as in `SettledPeriod`; the
-    arm starts at rest in `pose` (joints,) [rad], or where the identified period began, and is simulated
-    until its motion repeats. No measurement of the predicted motion is used. Raises ShapeError, and
-    PeriodicityError when it does not repeat.
+    The arm starts at rest and is simulated until its motion repeats.
+
+    Args:
+        estimate: whose parameters.
+        torque: one period (joints, samples) [N m].
+        rate: samples per second.
+        command_to_sample: from a command to the sample of its index [s], as in `SettledPeriod`.
+        pose: where the arm starts (joints,) [rad]; by default where the identified period began.
+        settling: tolerances and limits.
+
+    Returns:
+        Positions (joints, samples) [rad].
+
+    Raises:
+        ShapeError: when `torque` is not of the estimate's joints.
+        PeriodicityError: when the motion does not repeat.
     """
     joints = estimate.model.joints
     if torque.ndim != 2 or torque.shape[0] != joints:
@@ -141,13 +162,13 @@ def predict(
     step = 1.0 / (rate * steps)
     motor = motor_torque(torque, rate, command_to_sample, steps, delay=physics.delay, lag=physics.lag)
     state = np.stack((estimate.start[0] if pose is None else pose, np.zeros(joints), np.zeros(joints)))
-    for period in range(MOST_PERIODS):
+    for period in range(settling.max_periods):
         position, end = simulate(physics, state, motor, step)
         change = float(np.abs(end - state).max())
-        if change < (PERIODIC if period < MOST_PERIODS - 1 else NEARLY):
+        if change < (settling.atol if period < settling.max_periods - 1 else settling.acceptable):
             return position
         state = end
     raise PeriodicityError(
-        f"after {MOST_PERIODS} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "
+        f"after {settling.max_periods} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "
         "the next: lower the torque, or look at the friction that was identified"
     )

@@ -10,6 +10,7 @@ from hil.drivers.clock import Clock
 from hil.drivers.packet import MAX_ID
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
+from hil.fakes.bus.hand import Move
 from hil.fakes.bus.supply import Supply
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_plant
@@ -33,6 +34,10 @@ class FakeServo(BaseModel):
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
     zero_ticks: Annotated[int, Field(description="Present Position at which the joint's angle is 0")]
     direction: Annotated[int, Field(description="-1 where the servo turns against the joint")] = 1
+    joint: Annotated[
+        int | None,
+        Field(ge=1, description="which joint it moves, from 1; the one behind the last servo's unless given"),
+    ] = None
     firmware: Annotated[int, Field(ge=38, le=255, description="Firmware Version")] = 48
     baud: Annotated[int, Field(description="baud rate the servo is set to")] = 1_000_000
     return_delay_us: Annotated[
@@ -112,20 +117,40 @@ class FakeArm(BaseModel):
     plant_options: Annotated[dict[str, Any], Field(description="what the factory is called with")] = {}
     supply: Annotated[Supply | None, Field(description="resistance of the supply; none unless given")] = None
     faults: Annotated[tuple[Fault, ...], Field(strict=False, description="what goes wrong, and when")] = ()
+    moves: Annotated[
+        tuple[Move, ...], Field(strict=False, description="what a hand does to limp joints, and when")
+    ] = ()
 
     @model_validator(mode="after")
-    def _one_servo_per_joint(self) -> Self:
+    def _a_servo_for_each_joint(self) -> Self:
         ids = [servo.id for servo in self.servos]
         if len(set(ids)) < len(ids):
             raise ValueError(f"servos: IDs {', '.join(map(str, ids))}: each servo on a bus needs an ID of its own")
         if (self.arm is None) == (self.plant is None):
             raise ValueError('give either the table arm or plant = "module:factory"')
-        if self.arm is not None and len(ids) != len(self.arm.drives):
-            raise ValueError(f"{len(ids)} servos for {len(self.arm.drives)} drives of the arm: one servo per drive")
+        count = max(self.joints) + 1
+        if set(self.joints) != set(range(count)):
+            moved = ", ".join(str(joint + 1) for joint in self.joints)
+            raise ValueError(f"servos: they move the joints {moved}: each joint from 1 on needs a servo")
+        if self.arm is not None and count != len(self.arm.drives):
+            servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")
+            raise ValueError(f"{servos} for {len(self.arm.drives)} drives of the arm: one servo per drive")
         for fault in self.faults:
             if fault.servo is not None and fault.servo not in ids:
                 raise ValueError(f"faults: {fault.kind} of servo {fault.servo}: the IDs are {', '.join(map(str, ids))}")
+        for move in self.moves:
+            if move.servo not in ids:
+                raise ValueError(f"moves: servo {move.servo}: the IDs are {', '.join(map(str, ids))}")
         return self
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """Which joint each servo moves, counted from 0."""
+        moved: list[int] = []
+        for servo in self.servos:
+            behind = moved[-1] + 1 if moved else 0
+            moved.append(behind if servo.joint is None else servo.joint - 1)
+        return tuple(moved)
 
     def make_plant(self) -> Plant:
         """The mechanism, at its start at time 0; raises PlantError."""
@@ -133,8 +158,10 @@ class FakeArm(BaseModel):
             return make_plant(self.arm)
         name = self.plant or ""
         plant = load_plant(name, self.plant_options)
-        if plant.joints != len(self.servos):
-            raise PlantError(f'plant = "{name}" has {plant.joints} joints for {len(self.servos)} servos')
+        count = max(self.joints) + 1
+        if plant.joints != count:
+            servos = f"{len(self.servos)} servos" + (f" on {count}" if count != len(self.servos) else "")
+            raise PlantError(f'plant = "{name}" has {plant.joints} joints for {servos}')
         return plant
 
 
@@ -189,9 +216,11 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         servos,
         fake.make_plant(),
         clock,
+        joints=fake.joints,
         adapter_latency_us=fake.adapter_latency_us,
         supply=fake.supply,
         seed=fake.seed,
     )
     bus.faults.add(*fake.faults)
+    bus.hand.move(*fake.moves)
     return bus

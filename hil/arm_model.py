@@ -5,7 +5,7 @@ one pose, a trajectory and a batch of trajectories are all taken as they are.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ class JointFacts:
     """
 
     name: str
-    servo: str
+    servo: str = field(metadata={"key": "model"})  # the name in result.json
     mode: str
     torque_per_goal: float
     torque_per_goal_std: float

@@ -3,20 +3,23 @@
 import json
 import math
 import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.arm_model import ArmModel, JointFacts
+from hil.arm_model import ArmModel
 from hil.errors import ResultError
 from hil.estimator.models.terms import RIGID_BODY, base_names, extra_names
+from hil.results.json_form import FormError, from_json
+from hil.results.parts import ArmFacts, Quantity
+from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
 
-SCHEMA = 1
 
-
-def read_result(path: Path) -> dict[str, Any]:
-    """The result in a run folder, or in the JSON or TOML file `path`; raises ResultError."""
-    file = path / "result.json" if path.is_dir() else path
+def _read(path: Path) -> dict[str, Any]:
+    """The object in a run folder's result.json, or in the JSON or TOML file `path`; raises ResultError."""
+    file = _file(path)
     if path.is_dir() and not file.is_file():
         raise ResultError(
             f"{path} holds no result.json: its identification did not finish. If it holds samples.npy, run "
@@ -40,54 +43,60 @@ def read_result(path: Path) -> dict[str, Any]:
             f"{file}: schema {result['schema']!r} is not {SCHEMA}, which this hil reads; it was written by "
             f"{'a newer' if _newer(result['schema']) else 'another'} hil. Install that one, or estimate again."
         )
-    return _with_infinities(result)
+    return result
 
 
-def _with_infinities(result: dict[str, Any]) -> dict[str, Any]:
-    """An error bar that is infinite (nothing was seen of the parameter) is null in strict JSON."""
-    for entry in [*result.get("parameters", {}).values(), *result.get("extra", {}).values()]:
-        if isinstance(entry, dict) and entry.get("std", 0.0) is None:
-            entry["std"] = math.inf
-    covariance = result.get("covariance", {})
-    if "matrix" in covariance:
-        covariance["matrix"] = [[math.inf if each is None else each for each in row] for row in covariance["matrix"]]
+def read_result(path: Path) -> Result:
+    """The result of a run folder or of its result.json; raises ResultError."""
+    try:
+        return result_from_json(_read(path))
+    except FormError as error:
+        raise _damaged(path, error) from error
+
+
+def read_settled_result(path: Path) -> SettledResult:
+    """The same, of an estimate from settled periods; raises ResultError for any other."""
+    result = read_result(path)
+    if not isinstance(result, SettledResult):
+        raise ResultError(f"{path}: was estimated without a settled period, by multiple shooting, and this needs one.")
     return result
 
 
 def read_model(path: str | PathLike[str]) -> ArmModel:
     """See `hil.load_model`."""
-    return model_of(read_result(Path(path)), Path(path))
-
-
-def model_of(result: dict[str, Any], path: Path) -> ArmModel:
-    """The model in a result that was read from `path`; raises ResultError."""
-    file = path / "result.json" if path.is_dir() else path
     try:
-        joints = tuple(_joint(entry) for entry in result["arm"]["joints"])
-        gravity = float(result["arm"]["gravity"])
-        rest_pose = tuple(float(angle) for angle in result["arm"]["rest_pose"])
-        entries = {**result["parameters"], **result.get("extra", {})}
-        values = {name: float(entry["value"]) for name, entry in entries.items()}
-        stds = {name: float(entry["std"]) for name, entry in entries.items()}
-    except (KeyError, TypeError, ValueError) as error:
-        what = f"has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ResultError(f"{file}: is damaged or from an older hil: it {what}. Run hil estimate again.") from error
-    _check_terms(values, len(joints), file)
-    return ArmModel(values, stds, gravity, rest_pose, joints)
+        saved = from_json(_SavedModel, _read(Path(path)))
+    except FormError as error:
+        raise _damaged(Path(path), error) from error
+    return _model(saved.arm, {**saved.parameters, **saved.extra}, Path(path))
 
 
-def _joint(entry: dict[str, Any]) -> JointFacts:
-    low, high = entry["position_limit"]
-    return JointFacts(
-        name=str(entry["name"]),
-        servo=str(entry["model"]),
-        mode=str(entry["mode"]),
-        torque_per_goal=float(entry["torque_per_goal"]),
-        torque_per_goal_std=float(entry["torque_per_goal_std"]),
-        goal_limit=float(entry["goal_limit"]),
-        position_limit=(float(low), float(high)),
-        velocity_limit=float(entry["velocity_limit"]),
-    )
+def model_of(result: SettledResult, path: Path) -> ArmModel:
+    """The model in a result that was read from `path`; raises ResultError."""
+    return _model(result.arm, result.quantities, path)
+
+
+@dataclass(frozen=True)
+class _SavedModel:
+    """As much of a result as a model needs: what `hil export` keeps, too."""
+
+    arm: ArmFacts
+    parameters: Mapping[str, Quantity]
+    extra: Mapping[str, Quantity] = field(default_factory=dict)
+
+
+def _model(arm: ArmFacts, found: Mapping[str, Quantity], path: Path) -> ArmModel:
+    values = {name: each.value for name, each in found.items()}
+    _check_terms(values, len(arm.joints), _file(path))
+    return ArmModel(values, {name: each.std for name, each in found.items()}, arm.gravity, arm.rest_pose, arm.joints)
+
+
+def _damaged(path: Path, error: FormError) -> ResultError:
+    return ResultError(f"{_file(path)}: is damaged or from an older hil: it {error}. Run hil estimate again.")
+
+
+def _file(path: Path) -> Path:
+    return path / "result.json" if path.is_dir() else path
 
 
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:

@@ -5,7 +5,7 @@ predicted and what was seen.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from hil.estimator.models.parameters import Physics
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
 from hil.plan.plan import Plan
+from hil.results.parts import PlayedStep
+from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
@@ -78,18 +80,15 @@ class Step:
         )
         return f"{self.name}, peak torque {torque} N m: {each}."
 
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "peak_torque": self.peak_torque.tolist(),
-            "predicted_median": self.median.tolist(),
-            "predicted_quantile_99": self.quantile.tolist(),
-            "seen": self.seen.tolist(),
-            "within_quantile": self.within,
-        }
+    def played(self) -> PlayedStep:
+        """As the result keeps it."""
+        median, quantile, seen = (tuple(map(tuple, rows.tolist())) for rows in (self.median, self.quantile, self.seen))
+        return PlayedStep(self.name, tuple(self.peak_torque.tolist()), median, quantile, seen, self.within)
 
 
-def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> tuple[str, Any]:
+def identify_in_steps(
+    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
+) -> tuple[str, SettledResult]:
     """The whole way from link lengths to the result; the sentence about torque and the result.
 
     Raises what a run raises, and ExperimentError when the pilot cannot be identified at any safe torque.
@@ -105,7 +104,7 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
         folder = run.below(f"step-{len(steps) + 1}", between)
         _play(between, folder, shown_path, watch, say, f"Step {len(steps) + 1}", full, steps)
         try:
-            latest = _estimate(config, folder, full.plan, steps[-1], [_values(result)])
+            latest = _estimate(config, folder, full.plan, steps[-1], [result.values])
             full = next_amplitude(config, latest, full.plan, steps[-1])
         except (EstimationError, NoSafeTorque) as error:
             say(f"This step's estimate is not used, and the full run goes no farther than it did: {error}")
@@ -114,15 +113,15 @@ def identify_in_steps(config: Config, run: RunFolder, shown_path: Path, watch: W
     played = _with_torque(config, full.peak_torque)
     run.write_played(played)
     torque = _play(played, run, shown_path, watch, say, "Full run", full, steps)
-    result = _estimate(played, run, full.plan, steps[-1], [_values(result)])
-    result["steps"] = [step.as_json() for step in steps]
+    result = _estimate(played, run, full.plan, steps[-1], [result.values])
+    result = replace(result, steps=tuple(step.played() for step in steps))
     run.write_result(result)
     return torque, result
 
 
 def _pilot(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, steps: list[Step]
-) -> tuple[dict[str, Any], Amplitude]:
+) -> tuple[SettledResult, Amplitude]:
     """The first run, as small as can be identified; its result, and how far it lets the next one go."""
     pilot = pilot_config(config)
     ensemble = prior_ensemble(config, PRIOR_ARMS)
@@ -159,7 +158,7 @@ def pilot_config(config: Config) -> Config:
 
 def _estimate(
     config: Config, folder: RunFolder, played: Plan, step: Step, starts: list[dict[str, float]]
-) -> dict[str, Any]:
+) -> SettledResult:
     """Estimate the run in `folder`, started from `starts` too; once more where the arm found does not move as it did.
 
     A fit may end with friction so odd that it leaves the settled motion alone and holds the arm at rest. The second
@@ -169,12 +168,12 @@ def _estimate(
     result = estimate_run(folder)
     if _astray(config, nominal(result), played, step) > REPLAYED:
         shape = {name: value for name, value in starts[0].items() if name.startswith(_SHAPE)}
-        folder.write_starts([{**_values(result), **shape}])
+        folder.write_starts([{**result.values, **shape}])
         result = estimate_run(folder)
     return result
 
 
-def next_amplitude(config: Config, result: dict[str, Any], played: Plan, step: Step) -> Amplitude:
+def next_amplitude(config: Config, result: SettledResult, played: Plan, step: Step) -> Amplitude:
     """As far as what `result` of `step`, in which `played` was, leaves open allows. Raises NoSafeTorque."""
     arm = nominal(result)
     astray = _astray(config, arm, played, step)
@@ -185,7 +184,7 @@ def next_amplitude(config: Config, result: dict[str, Any], played: Plan, step: S
         )
     ensemble = result_ensemble(result, RESULT_ARMS, _farther(config, step))
     optimal = config.experiment.design == "optimal"
-    plan = designed_plan(config, arm, list(result["parameters"])) if optimal else roomy_plan(config, arm)
+    plan = designed_plan(config, arm, list(result.parameters)) if optimal else roomy_plan(config, arm)
     return largest_amplitude(config, ensemble, plan=plan)
 
 
@@ -229,10 +228,6 @@ def _play(
     if not step.within:
         say(f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed.")
     return torque
-
-
-def _values(result: dict[str, Any]) -> dict[str, float]:
-    return {name: entry["value"] for name, entry in {**result["parameters"], **result["extra"]}.items()}
 
 
 def _with_torque(config: Config, peak_torque: Array) -> Config:

@@ -14,7 +14,7 @@ BAND = 8  # lines looked at together
 
 
 @dataclass(frozen=True)
-class Motion:
+class PeriodicMotion:
     """Angles, velocities and accelerations of one period (joints, samples) [rad, rad/s, rad/s^2]."""
 
     position: Array
@@ -49,13 +49,13 @@ def cut_off(lines: Lines) -> int:
     return int(BAND * (signal[-1] + 1)) if signal.size else 1
 
 
-def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) -> Motion:
+def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) -> PeriodicMotion:
     """The motion that the lines up to `harmonics` make, differentiated exactly by j k w0."""
     kept = np.zeros_like(lines)
     kept[:, : harmonics + 1] = lines[:, : harmonics + 1]
     turn = 1j * fundamental * np.arange(lines.shape[1])
     waves = (np.fft.irfft(samples * kept * turn**order, samples, axis=-1) for order in range(3))
-    return Motion(*waves)
+    return PeriodicMotion(*waves)
 
 
 def held_lines(command: Array, rate: float, delay: float) -> Lines:

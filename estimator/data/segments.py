@@ -19,7 +19,7 @@ DIFFERENCE = 1e-7  # s
 
 
 @dataclass(frozen=True)
-class Segment:
+class RecordingSegment:
     """A piece of a recording on the grid of its simulation."""
 
     recording: int
@@ -66,7 +66,7 @@ class Grid:
         return cls(float(recording.time[0]), step, recording.time[0] + step * np.arange(count + 1))
 
 
-def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Segment]:
+def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[RecordingSegment]:
     """Cut a recording into equal pieces of about `length` [s]; `number` says which recording it is.
 
     Raises RecordingError when no piece holds FEWEST samples.
@@ -82,7 +82,9 @@ def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Se
             continue
         index, weight = _cubic(place[inside] - first, last - first)
         state = _state_at(recording, grid.start + grid.step * first)
-        segments.append(Segment(number, first, last - first, index, weight, recording.position[:, inside], state))
+        segments.append(
+            RecordingSegment(number, first, last - first, index, weight, recording.position[:, inside], state)
+        )
     if not segments:
         raise RecordingError(
             f"no piece of {length:g} s holds {FEWEST} samples: record faster, or choose longer segments"

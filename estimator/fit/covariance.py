@@ -18,10 +18,9 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.fit.levenberg_marquardt import Quadratic
 from hil.estimator.fit.normal_equations import normal_equations
+from hil.estimator.options import CovarianceOptions
 
-LONGEST_LAG = 400  # samples
-MOST_OF_RUN = 0.05
-FEWEST_LAGS = 4
+DEFAULTS = CovarianceOptions()
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 
 
@@ -51,20 +50,20 @@ class Scatter:
             self._total += normal_equations(windows, np.zeros(len(windows)))[0] / self._lags
 
 
-def correlation_time(residuals: Sequence[Array]) -> int:
+def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DEFAULTS) -> int:
     """Lags (samples) beyond which no residual (joints, samples) of any run is correlated, times two.
 
     Where the autocorrelation first falls into the band that white noise would leave it in.
     """
-    longest = FEWEST_LAGS
+    longest = options.min_lag
     for residual in residuals:
         samples = residual.shape[1]
-        most = min(LONGEST_LAG, int(MOST_OF_RUN * samples))
+        most = min(options.max_lag, int(options.max_lag_share * samples))
         for row in residual:
             rho = autocorrelation(row, most)
             inside = np.nonzero(np.abs(rho[1:]) < 2.0 / np.sqrt(samples))[0]
             longest = max(longest, 2 * (int(inside[0]) + 1 if inside.size else most))
-    return min(longest, LONGEST_LAG)
+    return min(longest, options.max_lag)
 
 
 def structured_share(residual: Array) -> Array:

@@ -7,13 +7,9 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ConvergenceError
+from hil.estimator.options import MinimiserOptions
 
-LONGEST = 2.0  # change of one coordinate in one step
-ITERATIONS = 60
-UNFINISHED = 1e-2
-FIRST_DAMPING = 1e-3  # of the squared length of each coordinate's column
-LEAST_DAMPING = 1e-9
-MOST_DAMPING = 1e3
+DEFAULTS = MinimiserOptions()
 
 
 @dataclass(frozen=True)
@@ -45,51 +41,67 @@ Move = Callable[[Array, Array], Array]
 Limits = Callable[[Array], tuple[Array, Array]]
 
 
-def alike(x: Array) -> tuple[Array, Array]:
-    """No coordinate changes by more than LONGEST in one step."""
-    return np.full(x.size, -LONGEST), np.full(x.size, LONGEST)
-
-
 def minimise(
     evaluate: Evaluate,
     start: Array,
-    enough: float,
-    damping: float = FIRST_DAMPING,
+    ftol: float,
+    damping: float | None = None,
     at: Quadratic | None = None,
     *,
     move: Move = np.add,
-    limits: Limits = alike,
+    limits: Limits | None = None,
+    options: MinimiserOptions = DEFAULTS,
 ) -> Minimum:
-    """Minimise a sum of squares from `start`, coordinates of the size of 1; `at` is the sum there, if it is known.
+    """Minimise a sum of squares from `start`, coordinates of the size of 1.
 
-    `move` takes coordinates and a step to where the step leads; `limits` gives the least and the most that each
-    coordinate may change in a step from there.
+    Damped steps are short along directions that hardly show and end too early there: near the end, `damping` should
+    start at `options.min_damping`.
 
-    Ends when a step lowers the sum, or would, by less than `enough` of it; a sum that is not finite counts as
-    too large. Damped steps are short along what is hardly seen and end too early there: near the end, `damping`
-    should start at LEAST_DAMPING. Raises ConvergenceError when `start` gives no finite sum, or when the sum still
-    falls by more than UNFINISHED of it after ITERATIONS.
+    Args:
+        evaluate: the sum at a point; one that is not finite counts as too large.
+        start: coordinates (coordinates,).
+        ftol: ends when a step lowers the sum, or would, by less than this share of it.
+        damping: to begin with; by default `options.initial_damping`.
+        at: the sum at `start`, if it is known.
+        move: takes coordinates and a step to where the step leads.
+        limits: gives the least and the most that each coordinate may change in a step from a point; by default
+            `options.max_step` either way.
+        options: limits of the iteration.
+
+    Returns:
+        The minimum, and how many points were evaluated.
+
+    Raises:
+        ConvergenceError: when `start` gives no finite sum, or when the sum still falls by more than
+            `options.unfinished` of it after `options.max_iterations`.
     """
     x, here = start, evaluate(start) if at is None else at
     if not np.isfinite(here.cost):
         raise ConvergenceError("the starting values give no finite motion: check the torque and the period's units")
+    damping = options.initial_damping if damping is None else damping
     evaluations = int(at is None)
     gained = np.inf
-    for _ in range(ITERATIONS):
-        found, damping, tried = _improve(evaluate, x, here, damping, enough, move, limits(x))
+    for _ in range(options.max_iterations):
+        bounds = step_limits(x, options) if limits is None else limits(x)
+        found, damping, tried = _improve(evaluate, x, here, damping, ftol, move, bounds, options)
         evaluations += tried
         if found is None:
             return Minimum(x, here, evaluations)
         gained = here.cost - found[1].cost
         x, here = found
-        if gained < enough * here.cost:
+        if gained < ftol * here.cost:
             return Minimum(x, here, evaluations)
-    if gained < UNFINISHED * here.cost:
+    if gained < options.unfinished * here.cost:
         return Minimum(x, here, evaluations)
     raise ConvergenceError(
-        f"after {ITERATIONS} iterations the sum of squares, {here.cost:.4g}, still falls by {gained:.2g} in each: "
-        "try a simpler model or data with more motion"
+        f"after {options.max_iterations} iterations the sum of squares, {here.cost:.4g}, still falls by {gained:.2g} "
+        "in each: try a simpler model or data with more motion"
     )
+
+
+def step_limits(x: Array, options: MinimiserOptions) -> tuple[Array, Array]:
+    """The least and the most that each coordinate of `x` may change in one step if nothing else limits it."""
+    return np.full(x.size, -options.max_step), np.full(x.size, options.max_step)
 
 
 def _improve(
@@ -97,24 +109,26 @@ def _improve(
     x: Array,
     at: Quadratic,
     damping: float,
-    enough: float,
+    ftol: float,
     move: Move,
     limits: tuple[Array, Array],
+    options: MinimiserOptions,
 ) -> tuple[tuple[Array, Quadratic] | None, float, int]:
     """A better point, or None when there is none in sight; the next step's damping; and the points tried."""
     tried = 0
-    while damping < MOST_DAMPING:
+    while damping < options.max_damping:
         step = _step(at.normal, at.gradient, damping, *limits)
         foreseen = -float(step @ (2.0 * at.gradient + at.normal @ step))
-        if foreseen < enough * at.cost:
+        if foreseen < ftol * at.cost:
             break
         moved = move(x, step)
         there = evaluate(moved)
         tried += 1
         gained = at.cost - there.cost
         if gained > 0.0:
-            return (moved, there), max(LEAST_DAMPING, damping * (0.1 if gained > 0.5 * foreseen else 1.0)), tried
-        damping = max(10.0 * damping, FIRST_DAMPING)
+            trusted = 0.1 if gained > 0.5 * foreseen else 1.0
+            return (moved, there), max(options.min_damping, damping * trusted), tried
+        damping = max(10.0 * damping, options.initial_damping)
     return None, damping, tried
 
 

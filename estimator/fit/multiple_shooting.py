@@ -6,9 +6,9 @@ identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical
 (1983). The segments are not joined: noise that a rigid arm does not have, such as play and flexing, may
 move the state between them.
 
-Short segments come first: started far from the truth, they find it; longer ones then sharpen it. Where a segment then
-is off by more than usual, because a joint stuck in it, say, as no smooth friction sticks, it counts so much less: the
-errors of segments differ in size, and who counts them alike lets the worst understood of them decide.
+Short segments come first: started far from the truth, they find it; longer ones then sharpen it. A segment whose
+residual is then larger than usual, because a joint stuck in it, say, as no smooth friction sticks, is downweighted by
+as much: with equal weights the segments that the model explains worst would decide.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +19,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
-from hil.estimator.data.segments import Grid, Segment, cut, grid_torque, grid_torque_slopes
+from hil.estimator.data.segments import Grid, RecordingSegment, cut, grid_torque, grid_torque_slopes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import by_parameters
 from hil.estimator.fit.reparametrisation import Coordinates, scales_of
@@ -27,18 +27,11 @@ from hil.estimator.fit.segmented_least_squares import Segmented, minimise_segmen
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
+from hil.estimator.options import ShootingOptions
 from hil.estimator.simulation.arm import simulate
 from hil.estimator.simulation.presliding_sensitivity import sensitive
 
-WIDTH_FLOOR = 3e-3  # rad/s: narrower costs much time and is not seen in a second of motion
-STARTING_WIDTH = 0.05  # rad/s
-STARTING_BEND = 0.003  # rad, of friction that yields before it slides
-RISES_FADE = (0.2, 2.0)  # rad/s
-SHORT = 0.25  # of the segments' length, to begin with
-COARSE = 1e-3
-FINE = 3e-5
-ANGLE_SCALE = 0.1  # rad
-REWEIGHTED = 2  # fits after the first
+DEFAULTS = ShootingOptions()
 ALL = slice(None)
 
 
@@ -81,8 +74,16 @@ class Shooting:
     """The residuals of all segments by coordinates."""
 
     def __init__(
-        self, recordings: Sequence[Recording], model: Model, length: float, *, zeros: bool = False, of: slice = ALL
+        self,
+        recordings: Sequence[Recording],
+        model: Model,
+        length: float,
+        *,
+        zeros: bool = False,
+        of: slice = ALL,
+        options: ShootingOptions = DEFAULTS,
     ) -> None:
+        self._options = options
         self._recordings = recordings
         self.zeros = len(recordings) * model.joints if zeros else 0
         self._grids = [Grid.of(recording) for recording in recordings]
@@ -94,7 +95,7 @@ class Shooting:
         self.noise = np.max([recording.noise for recording in recordings], axis=0)[:, None]
         velocity = float(np.sqrt(np.mean([np.mean(segment.state[1] ** 2) for segment in self.segments]))) + 0.1
         torque = float(np.sqrt(np.mean([np.mean(recording.torque**2) for recording in recordings])))
-        self.state_scale = np.repeat([ANGLE_SCALE, velocity], model.joints).reshape(2, -1)
+        self.state_scale = np.repeat([options.angle_scale, velocity], model.joints).reshape(2, -1)
         self._scales = (torque, velocity)
         self._model = model
         self._trust = np.ones((len(self.segments), model.joints))
@@ -102,9 +103,10 @@ class Shooting:
 
     def coordinates(self, inertia: float) -> Coordinates:
         """The parameters' coordinates; `inertia` [kg m^2] of the arm as a scale."""
-        return Coordinates(self._model.names, scales_of(self._model.names, *self._scales, inertia), WIDTH_FLOOR)
+        scales = scales_of(self._model.names, *self._scales, inertia)
+        return Coordinates(self._model.names, scales, self._options.coordinates)
 
-    def position(self, segment: Segment, physics: Physics, state: Array) -> Array:
+    def position(self, segment: RecordingSegment, physics: Physics, state: Array) -> Array:
         """Simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
         torque = self._torque(segment, physics)[0]
         step = self._grids[segment.recording].step
@@ -141,7 +143,7 @@ class Shooting:
         count = len(coordinates.names)
         columns = np.zeros((*by_value.shape[:2], shared.size + own.size))
         columns[:, :, :count] = by_value[:, :, :count] @ coordinates.slopes(shared[:count])
-        columns[:, :, self._zeros_of(segment)] = by_value[:, :, count : count + len(zeros)] * ANGLE_SCALE
+        columns[:, :, self._zeros_of(segment)] = by_value[:, :, count : count + len(zeros)] * self._options.angle_scale
         columns[:, :, shared.size :] = by_value[:, :, count + len(zeros) :] * self.state_scale.reshape(-1)
         known = np.isfinite(segment.position)[:, :, None]
         columns = np.where(known, columns / self._noise(number)[:, :, None], 0.0)
@@ -155,8 +157,8 @@ class Shooting:
             rms[number] = np.sqrt(np.sum((rows * self._noise(number)) ** 2, axis=1) / _samples(segment))
         return rms
 
-    def weigh_down(self, errors: Array) -> None:
-        """Trust the segments whose `errors`, as of the method of this name, are larger than usual so much less."""
+    def downweight(self, errors: Array) -> None:
+        """Downweight the segments whose `errors`, as the method of this name gives them, are larger than usual."""
         usual = np.median(errors, axis=0)
         self._trust = np.minimum(1.0, usual / np.maximum(errors, 1e-12))
 
@@ -164,7 +166,7 @@ class Shooting:
         """Each segment's own coordinates as its measured positions suggest (segments, 2 joints)."""
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
-    def _zeros_of(self, segment: Segment) -> slice:
+    def _zeros_of(self, segment: RecordingSegment) -> slice:
         """Where a segment's encoder zeros stand among the shared coordinates; nowhere if they are known."""
         count = len(self._model.names)
         if not self.zeros:
@@ -172,10 +174,10 @@ class Shooting:
         first = count + segment.recording * self._model.joints
         return slice(first, first + self._model.joints)
 
-    def _physics(self, coordinates: Coordinates, segment: Segment, shared: Array) -> Physics:
+    def _physics(self, coordinates: Coordinates, segment: RecordingSegment, shared: Array) -> Physics:
         count = len(coordinates.names)
         values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
-        zeros = ANGLE_SCALE * shared[self._zeros_of(segment)]
+        zeros = self._options.angle_scale * shared[self._zeros_of(segment)]
         return Physics.of(values | {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)})
 
     def _noise(self, number: int) -> Array:
@@ -188,7 +190,7 @@ class Shooting:
         difference = np.where(np.isfinite(measured), position - measured, 0.0)
         return np.asarray((difference / self._noise(number)).reshape(-1))
 
-    def _torque(self, segment: Segment, physics: Physics) -> tuple[Array, Array]:
+    def _torque(self, segment: RecordingSegment, physics: Physics) -> tuple[Array, Array]:
         """Motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
         key = (physics.delay, physics.lag)
         driven = self._driven.get(key)
@@ -211,6 +213,7 @@ def estimate_by_shooting(
     length: float = 1.0,
     zeros: bool = False,
     of: slice = ALL,
+    options: ShootingOptions = DEFAULTS,
 ) -> ShootingEstimate:
     """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
 
@@ -220,38 +223,42 @@ def estimate_by_shooting(
     they are not. `of` takes some of each recording's segments and leaves the others for a check. Raises RecordingError
     when nothing is long enough, ConvergenceError.
     """
-    short, problem = (Shooting(recordings, model, part * length, zeros=zeros, of=of) for part in (SHORT, 1.0))
+    short, problem = (
+        Shooting(recordings, model, part * length, zeros=zeros, of=of, options=options) for part in (options.short, 1.0)
+    )
     coordinates = problem.coordinates(max(float(start[0]), 1e-6))
     # Friction's rise has local minima: several starts, and the best end is kept.
     ends: list[Segmented] = []
     lost: list[ConvergenceError] = []
-    for x in _starts(problem, coordinates, model, start):
+    for x in _initial_guesses(problem, coordinates, model, start, options):
         try:
-            near = _fit(short, coordinates, x, short.start(), COARSE)
-            ends.append(_fit(problem, coordinates, near.shared, problem.start(), FINE))
+            near = _fit(short, coordinates, x, short.start(), options.ftol_start, options)
+            ends.append(_fit(problem, coordinates, near.shared, problem.start(), options.ftol, options))
         except ConvergenceError as error:
             lost.append(error)
     if not ends:
         raise lost[0]
     found = min(ends, key=lambda end: end.cost)
-    for _ in range(REWEIGHTED):
-        problem.weigh_down(problem.errors(coordinates, found))
-        found = _fit(problem, coordinates, found.shared, found.own, FINE)
-    return _estimate(problem, coordinates, model, found, length)
+    for _ in range(options.reweightings):
+        problem.downweight(problem.errors(coordinates, found))
+        found = _fit(problem, coordinates, found.shared, found.own, options.ftol, options)
+    return _estimate(problem, coordinates, model, found, length, options.angle_scale)
 
 
-def _fit(problem: Shooting, coordinates: Coordinates, shared: Array, own: Array, enough: float) -> Segmented:
+def _fit(
+    problem: Shooting, coordinates: Coordinates, shared: Array, own: Array, ftol: float, options: ShootingOptions
+) -> Segmented:
     residual, derivative = partial(problem.residual, coordinates), partial(problem.derivative, coordinates)
-    return minimise_segmented(residual, derivative, shared, own, enough)
+    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser)
 
 
 def _estimate(
-    problem: Shooting, coordinates: Coordinates, model: Model, found: Segmented, length: float
+    problem: Shooting, coordinates: Coordinates, model: Model, found: Segmented, length: float, angle_scale: float
 ) -> ShootingEstimate:
     count = len(model.names)
-    slope = np.eye(found.shared.size) * ANGLE_SCALE
+    slope = np.eye(found.shared.size) * angle_scale
     slope[:count, :count] = coordinates.slopes(found.shared[:count])
-    value = ANGLE_SCALE * found.shared
+    value = angle_scale * found.shared
     value[:count] = coordinates.values(found.shared[:count])
     recording = np.array([segment.recording for segment in problem.segments])
     covariance = by_parameters(found.covariance(recording, problem.zeros), slope, value)
@@ -272,20 +279,23 @@ def _estimate(
     )
 
 
-def _samples(segment: Segment) -> Array:
+def _samples(segment: RecordingSegment) -> Array:
     """Samples that hold a position (joints,)."""
     return np.asarray(np.isfinite(segment.position).sum(axis=1), dtype=np.float64)
 
 
-def _starts(problem: Shooting, coordinates: Coordinates, model: Model, base: Array) -> Iterator[Array]:
+def _initial_guesses(
+    problem: Shooting, coordinates: Coordinates, model: Model, base: Array, options: ShootingOptions
+) -> Iterator[Array]:
     """Shared coordinates to start from: `base`, and what it does not say of friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
-    known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), STARTING_WIDTH)
+    known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), options.initial_width)
     for joint in range(1, model.joints + 1):
-        known[f"presliding_stiffness_{joint}"] = abs(known[f"coulomb_{joint}"]) / STARTING_BEND
+        known[f"presliding_stiffness_{joint}"] = abs(known[f"coulomb_{joint}"]) / options.initial_bend
         known[f"presliding_damping_{joint}"] = abs(known[f"viscous_{joint}"])
     rising = "stribeck_velocity_1" in model.names
-    for velocity in RISES_FADE if rising else RISES_FADE[:1]:
+    velocities = options.initial_stribeck_velocities
+    for velocity in velocities if rising else velocities[:1]:
         known |= {f"stribeck_velocity_{joint}": velocity for joint in range(1, model.joints + 1)}
         value = np.array([known.get(name, term_of(name).initial) for name in model.names])
         yield np.concatenate((coordinates.coordinates(value), np.zeros(problem.zeros)))

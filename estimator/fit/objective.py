@@ -1,4 +1,4 @@
-"""What the likelihood minimises: the weighed squares of measured less simulated positions of several runs."""
+"""What the likelihood minimises: weighted squared residuals of several runs, measured minus simulated position."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,20 +7,19 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.fit.covariance import Scatter
-from hil.estimator.fit.levenberg_marquardt import FIRST_DAMPING, Minimum, Quadratic, alike, minimise
+from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise, step_limits
 from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.fit.reparametrisation import Coordinates
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.models.parameters import Physics
+from hil.estimator.options import MinimiserOptions
 
 Run = SimulatedRun | StabilisedRun
 
-BOLD = 0.8  # share of its width that friction's step may lose at a time, near the end
-
 
 @dataclass(frozen=True)
-class Problem:
+class Objective:
     """Residuals of several runs under one model, by coordinates: the parameters', then each run's first state."""
 
     runs: tuple[Run, ...]
@@ -29,14 +28,15 @@ class Problem:
     """Of the state at the first sample (2 joints,) [rad, rad/s]."""
     weights: tuple[Array, ...]
     """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
-    share: float = 1.0
-    """Of each run, from its beginning, that is looked at."""
-    pull: Array | None = None
-    """Stiffness of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
-    narrowing: float = BOLD
-    """Share that friction's step may lose of its width at a time."""
-    held: bool = False
-    """Whether the parameters stay as they are."""
+    minimiser: MinimiserOptions
+    max_relative_decrease: float
+    """Of the width of friction's step, in one iteration."""
+    horizon: float = 1.0
+    """Share of each run, from its beginning, that is looked at."""
+    tracking_stiffness: Array | None = None
+    """Of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
+    fixed_parameters: bool = False
+    """Whether only the first states are fitted."""
 
     @property
     def count(self) -> int:
@@ -65,7 +65,7 @@ class Problem:
             n, b = np.zeros((transform.shape[0],) * 2), np.zeros(transform.shape[0])
             cost = 0.0
             for part, position, derivative in run.pieces(
-                physics, self.start(x, index), self.coordinates.names, self.pull, self.share
+                physics, self.start(x, index), self.coordinates.names, self.tracking_stiffness, self.horizon
             ):
                 square = np.square(weight[:, part]).reshape(-1)
                 r = (position - run.measured[:, part]).reshape(-1)
@@ -80,15 +80,20 @@ class Problem:
             )
         return total
 
-    def minimise(self, x: Array, enough: float, damping: float = FIRST_DAMPING, at: Quadratic | None = None) -> Minimum:
-        """Minimise the sum of squares from `x`, until it falls by less than `enough` of it; see `minimise`."""
-        return minimise(self.evaluate, x, enough, damping, at, move=self.coordinates.moved, limits=self._limits)
+    def minimise(self, x: Array, ftol: float, damping: float | None = None, at: Quadratic | None = None) -> Minimum:
+        """Minimise the sum of squares from `x`; see `hil.estimator.fit.levenberg_marquardt.minimise`."""
+        return minimise(
+            *(self.evaluate, x, ftol, damping, at),
+            move=self.coordinates.moved,
+            limits=self._limits,
+            options=self.minimiser,
+        )
 
     def _limits(self, x: Array) -> tuple[Array, Array]:
         """The least and the most that each coordinate may change in a step."""
-        least, most = alike(x)
-        self.coordinates.limit(x[: self.count], least, most, self.narrowing)
-        if self.held:
+        least, most = step_limits(x, self.minimiser)
+        self.coordinates.limit(x[: self.count], least, most, self.max_relative_decrease)
+        if self.fixed_parameters:
             least[: self.count] = most[: self.count] = 0.0
         return least, most
 

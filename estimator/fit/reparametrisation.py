@@ -13,12 +13,9 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.terms import Scale, joint_of, term_of
+from hil.estimator.options import CoordinateOptions
 
-LEAST_SHARE = 1e-3  # of its scale: the least that a positive parameter starts with
-MOST_COUPLING = 0.95  # of its bound, at the start
-BEND = 0.01  # rad: much of it, for friction that yields before it slides
-NEAREST = 1e-3  # of a width's floor: what always stays above it, or no step would lead back
-WIDENING = 2.0  # of a width, in one step
+TYPICAL_BEND = 0.01  # rad: much, for friction that yields before it slides; only a scale
 
 
 @dataclass(frozen=True)
@@ -29,8 +26,7 @@ class Coordinates:
     """Parameters, as in `Model.names`."""
     scales: Array
     """Scale of each parameter (parameters,) [its unit], by `scales_of`."""
-    width_floor: float
-    """What the width of every Coulomb step stays above [rad/s]."""
+    options: CoordinateOptions
 
     def values(self, x: Array) -> Array:
         """Parameters (parameters,) at the coordinates `x` (parameters,)."""
@@ -42,11 +38,12 @@ class Coordinates:
 
     def coordinates(self, value: Array) -> Array:
         """Coordinates of the parameters `value` (parameters,), moved into the physical range."""
-        above = np.maximum(value - self._floors, LEAST_SHARE * self.scales)
+        above = np.maximum(value - self._floors, self.options.min_initial * self.scales)
         x = np.where(self._either_sign, value / self.scales, np.log(above))
         for share, first, second in self._shares:
             part = value[share] / np.sqrt(above[first] * above[second])
-            x[share] = np.arctanh(np.clip(part, -MOST_COUPLING, MOST_COUPLING))
+            most = self.options.max_initial_share
+            x[share] = np.arctanh(np.clip(part, -most, most))
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
@@ -57,20 +54,22 @@ class Coordinates:
         """
         y = x + step
         widths = np.flatnonzero(self._floors)
-        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), NEAREST * self.width_floor))
+        least = self.options.min_width * self.options.width_floor
+        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), least))
         return y
 
-    def limit(self, x: Array, least: Array, most: Array, narrowing: float) -> None:
+    def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
         """Lower in place what coordinates may change by in one step from `x` (coordinates,), where less is declared of
-        them: a width by no more than its share `narrowing` and by WIDENING, others by their `Term.max_step`.
+        them: a width relative to itself, others by their `Term.max_step`.
 
         One that shrinks to nothing in a single step leaves no trace in the motion that would bring it back.
         """
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)
         widths = np.flatnonzero(self._floors)
-        share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
-        least[widths], most[widths] = np.maximum(-1.0, -narrowing * share), WIDENING * share
+        share = 1.0 + self.options.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
+        least[widths] = np.maximum(-1.0, -max_relative_decrease * share)
+        most[widths] = self.options.max_relative_increase * share
 
     def slopes(self, x: Array) -> Array:
         """Derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
@@ -88,7 +87,7 @@ class Coordinates:
 
     @cached_property
     def _floors(self) -> Array:
-        return np.array([self.width_floor if term_of(name).range == "floor" else 0.0 for name in self.names])
+        return np.array([self.options.width_floor if term_of(name).range == "floor" else 0.0 for name in self.names])
 
     @cached_property
     def _longest(self) -> Array:
@@ -116,7 +115,7 @@ def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: f
         "torque": torque,
         "velocity": velocity,
         "damping": torque / velocity,
-        "stiffness": torque / BEND,
+        "stiffness": torque / TYPICAL_BEND,
     }
     scales = [term_of(name).scale for name in names]
     return np.array([scale if isinstance(scale, float) else arm[scale] for scale in scales])

@@ -9,12 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.data.fourier import Motion, held_lines, lines_of
+from hil.estimator.data.fourier import PeriodicMotion, held_lines, lines_of
 from hil.estimator.data.settled_period import SettledPeriod
-from hil.estimator.fit.stage1 import COULOMB_WIDTH, LinearEstimate
+from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.regressor import regressor
+from hil.estimator.options import LinearOptions
 
 CYCLES = np.arange(1.0, 40.01, 0.25)  # per turn of the joint
+COULOMB_WIDTH = LinearOptions().coulomb_width
 STRIBECK_VELOCITY = 0.15  # rad/s: about right is enough to keep the rise of friction out of the ripple
 
 
@@ -46,7 +48,7 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 
 
 def _prepared(
-    period: SettledPeriod, motion: Motion, harmonics: int, joint: int, delay: float
+    period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
     """Columns and torque of one joint's lines as real numbers, and its torque and angle over time (samples,)."""
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ConvergenceError
+from hil.estimator.options import SegmentedMinimiserOptions
 
 Residual = Callable[[int, Array, Array], Array]
 """Residuals (rows,) of one segment at shared coordinates (shared,) and its own (own,)."""
@@ -22,15 +23,10 @@ Residual = Callable[[int, Array, Array], Array]
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
 """The same residuals and their derivatives by shared coordinates, then by its own (rows, shared + own)."""
 
-LONGEST = 2.0  # change of one coordinate in one step
-ITERATIONS = 80
-UNFINISHED = 1e-3  # of the sum: less than this still to gain is no reason to give up
-ENOUGH_SEGMENTS = 3
-SEEN = 1e-12  # of the largest eigenvalue
-PART = 1e-4  # of a coordinate in what is not seen, squared: less is rounding
-FIRST_DAMPING = 1e-3
-LEAST_DAMPING = 1e-8
-MOST_DAMPING = 1e5
+DEFAULTS = SegmentedMinimiserOptions()
+MIN_SEGMENTS = 3
+MIN_EIGENVALUE = 1e-12  # of the largest: below, a direction leaves no trace
+MIN_PART = 1e-4  # of a coordinate in such a direction, squared: less is rounding
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,7 @@ class Segmented:
 
         It holds when the residuals of a segment hang together, as model error makes them: Liang and Zeger,
         "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13. Fewer than
-        ENOUGH_SEGMENTS times as many segments as coordinates cannot tell what correlates with what: they tell
+        MIN_SEGMENTS times as many segments as coordinates cannot tell what correlates with what: they tell
         one factor by which all is more uncertain than white noise would make it. Infinite for a coordinate that can
         change, alone or with others, and leave no trace.
         """
@@ -67,7 +63,7 @@ class Segmented:
         bread, hidden = _inverse(self.information / np.outer(norm, norm))
         bread /= np.outer(norm, norm)
         few = segments / max(1, segments - 1)
-        if segments < ENOUGH_SEGMENTS * size:
+        if segments < MIN_SEGMENTS * size:
             covariance = few * _size(self.scores, bread) / size * bread
         else:
             covariance = few * bread @ (self.scores.T @ self.scores) @ bread
@@ -89,10 +85,10 @@ def _inverse(matrix: Array) -> tuple[Array, Array]:
     """Of a matrix that is positive semidefinite but for rounding, without the directions that are not seen at all;
     and which coordinates have part in those."""
     size, direction = np.linalg.eigh(matrix)
-    seen = size > SEEN * size[-1]
+    seen = size > MIN_EIGENVALUE * size[-1]
     inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
     part = np.sum(direction[:, ~seen] ** 2, axis=1)
-    return inverse, part > PART
+    return inverse, part > MIN_PART
 
 
 @dataclass(frozen=True)
@@ -123,40 +119,45 @@ class _Blocks:
 
 
 def minimise_segmented(
-    residual: Residual, derivative: Derivative, shared: Array, own: Array, enough: float
+    residual: Residual,
+    derivative: Derivative,
+    shared: Array,
+    own: Array,
+    ftol: float,
+    options: SegmentedMinimiserOptions = DEFAULTS,
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when a step gains
-    less than `enough` of the sum, or after ITERATIONS when it gained less than UNFINISHED. `residual` and
-    `derivative` are called from several threads; the result does not depend on their number. Raises
-    ConvergenceError.
+    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when a step gains less than
+    `ftol` of the sum, or after `options.max_iterations` when it gained less than `options.unfinished`. `residual` and
+    `derivative` are called from several threads; the result does not depend on their number. Raises ConvergenceError.
     """
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         rows = _residuals(residual, shared, own, threads)
         cost = _cost(rows)
         if not np.isfinite(cost):
             raise ConvergenceError("the starting values give no finite motion: check the units of torque and time")
-        damping = FIRST_DAMPING
-        for iteration in range(1, ITERATIONS + 1):
+        damping = options.initial_damping
+        for iteration in range(1, options.max_iterations + 1):
             blocks = _blocks(derivative, shared, own, threads)
             gained = 0.0
-            while damping < MOST_DAMPING:
-                there = _stepped(blocks, shared, own, damping)
+            while damping < options.max_damping:
+                there = _stepped(blocks, shared, own, damping, options.max_step)
                 rows_there = _residuals(residual, *there, threads)
                 gained = cost - _cost(rows_there)
                 if gained > 0.0:
                     (shared, own), rows, cost = there, rows_there, cost - gained
-                    damping = max(0.2 * damping, LEAST_DAMPING)
+                    damping = max(0.2 * damping, options.min_damping)
                     break
-                damping = max(8.0 * damping, FIRST_DAMPING)
-            if gained < enough * cost or (iteration == ITERATIONS and gained < UNFINISHED * cost):
+                damping = max(8.0 * damping, options.initial_damping)
+            last = iteration == options.max_iterations
+            if gained < ftol * cost or (last and gained < options.unfinished * cost):
                 blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
                 return Segmented(shared, own, cost, information, scores, iteration)
     raise ConvergenceError(
-        f"after {ITERATIONS} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} in each: try a "
-        "simpler friction model or shorter segments"
+        f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} in "
+        "each: try a simpler friction model or shorter segments"
     )
 
 
@@ -185,12 +186,12 @@ def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPo
     return _Blocks(normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:], gradient[:, :n], gradient[:, n:])
 
 
-def _stepped(blocks: _Blocks, shared: Array, own: Array, damping: float) -> tuple[Array, Array]:
+def _stepped(blocks: _Blocks, shared: Array, own: Array, damping: float, max_step: float) -> tuple[Array, Array]:
     information, scores, solve, known = blocks.reduced(damping)
     full = np.diag(blocks.shared.sum(axis=0))
     scale = np.sqrt(np.maximum(full, 1e-12 * full.max()))
     matrix = information / np.outer(scale, scale) + damping * np.eye(shared.size)
     step = -np.linalg.lstsq(matrix, scores.sum(axis=0) / scale, rcond=1e-13)[0] / scale
-    step = np.clip(step, -LONGEST, LONGEST)
+    step = np.clip(step, -max_step, max_step)
     own_step = -known - np.einsum("sij,j->si", solve, step)
-    return shared + step, own + np.clip(own_step, -LONGEST, LONGEST)
+    return shared + step, own + np.clip(own_step, -max_step, max_step)

@@ -8,10 +8,11 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.models.parameters import CONSTANTS, Physics
+from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.closed_loop import Stabilised
 
-RELATIVE, LEAST = 1e-5, 1e-7
-"""A difference is taken over this much of a parameter's value, and at least so much of its unit."""
+RTOL, ATOL = 1e-5, 1e-7
+"""A difference is taken over this much of a parameter's value, and this much of its unit."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class StabilisedRun:
         """Of this period, during which `stabiliser` gave part of the torque."""
         return cls(stabiliser, period.filled(), period.rate, period.command_to_sample)
 
-    def roughly(self) -> "StabilisedRun":
+    def integrated(self, _: IntegrationOptions) -> "StabilisedRun":
         """Itself: it has one step only."""
         return self
 
@@ -38,22 +39,27 @@ class StabilisedRun:
         return self.stabiliser.positions(physics, start, self.rate, self.command_to_sample)
 
     def pieces(
-        self, physics: Physics, start: Array, names: tuple[str, ...], pull: Array | None = None, share: float = 1.0
+        self,
+        physics: Physics,
+        start: Array,
+        names: tuple[str, ...],
+        _tracking_stiffness: Array | None = None,
+        horizon: float = 1.0,
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """The whole run, or the first `share` of it, as one piece, as `SimulatedRun.pieces` gives them.
+        """The whole run, or the share `horizon` from its beginning, as one piece, as `SimulatedRun.pieces` gives them.
 
-        Its stabiliser is `pull` enough.
+        Its stabiliser keeps it near the measured motion: it needs no springs.
         """
         position = self.position(physics, start)
         derivatives = []
         for name in names:
-            step = LEAST + RELATIVE * abs(_value(physics, name))
+            step = ATOL + RTOL * abs(_value(physics, name))
             derivatives.append((self.position(_nudged(physics, name, step), start) - position) / step)
         for index in np.ndindex(*start.shape):
             nudged = start.copy()
-            nudged[index] += LEAST
-            derivatives.append((self.position(physics, nudged) - position) / LEAST)
-        count = round(share * self.measured.shape[1])
+            nudged[index] += ATOL
+            derivatives.append((self.position(physics, nudged) - position) / ATOL)
+        count = round(horizon * self.measured.shape[1])
         yield slice(0, count), position[:, :count], np.stack(derivatives, axis=-1)[:, :count]
 
 

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.data.fourier import Lines, Motion, cut_off, held_lines, lines_of, motion_of
+from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ShapeError, UnidentifiableError
 from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
+from hil.estimator.options import LinearOptions
 
-COULOMB_WIDTH = 0.05  # rad/s: about the velocity that the dropped lines leave in a sticking joint
-WORST_CONDITION = 1e8
+DEFAULTS = LinearOptions()
 
 
 @dataclass(frozen=True)
@@ -33,18 +33,18 @@ class LinearEstimate:
     """Standard errors if the residual were white (parameters,): optimistic for other friction."""
     delay: float
     """Delay of the motors' torque [s]."""
-    motions: tuple[Motion, ...]
+    motions: tuple[PeriodicMotion, ...]
     """Each period's motion from its lines up to `harmonics`."""
     harmonics: tuple[int, ...]
     """Highest harmonic used of each period."""
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> PeriodicMotion:
         """Of the first period."""
         return self.motions[0]
 
 
-def fit_lines(*periods: SettledPeriod) -> LinearEstimate:
+def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> LinearEstimate:
     """Estimate the base parameters from one or more settled periods of one arm.
 
     Raises UnidentifiableError when the motion does not tell them apart, ShapeError for periods of arms with
@@ -59,20 +59,24 @@ def fit_lines(*periods: SettledPeriod) -> LinearEstimate:
         motion_of(line, highest, period.fundamental, period.samples)
         for line, highest, period in zip(lines, harmonics, periods, strict=True)
     )
-    equations = [_equations(*each) for each in zip(periods, motions, harmonics, strict=True)]
+    width = options.coulomb_width
+    equations = [_equations(*each, width) for each in zip(periods, motions, harmonics, strict=True)]
     A = np.concatenate([columns for columns, _ in equations], axis=1)
     torque = np.concatenate([goal for _, goal in equations], axis=1)
 
-    theta, _ = _solve(A, torque, np.ones(joints))
+    theta, _ = _solve(A, torque, np.ones(joints), options.max_condition)
     # The second time each joint counts by what the first left unexplained of it.
     left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
-    theta, std = _solve(A, torque, 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max()))
+    weight = 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max())
+    theta, std = _solve(A, torque, weight, options.max_condition)
     return LinearEstimate(base_names(joints), theta[:-1], std[:-1], float(theta[-1]), motions, harmonics)
 
 
-def _equations(period: SettledPeriod, motion: Motion, harmonics: int) -> tuple[Lines, Lines]:
+def _equations(
+    period: SettledPeriod, motion: PeriodicMotion, harmonics: int, coulomb_width: float
+) -> tuple[Lines, Lines]:
     """One period's columns (joints, lines, unknowns) and torques (joints, lines), line by line."""
-    Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)
+    Y = regressor(motion.position, motion.velocity, motion.acceleration, coulomb_width)
     # One joint after the other: a long period's spectra of all regressors at once would fill the memory.
     columns = np.stack([np.fft.rfft(rows, axis=0)[: harmonics + 1] for rows in Y]) / period.samples
     torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : harmonics + 1]
@@ -80,7 +84,7 @@ def _equations(period: SettledPeriod, motion: Motion, harmonics: int) -> tuple[L
     return np.concatenate((columns, slope[:, :, None]), axis=2), torque
 
 
-def _solve(columns: Lines, torque: Lines, weight: Array) -> tuple[Array, Array]:
+def _solve(columns: Lines, torque: Lines, weight: Array, max_condition: float) -> tuple[Array, Array]:
     """Weighted least squares of complex `torque` (joints, lines) on `columns` (joints, lines, unknowns)."""
     weighted = (columns * weight[:, None, None]).reshape(-1, columns.shape[2])
     A = np.concatenate((weighted.real, weighted.imag))
@@ -88,10 +92,10 @@ def _solve(columns: Lines, torque: Lines, weight: Array) -> tuple[Array, Array]:
     b = np.concatenate((goal.real, goal.imag))
     norm = np.linalg.norm(A, axis=0)
     U, size, Vt = np.linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
-    if size[-1] * WORST_CONDITION < size[0]:
+    if size[-1] * max_condition < size[0]:
         raise UnidentifiableError(
             f"the regression's condition is {size[0] / max(size[-1], 1e-300):.2g}, at most "
-            f"{WORST_CONDITION:.0e} can be solved: the motion does not tell parameters apart; "
+            f"{max_condition:.0e} can be solved: the motion does not tell parameters apart; "
             "excite more lines or raise the torque"
         )
     theta = Vt.T @ ((U.T @ b) / size)

@@ -11,12 +11,12 @@ from hil.estimator.errors import PeriodicityError
 from hil.estimator.fit.multiple_shooting import ALL, Shooting
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
+from hil.estimator.options import SettlingOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
 
 LEAST_WIDTH = 1e-3  # rad/s of a Coulomb step, where a method knows none
-MOST_PERIODS = 20  # simulated until the motion is periodic
-PERIODIC = 1e-6  # rad and rad/s, from one period's end to the next
+SETTLING = SettlingOptions(max_periods=20, atol=1e-6)
 
 
 def prediction_rms(
@@ -81,13 +81,13 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
     )
     filled = period.filled()
     state = np.stack((filled.mean(axis=1), np.zeros(period.joints), np.zeros(period.joints)))
-    for _ in range(MOST_PERIODS):
+    for _ in range(SETTLING.max_periods):
         position, end = simulate(physics, state, motor, step)
-        if float(np.abs(end - state).max()) < PERIODIC:
+        if float(np.abs(end - state).max()) < SETTLING.atol:
             error: Array = np.sqrt(np.nanmean((period.position - position) ** 2, axis=1)) / filled.std(axis=1)
             return error
         state = end
-    raise PeriodicityError(f"under these parameters the arm does not settle within {MOST_PERIODS} periods")
+    raise PeriodicityError(f"under these parameters the arm does not settle within {SETTLING.max_periods} periods")
 
 
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:

@@ -19,9 +19,9 @@ from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.identify import Estimate, identify, predict
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import Drive
+from hil.estimator.options import SelectionOptions
 
-WORTH = 0.98  # of the score of the best so far: what another term must reach to be kept
-EXPLAINED = 1.05  # error of prediction in units of the noise: nothing is left for another term
+DEFAULTS = SelectionOptions()
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ def choose(
     *,
     torque_scale: bool = False,
     starts: Sequence[Mapping[str, float]] = (),
+    options: SelectionOptions = DEFAULTS,
 ) -> Choice:
     """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
 
@@ -93,16 +94,18 @@ def choose(
     joints = periods[0].joints
     for step in _ladder(joints, drive):
         model = step.having("torque_scale") if torque_scale else step
-        trial = tried(model if best is None else _on_top(model, best.model), hasty=True)
+        trial = tried(model if best is None else _on_top(model, best.model), coarse=True)
         trials.append(trial)
-        if best is None or (trial.score < WORTH * best.score and _beyond_chance(trial.estimate, best.estimate)):
+        if best is None or (
+            trial.score < options.keep_ratio * best.score and _beyond_chance(trial.estimate, best.estimate)
+        ):
             best = trial
-        if best.score < EXPLAINED:
+        if best.score < options.explained_error:
             break
     if best is None or best.estimate is None:
         raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
-    if best.score >= EXPLAINED:
-        best = tried(best.model, hasty=False)
+    if best.score >= options.explained_error:
+        best = tried(best.model, coarse=False)
     return Choice(tuple(trials), best)
 
 
@@ -141,12 +144,12 @@ def _try(
     starts: Sequence[Mapping[str, float]],
     model: Model,
     *,
-    hasty: bool,
+    coarse: bool,
 ) -> Trial:
     started = time.perf_counter()
     relative = None
     try:
-        estimate = identify(periods, model, hasty=hasty, starts=starts)
+        estimate = identify(periods, model, coarse=coarse, starts=starts)
         if held_out is None:
             score = _criterion(estimate, periods)
         else:

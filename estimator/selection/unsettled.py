@@ -18,9 +18,10 @@ from hil.estimator.errors import ConvergenceError, RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, Drive, Option
+from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.prediction import prediction_errors
 
-WORTH = 0.98  # of the error of the best so far: what another term must reach to be kept
+DEFAULTS = SelectionOptions()
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
 
 
@@ -58,6 +59,7 @@ def choose_by_shooting(
     length: float = 1.0,
     zeros: bool = False,
     torque_scale: bool = False,
+    options: SelectionOptions = DEFAULTS,
 ) -> SegmentChoice:
     """Fit richer and richer friction, presliding and asymmetry on the best, as long as segments left out are predicted
     better.
@@ -79,11 +81,11 @@ def choose_by_shooting(
     trials = [tried(Model(joints, friction, drive, always)) for friction in FRICTIONS]
     best = trials[0]
     for trial in trials[1:]:
-        best = trial if trial.score < WORTH * best.score else best
+        best = trial if trial.score < options.keep_ratio * best.score else best
     further: tuple[Option, ...] = ("presliding", "asymmetry")
     for option in further:
         trials.append(tried(best.model.having(option)))
-        best = trials[-1] if trials[-1].score < WORTH * best.score else best
+        best = trials[-1] if trials[-1].score < options.keep_ratio * best.score else best
     if best.held_out is None:
         raise ConvergenceError("no friction model could be fitted: look at the recording and its units")
     estimate = estimate_by_shooting(recordings, best.model, start, length=length, zeros=zeros)

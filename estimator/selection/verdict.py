@@ -137,4 +137,4 @@ def _outliers(estimate: Estimate, validation: Validation) -> tuple[str, ...]:
     # Where the model lacks something, what is far from it is no fault of the reading.
     if not estimate.outliers or validation.residual_over_floor.max() > EXPLAINED:
         return ()
-    return (f"{estimate.outliers} readings were far off and weighed down; if that goes on, look at cables and baud.",)
+    return (f"{estimate.outliers} readings were far off and downweighted; if that goes on, look at cables and baud.",)

@@ -26,6 +26,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import Physics, place_of
+from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
 
 # Of joint 1 in `Physics.vector`; joint 2 follows.
@@ -36,13 +37,13 @@ LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
     place_of, ("load", "viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale")
 )
 
-LONGEST_STEP = 0.85e-3  # s
-MOST_PIECES = 64
+INTEGRATION = IntegrationOptions()
+MAX_SUBSTEPS = INTEGRATION.max_substeps
 FADED = 40.0  # e to minus this is lost beside 1, and takes a library longer than any other power
 GAMMA = 1.0 - math.sqrt(0.5)
 
 
-def steps_per_sample(rate: float, longest: float = LONGEST_STEP) -> int:
+def steps_per_sample(rate: float, longest: float = INTEGRATION.max_step) -> int:
     """Integration steps of at most `longest` [s] in one sample at `rate` [1/s]."""
     return math.ceil(1.0 / (rate * longest))
 
@@ -69,7 +70,7 @@ def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tupl
     return position[:joints], state[:, :joints]
 
 
-def finer_pieces(physics: Physics, step: float, most: int = MOST_PIECES) -> int:
+def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> int:
     """Finer steps in place of one of `step` [s] near standstill, at most `most`.
 
     Dry friction turned round may carry a joint across a quarter of its step's width in one of them. A power of

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import SLIDING, Physics
-from hil.estimator.simulation.arm import MOST_PIECES, pieces_now
+from hil.estimator.simulation.arm import MAX_SUBSTEPS, pieces_now
 from hil.estimator.simulation.bristles import (
     COULOMB,
     DAMPING,
@@ -58,10 +58,10 @@ class PreslidingSensitive(Sensitive):
         start: Array,
         causes: tuple[str, ...],
         step: float,
-        most_pieces: int = MOST_PIECES,
-        pull: Array | None = None,
+        max_substeps: int = MAX_SUBSTEPS,
+        tracking_stiffness: Array | None = None,
     ) -> None:
-        super().__init__(physics, start, causes, step, most_pieces, pull)
+        super().__init__(physics, start, causes, step, max_substeps, tracking_stiffness)
         *room, at = self._room
         # Dry friction is the bristles' here: within the arm's step its derivatives go nowhere.
         within = at.copy()

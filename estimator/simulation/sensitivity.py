@@ -33,7 +33,7 @@ from hil.estimator.simulation.arm import (
     FADING,
     GAMMA,
     LOAD,
-    MOST_PIECES,
+    MAX_SUBSTEPS,
     OFFSET,
     RISE,
     SCALE,
@@ -70,7 +70,7 @@ class Sensitive:
 
     `start` (2, joints): angles [rad] and velocities [rad/s] at the first sample; `causes`: names of what to
     differentiate by, from CAUSES; `step` [s]: length of one integration step, cut into at most
-    `most_pieces` where a joint is near standstill; `pull` (joints,) [N m/rad]: stiffness of
+    `max_substeps` where a joint is near standstill; `tracking_stiffness` (joints,) [N m/rad]: stiffness of
     springs from the simulated joints to angles given beside the torque, which are not there in the arm.
     """
 
@@ -80,14 +80,14 @@ class Sensitive:
         start: Array,
         causes: tuple[str, ...],
         step: float,
-        most_pieces: int = MOST_PIECES,
-        pull: Array | None = None,
+        max_substeps: int = MAX_SUBSTEPS,
+        tracking_stiffness: Array | None = None,
     ) -> None:
         self._joints = start.shape[1]
         self._count = len(causes)
         self._constants = physics.vector
         self._step = step
-        self._pieces = finer_pieces(physics, step, most_pieces)
+        self._pieces = finer_pieces(physics, step, max_substeps)
         self._state = np.zeros((2, 2))
         self._state[:, : self._joints] = start
         self._places: npt.NDArray[np.int64] = np.full(len(CAUSES), NOWHERE)
@@ -100,16 +100,16 @@ class Sensitive:
         for row, inertia in ((4, 0), (4, 2), (5, 2), (6, 2), (6, 3)):
             rows[:, row, self._places[inertia]] = 1.0
         spring = np.zeros((2, 2))
-        spring[0, : self._joints] = 0.0 if pull is None else pull
+        spring[0, : self._joints] = 0.0 if tracking_stiffness is None else tracking_stiffness
         self._room = (rows.reshape(-1), np.zeros(2 * NUMBERS), *np.zeros((4, 2, 2)), spring, self._places)
         self._z = z.reshape(-1)
         self._turn = np.zeros(1, dtype=np.int64)
 
-    def advance(self, torque: Array, torque_slopes: Array, pulled_to: Array | None = None) -> tuple[Array, Array]:
+    def advance(self, torque: Array, torque_slopes: Array, tracked: Array | None = None) -> tuple[Array, Array]:
         """Go on by as many samples as `torque` has.
 
         `torque` (joints, samples, steps): mean motor torque over each step after each sample [N m];
-        `torque_slopes` (2, joints, samples, steps): its derivatives by delay and lag [N m/s]; `pulled_to` (joints,
+        `torque_slopes` (2, joints, samples, steps): its derivatives by delay and lag [N m/s]; `tracked` (joints,
         samples) [rad]: the springs' other ends, held from sample to sample. Returns the angles (joints, samples)
         [rad] and their derivatives (joints, samples, causes).
         """
@@ -119,7 +119,7 @@ class Sensitive:
         slopes = np.zeros((2, 2, samples, steps))
         slopes[:, :joints] = torque_slopes
         ends = np.zeros((2, samples))
-        ends[:joints] = 0.0 if pulled_to is None else pulled_to
+        ends[:joints] = 0.0 if tracked is None else tracked
         position = np.empty((2, samples))
         derivative = np.empty((2, samples, self._count))
         self._go_on(

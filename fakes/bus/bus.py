@@ -14,10 +14,12 @@ import math
 from collections.abc import Sequence
 
 from hil.drivers.clock import Clock
-from hil.drivers.packet import Packet
+from hil.drivers.packet import Instruction, Packet, encode
 from hil.fakes.bus.fault_effects import begin, end, put_with_faults
 from hil.fakes.bus.faults import Fault, FaultKind, Faults
+from hil.fakes.bus.hand import Hand
 from hil.fakes.bus.instructions import Instructions
+from hil.fakes.bus.joints import Joints, States
 from hil.fakes.bus.receiver import Receiver
 from hil.fakes.bus.supply import Supply
 from hil.fakes.bus.sync_reads import Reply
@@ -34,7 +36,8 @@ TICK_S = 1e-3
 
 
 class FakeBus:
-    """The wire, the adapter and everything behind it. Servo `i` of the sequence moves joint `i` of the plant.
+    """The wire, the adapter and everything behind it. Servo `i` of the sequence moves joint `i` of the plant, or where
+    `joints` is given joint `joints[i]`, so that two of them may move one.
 
     The plant's time is 0 when the bus is made. Times in this class are seconds on `clock`, but for `time` and those of
     faults, which count from when the bus was made.
@@ -46,13 +49,12 @@ class FakeBus:
         plant: Plant,
         clock: Clock,
         *,
+        joints: Sequence[int] | None = None,
         baud: int = 1_000_000,
         adapter_latency_us: float = 0.0,
         supply: Supply | None = None,
         seed: int = 0,
     ) -> None:
-        if len(servos) != plant.joints:
-            raise ValueError(f"{len(servos)} servos for a plant of {plant.joints} joints: one servo per joint")
         self.plant = plant
         self.clock = clock
         self.packets = 0
@@ -63,16 +65,18 @@ class FakeBus:
         self.pulled_at = -math.inf
         """When the cable was pulled last."""
         self._servos = tuple(servos)
+        self._joints = Joints(servos, plant, joints)
         self._supply = supply
         self._wire = Wire(baud, adapter_latency_us * 1e-6)
         self._receiver = Receiver()
         self._origin = self._now = clock.now()
         self._sent_by = self._now
         self._next_tick = math.inf
-        self._joint = {servo: joint for joint, servo in enumerate(self._servos)}
+        self._index = {servo: index for index, servo in enumerate(self._servos)}
+        self._hand = Hand(self._joints, plant, lambda: self.clock.now() - self._origin, self._ticks_wanted)
         self.faults = Faults(seed, self._begin_fault, self._end_fault)
         self._instructions = Instructions(self._servos, self)
-        for joint, servo in enumerate(self._servos):
+        for joint, servo in zip(self._joints.of, self._servos, strict=True):
             servo.power_up(self._now, lambda joint=joint: self.plant.position[joint])  # type: ignore[misc]
             servo.changed = self._servo_changed
         self._servo_changed()
@@ -95,6 +99,12 @@ class FakeBus:
         """The servos by their present ID, in the state they have at the clock's present time."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
+
+    @property
+    def hand(self) -> Hand:
+        """Moves joints whose torque is off; as it is at the clock's present time."""
+        self.advance(self.clock.now())
+        return self._hand
 
     @property
     def time(self) -> float:
@@ -196,17 +206,19 @@ class FakeBus:
         """Move plant, servos and faults on to `until`; nothing when that is past."""
         if until <= self._now:
             return
-        commands = []
         event = until >= self._next_tick or until - self._origin >= self.faults.next_change
+        commands = []
         for servo in self._servos:
             commands.append(servo.motor_current_a)
             if servo.watchdog_s and until > servo.heard_at + servo.watchdog_s:
                 event = True
         if event:
             self._advance_by_events(until)
-        else:
+        elif self._joints.one_each:
             self.plant.advance(until - self._origin, commands)
             self._now = until
+        else:
+            self._move_plant(until)
 
     def _advance_by_events(self, until: float) -> None:
         """Stop at each tick, fault and watchdog's trip, so that the plant sees its effect from that moment on."""
@@ -230,22 +242,27 @@ class FakeBus:
         self.faults.change(max(now - self._origin, self.faults.next_change))
 
     def _tick(self, now: float) -> None:
-        plant = self.plant
-        state = list(zip(self._servos, plant.position, plant.velocity, plant.current, strict=True))
+        state = self.joints()
         if self._supply is not None:
-            self._supply.load(self._servos, plant.current, now)
-        for servo, position, velocity, current in state:
+            self._supply.load(self._servos, state[2], now)
+        for servo, position, velocity, current in zip(self._servos, *state, strict=True):
             if servo.needs_ticks:
                 servo.tick(TICK_S, position, velocity, current)
+        if self._hand.busy:
+            self._hand.tick(now - self._origin)
 
     def _move_plant(self, until: float) -> None:
-        self.plant.advance(until - self._origin, [servo.motor_current_a for servo in self._servos])
+        self.plant.advance(until - self._origin, self._joints.commands())
         self._now = until
 
     def _servo_changed(self) -> None:
         """A servo has another ID, or needs ticks, or needs none any more."""
         self._instructions.route()
-        if self._supply is None and not any(servo.needs_ticks for servo in self._servos):
+        self._ticks_wanted()
+
+    def _ticks_wanted(self) -> None:
+        """Begin or end to tick, as servos and hand need it."""
+        if self._supply is None and not self._hand.busy and not any(servo.needs_ticks for servo in self._servos):
             self._next_tick = math.inf
         elif self._next_tick == math.inf:
             self._next_tick = self._now + TICK_S
@@ -256,14 +273,22 @@ class FakeBus:
             self.pulls += 1
             self.pulled_at = max(self._origin + fault.at, self.clock.now())
             self._wire.cut(self.pulled_at)
+        elif fault.kind == FaultKind.OTHER_MASTER:
+            self._other_master_speaks(self._servos[0].id if fault.servo is None else fault.servo)
         else:
-            begin(fault, self._servos, self.plant, self._now)
+            begin(fault, self._servos, self._joints.of, self.plant, self._now)
 
     def _end_fault(self, fault: Fault) -> None:
         if fault.kind == FaultKind.CABLE_PULLED:
             self.cable_is_out = False
         else:
-            end(fault, self._servos, self.plant)
+            end(fault, self._servos, self._joints.of, self.plant)
+
+    def _other_master_speaks(self, servo_id: int) -> None:
+        """Somebody else asks a servo for its Present Position; the host hears the question and the answer."""
+        request = encode(servo_id, Instruction.READ, b"\x84\x00\x04\x00")
+        asked_by = self._wire.put(request, self._now)
+        self._instructions.receive(Packet(servo_id, Instruction.READ, request[8:-2]), asked_by)
 
     # The servos' side
 
@@ -299,17 +324,26 @@ class FakeBus:
         """Bring the registers of a stretch up to date with the servo's joint."""
         end_address = address + length
         if (address < PRESENT_END and end_address > PRESENT_START) or servo.memory.is_indirect(address, length):
-            joint = self._joint[servo]
+            index = self._index[servo]
             position, velocity, current = self.joints()
-            servo.present.measure(address, end_address, self._now, position[joint], velocity[joint], current[joint])
+            servo.present.measure(address, end_address, self._now, position[index], velocity[index], current[index])
 
-    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Positions [rad], velocities [rad/s] and motor currents [A] of all joints."""
-        return self.plant.position, self.plant.velocity, self.plant.current
+    def joints(self) -> States:
+        """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
+        return self._joints.states()
 
     def is_moving(self, servo: Servo) -> bool:
         """Whether the servo's register Moving is 1."""
-        return servo.present.moves(self.plant.velocity[self._joint[servo]])
+        return servo.present.moves(self.plant.velocity[self._joints.of[self._index[servo]]])
+
+    @property
+    def servos_refuse(self) -> bool:
+        """Whether a fault lasts by which servos refuse what they are told."""
+        return bool(self.faults.on_answers)
+
+    def fault_error(self, servo: Servo, now: float) -> int:
+        """The ERR byte with which a fault has a servo answer."""
+        return self.faults.error(servo.id, now - self._origin)
 
     def count_collision(self) -> None:
         """Two servos with one ID have answered at once."""

@@ -12,9 +12,12 @@ if TYPE_CHECKING:
     from hil.fakes.bus.wire import Wire
 
 
-def begin(fault: Fault, servos: Sequence[Servo], plant: Plant, now: float) -> None:
-    """Do to servos and joints what the fault does; nothing for the kinds that are not about them. now: bus time [s]."""
-    for joint, servo in enumerate(servos):
+def begin(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant, now: float) -> None:
+    """Do to servos and joints what the fault does; nothing for the kinds that are not about them.
+
+    joints: of each servo, which joint it moves. now: bus time [s].
+    """
+    for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):
             continue
         match fault.kind:
@@ -35,9 +38,9 @@ def begin(fault: Fault, servos: Sequence[Servo], plant: Plant, now: float) -> No
                 servo.present.jump_ticks += round(fault.size)
 
 
-def end(fault: Fault, servos: Sequence[Servo], plant: Plant) -> None:
+def end(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant) -> None:
     """Undo it, as far as it passes by itself: a heated servo stays hot, an error stays until a reboot."""
-    for joint, servo in enumerate(servos):
+    for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):
             continue
         match fault.kind:

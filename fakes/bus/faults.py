@@ -29,6 +29,8 @@ class FaultKind(StrEnum):
     NOISE = "noise"
     LOST_INSTRUCTION = "lost_instruction"
     CORRUPTED_INSTRUCTION = "corrupted_instruction"
+    STATUS_ERROR = "status_error"
+    OTHER_MASTER = "other_master"
     SILENT_SERVO = "silent_servo"
     REBOOT = "reboot"
     OVERHEATING = "overheating"
@@ -56,6 +58,14 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.NOISE: FaultFacts("random bytes come before a status packet", "bytes", 8),
     FaultKind.LOST_INSTRUCTION: FaultFacts("no servo hears an instruction packet"),
     FaultKind.CORRUPTED_INSTRUCTION: FaultFacts("the servos hear an instruction packet with a wrong CRC"),
+    FaultKind.STATUS_ERROR: FaultFacts(
+        "a servo refuses what it is told and answers with an error; 128 is the Alert bit, with which alone it obeys",
+        "ERR byte",
+        1,
+    ),
+    FaultKind.OTHER_MASTER: FaultFacts(
+        "another program on the bus asks a servo for its position, again and again", "seconds between", 0.01
+    ),
     FaultKind.SILENT_SERVO: FaultFacts("a servo's bus cable is out: it hears and says nothing, its motor goes on"),
     FaultKind.REBOOT: FaultFacts("a servo's supply breaks down for a moment and it boots", "seconds deaf", 0.25),
     FaultKind.OVERHEATING: FaultFacts("a servo is hotter than its Temperature Limit", "kelvin above it", 10),
@@ -80,6 +90,7 @@ REPLY_FAULTS = frozenset(
     }
 )
 INSTRUCTION_FAULTS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
+_LEAST_REPEAT_S = 1e-3
 
 
 class Fault(BaseModel):
@@ -108,6 +119,11 @@ class Fault(BaseModel):
         """`amount`, or what the kind has instead of it."""
         return FAULTS[self.kind].default if self.amount is None else self.amount
 
+    @property
+    def repeats_every(self) -> float:
+        """How often it happens anew while it lasts [s]; infinite for a fault that happens once."""
+        return max(self.size, _LEAST_REPEAT_S) if self.kind is FaultKind.OTHER_MASTER else math.inf
+
     def concerns(self, servo_id: int) -> bool:
         return self.servo is None or self.servo == servo_id
 
@@ -132,12 +148,14 @@ class Faults:
         """When the next fault begins or ends [s since the bus was made]."""
         self.on_replies: list[Fault] = []
         self.on_instructions: list[Fault] = []
-        """The faults of packets that last just now."""
+        self.on_answers: list[Fault] = []
+        """The faults of packets that last just now; on_answers: of what servos make of them."""
         self.random = Random(f"faults {seed}")
         self._begin = begin
         self._end = end
         self._to_come: list[Fault] = []
         self._lasting: list[Fault] = []
+        self._repeats: list[tuple[float, Fault]] = []
 
     def add(self, *faults: Fault) -> None:
         """Let these happen too. One whose time has passed begins at once."""
@@ -163,7 +181,19 @@ class Faults:
         for fault in sorted((fault for fault in self._to_come if fault.at <= now), key=lambda fault: fault.at):
             self._to_come.remove(fault)
             self._start(fault, now)
+        for index, (due, fault) in enumerate(self._repeats):
+            if due <= now:
+                self._repeats[index] = (max(due + fault.repeats_every, math.nextafter(now, math.inf)), fault)
+                if self.strikes(fault, fault.servo, now):
+                    self._begin(fault)
         self._look_ahead()
+
+    def error(self, servo_id: int, now: float) -> int:
+        """The ERR byte with which a servo answers instead of obeying; 0 when it obeys. now: seconds of the bus."""
+        for fault in self.on_answers:
+            if self.strikes(fault, servo_id, now):
+                return round(fault.size) & 0xFF
+        return 0
 
     def strikes(self, fault: Fault, servo_id: int | None, now: float) -> bool:
         """Whether a fault of packets strikes this one; if so, that is kept in `happened`."""
@@ -180,6 +210,10 @@ class Faults:
             self.on_replies.append(fault)
         elif fault.kind in INSTRUCTION_FAULTS:
             self.on_instructions.append(fault)
+        elif fault.kind is FaultKind.STATUS_ERROR:
+            self.on_answers.append(fault)
+        elif fault.repeats_every < math.inf:
+            self._repeats.append((now, fault))
         elif fault.probability >= 1.0 or self.random.random() < fault.probability:
             self.happened.append(Happened(now, fault.kind, fault.servo))
             self._begin(fault)
@@ -192,11 +226,16 @@ class Faults:
             self.on_replies.remove(fault)
         elif fault in self.on_instructions:
             self.on_instructions.remove(fault)
+        elif fault in self.on_answers:
+            self.on_answers.remove(fault)
+        elif fault.repeats_every < math.inf:
+            self._repeats = [entry for entry in self._repeats if entry[1] is not fault]
         else:
             self._end(fault)
 
     def _look_ahead(self) -> None:
         times = [fault.at for fault in self._to_come] + [fault.end for fault in self._lasting]
+        times += [due for due, _ in self._repeats]
         self.next_change = min(times, default=math.inf)
 
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 from hil.drivers.packet import (
+    ALERT,
     BROADCAST_ID,
     HEADER,
     MAX_LENGTH,
@@ -48,10 +49,19 @@ class Line(Protocol):
         ...
 
     def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Positions [rad], velocities [rad/s] and motor currents [A] of all joints, in the order of the servos."""
+        """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
         ...
 
     def is_moving(self, servo: Servo) -> bool: ...
+
+    @property
+    def servos_refuse(self) -> bool:
+        """Whether a fault lasts by which servos refuse what they are told."""
+        ...
+
+    def fault_error(self, servo: Servo, now: float) -> int:
+        """The ERR byte with which a fault has a servo answer; its number other than 0: instead of obeying."""
+        ...
 
     def count_collision(self) -> None: ...
 
@@ -120,7 +130,7 @@ class Instructions:
                 self._address(packet.id, lambda _: (StatusError.DATA_LENGTH, b""), now, least_level=1)
                 return
             address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
-            self._address(packet.id, lambda servo: self._read(servo, address, length), now, least_level=1)
+            self._address(packet.id, lambda servo: self._read(servo, address, length, now), now, least_level=1)
             return
         least_level = 0 if instruction == Instruction.PING else 2
         self._address(packet.id, lambda servo: self._execute(servo, instruction, body, now), now, least_level)
@@ -146,11 +156,25 @@ class Instructions:
     def _execute(
         self, servo: Servo, instruction: int, body: bytes, now: float, *, shadow: bool = False
     ) -> tuple[int, bytes]:
-        return servo.execute(instruction, body, now, self._line.is_moving(servo), shadow=shadow)
+        fault = self._line.fault_error(servo, now) if self._line.servos_refuse else 0
+        if fault & ~ALERT:
+            return fault, b""
+        error, data = servo.execute(instruction, body, now, self._line.is_moving(servo), shadow=shadow)
+        return error | fault, data
 
-    def _read(self, servo: Servo, address: int, length: int) -> tuple[int, bytes]:
+    def _read(self, servo: Servo, address: int, length: int, now: float) -> tuple[int, bytes]:
+        fault = self._line.fault_error(servo, now) if self._line.servos_refuse else 0
+        if fault & ~ALERT:
+            return fault, b""
         self._line.measure(servo, address, length)
-        return servo.read(address, length)
+        error, data = servo.read(address, length)
+        return error | fault, data
+
+    def _write(self, servo: Servo, addressed: int, address: int, data: bytes, now: float) -> None:
+        """One servo's part of a group write."""
+        if self._line.servos_refuse and self._line.fault_error(servo, now) & ~ALERT:
+            return
+        (servo.write if servo.id == addressed else servo.write_as_shadow)(address, data)
 
     # All of them, or several
 
@@ -169,8 +193,7 @@ class Instructions:
         for at in range(4, len(body) - length, length + 1):
             for servo in writers.get(body[at], ()):
                 if servo.heard_at == now:
-                    write = servo.write if servo.id == body[at] else servo.write_as_shadow
-                    write(address, body[at + 1 : at + 1 + length])
+                    self._write(servo, body[at], address, body[at + 1 : at + 1 + length], now)
 
     def _bulk_write(self, body: bytes, now: float) -> None:
         at = 0
@@ -180,13 +203,14 @@ class Instructions:
             if len(data) == length:
                 for servo in self._writers.get(body[at], ()):
                     if servo.heard_at == now:
-                        (servo.write if servo.id == body[at] else servo.write_as_shadow)(address, data)
+                        self._write(servo, body[at], address, data, now)
             at += 5 + length
 
     def _sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 4:
             return
-        if body.startswith(SPAN) and (replies := self._state_reads.sync_read(body, self._by_id, now)):
+        usual = body.startswith(SPAN) and not self._line.servos_refuse
+        if usual and (replies := self._state_reads.sync_read(body, self._by_id, now)):
             self._line.send(replies, now)
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
@@ -195,7 +219,8 @@ class Instructions:
     def _fast_sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 5:
             return
-        if body.startswith(SPAN) and (replies := self._state_reads.fast_sync_read(body, self._by_id, now)):
+        usual = body.startswith(SPAN) and not self._line.servos_refuse
+        if usual and (replies := self._state_reads.fast_sync_read(body, self._by_id, now)):
             self._line.send(replies, now)
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
@@ -208,14 +233,12 @@ class Instructions:
         self._fast_read(list(_bulk_parts(body)), now)
 
     def _group_read(self, parts: Sequence[Part], now: float) -> None:
-        measure = self._line.measure
         replies = []
         for servo_id, address, length in parts:
             servo = self._answering(servo_id, now)
             if servo is None:
                 break
-            measure(servo, address, length)
-            error, data = servo.read(address, length)
+            error, data = self._read(servo, address, length, now)
             replies.append((servo_id, servo.return_delay_s, encode_status(servo_id, error | servo.alert, data)))
         if replies:
             self._line.send(replies, now)
@@ -232,7 +255,7 @@ class Instructions:
             servo = self._answering(servo_id, now)
             if servo is None or not servo.has_fast_reads:
                 break
-            error, data = self._read(servo, address, length)
+            error, data = self._read(servo, address, length, now)
             whole += bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")
             whole += crc(whole).to_bytes(2, "little")
             replies.append((servo_id, servo.return_delay_s, whole[sent:]))

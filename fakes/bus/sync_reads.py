@@ -33,13 +33,14 @@ class Joints(Protocol):
     """Where the joints' states come from."""
 
     def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Positions [rad], velocities [rad/s] and motor currents [A] of all joints, in the order of the servos."""
+        """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
         ...
 
 
 class _Part(NamedTuple):
     servo: Servo
-    joint: int
+    place: int
+    """Among all servos."""
     front: bytes
     """Of a status packet: header, ID, LEN, INST."""
     id_byte: bytes
@@ -62,10 +63,10 @@ class StateReads:
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
         replies = []
-        for servo, joint, front, _ in parts:
+        for servo, place, front, _ in parts:
             if servo.heard_at != now or not servo.status_return_level:
                 return None
-            state = servo.present.state(positions[joint], velocities[joint], currents[joint])
+            state = servo.present.state(positions[place], velocities[place], currents[place])
             if _STUFFED in state:
                 reply = encode_status(servo.id, servo.alert, state)
             else:
@@ -82,10 +83,10 @@ class StateReads:
         whole = HEADER + bytes((BROADCAST_ID, size & 0xFF, size >> 8, Instruction.STATUS))
         replies = []
         sent = 0
-        for servo, joint, _, id_byte in parts:
+        for servo, place, _, id_byte in parts:
             if servo.heard_at != now or not servo.status_return_level or not servo.has_fast_reads:
                 return None
-            state = servo.present.state(positions[joint], velocities[joint], currents[joint])
+            state = servo.present.state(positions[place], velocities[place], currents[place])
             whole += _ALERT[servo.alert] + id_byte + state
             whole += crc(whole).to_bytes(2, "little")
             replies.append((servo.id, servo.return_delay_s, whole[sent:]))

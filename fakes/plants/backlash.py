@@ -49,6 +49,10 @@ class GearedArm:
         """Hold a joint's motor fast, or let it go."""
         self._rotors[joint].motor.jammed = jammed
 
+    def hold(self, joint: int, velocity: float | None) -> None:
+        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        self._rotors[joint].motor.held_at = velocity
+
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
         if remaining <= 0.0:

@@ -14,6 +14,7 @@ LONGEST_STEP = 0.6e-3  # s: short against the arm's own motion
 SHORTEST_STEP = 1e-9  # s: less than this is rounding
 STEP_PER_WIDTH = 0.02  # s per rad/s: short against the time the arm takes to cross a smooth friction step
 STEP_PER_SWING = 0.2  # of the time in which a rotor on its bristles swings through one radian of phase
+LEAST_GRIP = 5.0  # N m s/rad between a hand and the joint that it moves
 JAM = 1e6  # N m of dry friction: more than anything here can push
 
 
@@ -36,6 +37,7 @@ class Motor:
         "bristle_torque",
         "constants",
         "current",
+        "held_at",
         "jammed",
         "longest_step",
         "viscous",
@@ -61,6 +63,8 @@ class Motor:
         self._set_friction(0.0)
         self.jammed = False
         """True: something holds the joint fast."""
+        self.held_at: float | None = None
+        """The velocity of a hand that holds the joint [rad/s]; None where none does."""
         self.current = 0.0  # A
         self.longest_step = min(LONGEST_STEP, STEP_PER_WIDTH * self._width) if self._width else LONGEST_STEP
         if self.bristle_stiffness and drive.rotor_inertia:
@@ -88,7 +92,7 @@ class Motor:
     @property
     def is_plain(self) -> bool:
         """Whether lag, torque, offset and sticking Stribeck friction are all there is to it."""
-        return not (self._shaped or self._width or self.bristle_stiffness or self.jammed)
+        return not (self._shaped or self._width or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """What the drive does during one step, its angle and velocity given at the step's middle.
@@ -125,6 +129,11 @@ class Motor:
             level = 0.0
         if self.jammed:
             level += JAM
+        if self.held_at is not None:
+            # Stiff enough to take a bare rotor along within one step, and not stiffer: the hand's skin.
+            grip = max(2.0 * armature(self._drive) / step, LEAST_GRIP)
+            torque += grip * (self.held_at - velocity)
+            slope += grip
         return torque, level, slope, command + away * left
 
     def bend(self, step: float, velocity: float) -> None:

@@ -35,6 +35,7 @@ class MujocoPlant:
         self._step = float(model.opt.timestep)
         self._current = np.zeros(len(joints))
         self._jammed = [False] * len(joints)
+        self._held_at: list[float | None] = [None] * len(joints)
         mujoco.mj_forward(model, self._data)
 
     @property
@@ -57,6 +58,10 @@ class MujocoPlant:
         """Hold a joint fast, or let it go."""
         self._jammed[joint] = jammed
 
+    def hold(self, joint: int, velocity: float | None) -> None:
+        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        self._held_at[joint] = velocity
+
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._data.time
         if remaining <= 0.0:
@@ -72,11 +77,15 @@ class MujocoPlant:
         self._current = command + (self._current - command) * left
         self._data.qfrc_applied[self._velocity_at] = self._torque_constant * self._current
         held = {at: self._data.qpos[at] for at, jammed in zip(self._position_at, self._jammed, strict=True) if jammed}
+        before = [float(self._data.qpos[at]) for at in self._position_at]
         mujoco.mj_step(self._model, self._data)
         for joint, (position_at, velocity_at) in enumerate(zip(self._position_at, self._velocity_at, strict=True)):
             if self._jammed[joint]:
                 self._data.qpos[position_at] = held[position_at]
                 self._data.qvel[velocity_at] = 0.0
+            elif (velocity := self._held_at[joint]) is not None:
+                self._data.qpos[position_at] = before[joint] + velocity * step
+                self._data.qvel[velocity_at] = velocity
 
 
 def make_plant(

@@ -40,6 +40,10 @@ class Pendulum:
         """Hold the joint fast, or let it go."""
         self._motor.jammed = jammed
 
+    def hold(self, joint: int, velocity: float | None) -> None:
+        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        self._motor.held_at = velocity
+
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
         if remaining <= 0.0:

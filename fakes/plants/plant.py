@@ -65,6 +65,15 @@ class CanJam(Protocol):
         ...
 
 
+@runtime_checkable
+class CanBeHeld(Protocol):
+    """A plant whose joints a hand can take and move, for `hil.fakes.bus.hand`."""
+
+    def hold(self, joint: int, velocity: float | None) -> None:
+        """Take joint `joint` (from 0) and move it at `velocity` [rad/s] until told otherwise; None lets it go."""
+        ...
+
+
 def make_plant(arm: Arm) -> Plant:
     """The plant of this arm, at rest in its starting pose at time 0."""
     if any(drive.backlash for drive in arm.drives):
@@ -131,6 +140,12 @@ class CheckedPlant:
         if not isinstance(self._plant, CanJam):
             raise PlantError(f'plant "{self._name}" has no jam(joint, jammed): a stuck joint needs it')
         self._plant.jam(joint, jammed)
+
+    def hold(self, joint: int, velocity: float | None) -> None:
+        """Pass it on; PlantError when the plant cannot."""
+        if not isinstance(self._plant, CanBeHeld):
+            raise PlantError(f'plant "{self._name}" has no hold(joint, velocity): the hand needs it')
+        self._plant.hold(joint, velocity)
 
     def check(self) -> None:
         """Raise PlantError unless the state is one finite number per joint, three times."""

@@ -64,6 +64,10 @@ class TwoLink:
         """Hold a joint fast, or let it go."""
         self._motors[joint].jammed = jammed
 
+    def hold(self, joint: int, velocity: float | None) -> None:
+        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        self._motors[joint].held_at = velocity
+
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
         if remaining <= 0.0:

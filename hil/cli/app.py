@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -22,6 +22,7 @@ from hil.cli import study as cli_study
 
 if TYPE_CHECKING:
     from hil.config.schema import Config
+    from hil.results.result import SettledResult
 
 app = typer.Typer(
     name="hil",
@@ -89,6 +90,7 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
     from hil.config.schema import load_config
     from hil.errors import ConfigError
     from hil.experiment.run import run_experiment
+    from hil.results.json_form import to_json
     from hil.runs.recording import load_samples
     from hil.runs.run_folder import RunFolder
     from hil.runs.timing import timing
@@ -105,7 +107,11 @@ def record(config: ConfigPath, out: OutPath = None, json_only: Json = False) -> 
         torque = run_experiment(checked, run, config, watch)
     terminal.say(torque)
     samples = load_samples(run.samples_path, len(checked.joints))
-    recorded = {"run": str(run.path), "samples": len(samples), "timing": timing(samples, checked.experiment.rate)}
+    recorded = {
+        "run": str(run.path),
+        "samples": len(samples),
+        "timing": to_json(timing(samples, checked.experiment.rate)),
+    }
     if json_only:
         print(strict_json.dumps(recorded))
         return
@@ -291,9 +297,9 @@ def main() -> NoReturn:
     sys.exit(0)
 
 
-def _show(result: dict[str, Any], config: "Config", path: Path, json_only: bool) -> None:
+def _show(result: "SettledResult", config: "Config", path: Path, json_only: bool) -> None:
     if json_only:
-        print(strict_json.dumps(result))
+        print(strict_json.dumps(result.to_json()))
         return
     from rich.console import Console
 

@@ -5,7 +5,7 @@ The modules that do the work are imported inside the commands, as in hil.cli.app
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,7 @@ from hil import strict_json
 from hil.errors import ConfigError
 
 if TYPE_CHECKING:
+    from hil.results.result import ShootingResult
     from hil.runs.run_folder import RunFolder
 
 Runs = Annotated[
@@ -60,29 +61,29 @@ def estimate_all_samples(run: "RunFolder", json_only: bool) -> None:
     show_any(result, json_only)
 
 
-def show_any(result: dict[str, Any], json_only: bool) -> None:
+def show_any(result: "ShootingResult", json_only: bool) -> None:
     """Print a result of multiple shooting."""
     if json_only:
-        print(strict_json.dumps(result))
+        print(strict_json.dumps(result.to_json()))
         return
     from hil.estimation.physical import physical_lines
 
-    print(f"{result['joints']}-joint arm, {result['config']}")
-    for name, entry in (*result["parameters"].items(), *result["extra"].items()):
-        print(f"{name:22s} {entry['unit']:10s} {entry['value']:12.5g} {entry['std']:9.1e}")
-    rms = ", ".join(f"{1000 * value:.3g}" for value in result["fit"]["residual_rms_rad"])
-    for entry in result.get("zeros", ()):
-        shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(entry["zero"], entry["std"], strict=True))
-        print(f"Encoder zeros of {entry['recording']}: {shown} rad.")
-    print(f"{result['method']}.")
-    print(f"Residual {rms} mrad RMS over {result['fit']['segments']} segments.")
-    for warning in result["warnings"]:
+    print(f"{result.joints}-joint arm, {result.config}")
+    for name, entry in result.quantities.items():
+        print(f"{name:22s} {entry.unit:10s} {entry.value:12.5g} {entry.std:9.1e}")
+    rms = ", ".join(f"{1000 * value:.3g}" for value in result.fit.residual_rms_rad)
+    for found in result.zeros or ():
+        shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(found.zero, found.std, strict=True))
+        print(f"Encoder zeros of {found.recording or result.config}: {shown} rad.")
+    print(f"{result.method}.")
+    print(f"Residual {rms} mrad RMS over {result.fit.segments} segments.")
+    for warning in result.warnings:
         print(f"Warning: {warning}")
-    if "model_choice" in result:
-        choice = result["model_choice"]
-        print(f"Chosen by segments left out: {choice['chosen']}, error {choice['error_divided_by']:.2f} times smaller.")
-    if "physical" in result:
-        print("\n".join(physical_lines(result["physical"])))
+    if result.model_choice is not None:
+        choice = result.model_choice
+        print(f"Chosen by segments left out: {choice.chosen}, error {choice.error_divided_by:.2f} times smaller.")
+    if result.physical is not None:
+        print("\n".join(physical_lines(result.physical)))
 
 
 def compare(
@@ -93,21 +94,21 @@ def compare(
     """Other methods on the same recording: RLS, EKF, UKF, IDIM-LS, the paper's, mujoco.sysid."""
     from hil.cli.terminal import Terminal
     from hil.estimation.compare import compare_run
+    from hil.results.json_form import to_json
     from hil.runs.run_folder import RunFolder
 
     folder = RunFolder.open(run)
     with Terminal(quiet=json_only).busy("Running the peers"):
         compared = compare_run(folder, mujoco)
     if json_only:
-        print(strict_json.dumps(compared))
+        print(strict_json.dumps(to_json(compared)))
         return
     print(f"{'method':14s} {'seconds':>8s} {'worst error':>20s} {'held out':>9s}  settings")
-    for name, entry in compared["methods"].items():
-        worst = entry.get("worst_relative_error")
-        error = "-" if worst is None else f"{100 * worst:.3f} % {entry['worst_parameter']}"
-        held_out = entry.get("held_out_rms")
-        shown = "-" if held_out is None else f"{100 * held_out:.2f} %"
-        print(f"{name:14s} {entry['seconds']:8.3f} {error:>20s} {shown:>9s}  {entry['settings']}")
+    for name, found in compared.methods.items():
+        worst = found.worst_relative_error
+        error = "-" if worst is None else f"{100 * worst:.3f} % {found.worst_parameter}"
+        shown = "-" if found.held_out_rms is None else f"{100 * found.held_out_rms:.2f} %"
+        print(f"{name:14s} {found.seconds:8.3f} {error:>20s} {shown:>9s}  {found.settings}")
     print(f"Parameters and standard errors of each: {folder.path / 'compare.json'}")
 
 
@@ -126,6 +127,7 @@ def calibrate(
     from hil.cli.terminal import Terminal
     from hil.estimation.calibrate import calibrate_runs, calibration_lines
     from hil.estimator.calibration import KnownMass
+    from hil.results.json_form import to_json
     from hil.runs.run_folder import RunFolder
 
     runs = RunFolder.open(without), RunFolder.open(with_mass)
@@ -134,4 +136,4 @@ def calibrate(
         length = known.quantities()["length_1"].value
     with Terminal(quiet=json_only).busy("Calibrating"):
         result = calibrate_runs(*runs, KnownMass(mass, distance, inertia, length or 0.0))
-    print(strict_json.dumps(result) if json_only else "\n".join(calibration_lines(result)))
+    print(strict_json.dumps(to_json(result)) if json_only else "\n".join(calibration_lines(result)))

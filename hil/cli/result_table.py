@@ -1,7 +1,6 @@
 """A result as a table in the terminal: parameter, unit, value, standard error; on a fake arm the truth too."""
 
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -9,25 +8,26 @@ from rich.table import Table
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
-from hil.plan.stabiliser import StabiliserShare
+from hil.results.parts import Quantity
+from hil.results.result import SettledResult
 
 
-def print_result(result: dict[str, Any], config: Config, run: Path, console: Console) -> None:
+def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
     """The table, the fit and what to do next."""
     console.print(_parameters(result))
-    physical = physical_lines(result["physical"]) if "physical" in result else []
+    physical = [] if result.physical is None else physical_lines(result.physical)
     told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
     told = (*told, *_torque_constants(result, config), *physical)
     for line in (*told, *_next(result, run)):
         console.print(line, soft_wrap=True, markup=False)
 
 
-def _parameters(result: dict[str, Any]) -> Table:
-    truth = result.get("truth")
+def _parameters(result: SettledResult) -> Table:
+    truth = result.truth
     # Narrow enough for 80 columns, so that no figure is cut.
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.title, table.title_justify, table.title_style = (
-        f"{result['joints']}-joint arm, {result['config']}",
+        f"{result.joints}-joint arm, {result.config}",
         "left",
         "",
     )
@@ -35,17 +35,17 @@ def _parameters(result: dict[str, Any]) -> Table:
     table.add_column("unit", no_wrap=True)
     for heading in ("value", "std", *(("truth", "error %", "in std.") if truth else ())):
         table.add_column(heading, justify="right", no_wrap=True)
-    for name, entry in result["parameters"].items():
-        table.add_row(name, entry["unit"], *_numbers(entry, truth.get(name) if truth else None))
+    for name, entry in result.parameters.items():
+        table.add_row(name, entry.unit, *_numbers(entry, truth.get(name) if truth else None))
     table.add_row()
-    for name, entry in result["extra"].items():
-        table.add_row(name, entry["unit"], f"{entry['value']:.5g}", f"{entry['std']:.1e}")
+    for name, entry in result.extra.items():
+        table.add_row(name, entry.unit, f"{entry.value:.5g}", f"{entry.std:.1e}")
     table.add_row()
     return table
 
 
-def _numbers(entry: dict[str, Any], truth: float | None) -> list[str]:
-    value, std = entry["value"], entry["std"]
+def _numbers(entry: Quantity, truth: float | None) -> list[str]:
+    value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
         error = value - truth
@@ -54,13 +54,13 @@ def _numbers(entry: dict[str, Any], truth: float | None) -> list[str]:
     return cells
 
 
-def _fit(result: dict[str, Any]) -> list[str]:
-    fit = result["fit"]
-    residual = ", ".join(f"{value:.3f}" for value in fit["residual_rms_ticks"])
+def _fit(result: SettledResult) -> list[str]:
+    fit = result.fit
+    residual = ", ".join(f"{value:.3f}" for value in fit.residual_rms_ticks)
     lines = [
-        f"Residual {residual} encoder steps RMS; the encoder's own rounding is {fit['quantisation_floor_ticks']}.",
+        f"Residual {residual} encoder steps RMS; the encoder's own rounding is {fit.quantisation_floor_ticks}.",
     ]
-    held_out = result["validation"].get("held_out_rms")
+    held_out = result.validation.held_out_rms
     if held_out:
         errors = ", ".join(f"{100 * value:.2f} %" for value in held_out)
         lines.append(
@@ -69,35 +69,35 @@ def _fit(result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _choice(result: dict[str, Any]) -> list[str]:
-    choice = result.get("model_choice")
+def _choice(result: SettledResult) -> list[str]:
+    choice = result.model_choice
     if not choice:
         return []
-    tried = ", ".join(trial["model"] for trial in choice["tried"])
-    gained, cost = choice["error_divided_by"], choice["standard_errors_times"]
+    tried = ", ".join(trial.model for trial in choice.tried)
+    gained, cost = choice.error_divided_by, choice.standard_errors_times
     return [
-        f"Chosen of {tried}: {choice['chosen']}. Against the first, it predicts {gained:.3g} times better and makes "
+        f"Chosen of {tried}: {choice.chosen}. Against the first, it predicts {gained:.3g} times better and makes "
         f"the standard errors {cost:.3g} times larger."
     ]
 
 
-def _verdict(result: dict[str, Any]) -> list[str]:
-    verdict = result["verdict"]
-    said = [*verdict["sentences"], *(f"Warning: {warning}" for warning in result["warnings"])]
-    return [f"Trust it: {verdict['trust']}. " + " ".join(said)]
+def _verdict(result: SettledResult) -> list[str]:
+    verdict = result.verdict
+    said = [*verdict.sentences, *(f"Warning: {warning}" for warning in result.warnings)]
+    return [f"Trust it: {verdict.trust}. " + " ".join(said)]
 
 
-def _stabiliser(result: dict[str, Any], config: Config) -> list[str]:
-    if "stabiliser" not in result:
+def _stabiliser(result: SettledResult, config: Config) -> list[str]:
+    if result.stabiliser is None:
         return []
-    return [StabiliserShare.from_json(result["stabiliser"]).said([joint.name for joint in config.joints])]
+    return [result.stabiliser.said([joint.name for joint in config.joints])]
 
 
-def _torque_constants(result: dict[str, Any], config: Config) -> list[str]:
-    said = [by_voltage_said(config.joints), torque_constants_said(config.joints, result["extra"])]
+def _torque_constants(result: SettledResult, config: Config) -> list[str]:
+    said = [by_voltage_said(config.joints), torque_constants_said(config.joints, result.extra)]
     return [each for each in said if each]
 
 
-def _next(result: dict[str, Any], run: Path) -> list[str]:
+def _next(result: SettledResult, run: Path) -> list[str]:
     lines = [f"Run folder: {run}, its report: {run / 'report.html'}"]
     return [*lines, f"Estimate again from the recording: hil estimate {run}"]

@@ -1,17 +1,16 @@
 """Arms that could be the one on the bench: drawn from a prior, or from a former result with its covariance."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.prior import base_draws
-from hil.errors import RunFolderError
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
+from hil.results.result import Result
 
 Array = NDArray[np.float64]
 
@@ -59,22 +58,16 @@ def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
     return Ensemble(physics, scale, "prior")
 
 
-def result_ensemble(result: dict[str, Any], count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
-    """From a result.json, its covariance widened by what the residual says the model lacks. Raises RunFolderError.
+def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
+    """From a result, its covariance widened by what the residual says the model lacks.
 
     farther: range of motion that will be simulated over the range that the result was identified on.
     """
-    try:
-        names = list(result["covariance"]["names"])
-        covariance = np.array(result["covariance"]["matrix"], dtype=float)
-        known = {**result["parameters"], **result["extra"]}
-        value = np.array([known[name]["value"] for name in names])
-        ticks = max(result["fit"]["residual_rms_ticks"])
-        joints = int(result["joints"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise RunFolderError(
-            f"The result holds no parameters with covariance ({error!r}); estimate it anew."
-        ) from error
+    names = result.covariance.names
+    covariance = result.covariance.array()
+    known = result.values
+    value = np.array([known[name] for name in names])
+    ticks = max(result.fit.residual_rms_ticks)
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)
     # A residual beyond rounding is model error, which shifts parameters by more than their covariance says.
     widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2
@@ -82,7 +75,7 @@ def result_ensemble(result: dict[str, Any], count: int, farther: float = 1.0, se
     random = np.random.default_rng((seed, 7))
     drawn = _draws(random, value, widened + extra, count)
     physics = tuple(Physics.of(_physical(dict(zip(names, row.tolist(), strict=True)), known)) for row in drawn)
-    return Ensemble(physics, np.ones((count, joints)), "result")
+    return Ensemble(physics, np.ones((count, result.joints)), "result")
 
 
 def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
@@ -95,17 +88,16 @@ def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: i
     return drawn
 
 
-def nominal(result: dict[str, Any]) -> Physics:
+def nominal(result: Result) -> Physics:
     """The arm that a result describes."""
-    known = {**result["parameters"], **result["extra"]}
-    return Physics.of({name: entry["value"] for name, entry in known.items()})
+    return Physics.of(result.values)
 
 
-def _physical(drawn: dict[str, float], known: dict[str, Any]) -> dict[str, float]:
+def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, float]:
     """A draw moved into the range of real arms."""
     for name, value in drawn.items():
         if term_of(name).range in {"positive", "floor"}:
-            centre = abs(known[name]["value"])
+            centre = abs(known[name])
             least = _LEAST_WIDTH if term_of(name).range == "floor" else 1e-9
             drawn[name] = max(value, _LEAST_SHARE * centre, least)
     if "coupling" in drawn:

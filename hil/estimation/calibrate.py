@@ -1,6 +1,7 @@
 """`hil calibrate`: each joint's torque constant from two runs, one of them with a known mass bolted on."""
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,14 +12,55 @@ from hil.estimation.settled_period import settled_period
 from hil.estimator.calibration import Calibration, KnownMass, calibrate
 from hil.estimator.identify import identify
 from hil.plan.plan import IDENTIFY
+from hil.results.json_form import Spread
+from hil.results.parts import PerJoint
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
 SCHEMA = 1
 
 
-def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -> dict[str, Any]:
-    """The calibration as a dictionary; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
+@dataclass(frozen=True)
+class TorqueConstant:
+    """Found and supposed torque per goal of one joint, in `unit`: N m/A, or N m/V in pwm mode."""
+
+    value: float
+    std: Spread
+    supposed: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """A parameter with its standard error [SI]."""
+
+    value: float
+    std: Spread
+
+
+@dataclass(frozen=True)
+class CalibrationFit:
+    """residual_rms_ticks: of both runs in encoder steps RMS. misfit: weighted sum of squared residuals per
+    sample; 1 is noise alone. joints: how many.
+    """
+
+    residual_rms_ticks: tuple[PerJoint, ...]
+    misfit: float
+    joints: int
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """What `hil calibrate` found, per joint by name, with the arm's parameters on the way."""
+
+    schema: int
+    torque_per_goal: Mapping[str, TorqueConstant]
+    parameters: Mapping[str, Estimated]
+    fit: CalibrationFit
+
+
+def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -> CalibrationResult:
+    """The torque constants; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
     config, other = without.load_config(), with_mass.load_config()
     _same_arm(config, other)
     if config.arm.gravity == 0.0:
@@ -45,37 +87,40 @@ def _same_arm(config: Config, other: Config) -> None:
         raise ConfigError(f"one run has {len(config.joints)} joints and the other {len(other.joints)}.")
 
 
-def _described(config: Config, found: Calibration) -> dict[str, Any]:
+def _described(config: Config, found: Calibration) -> CalibrationResult:
     factor, std = found.factor.tolist(), found.factor_std.tolist()
-    base = len(config.joints)
-    return {
-        "schema": SCHEMA,
-        "torque_per_goal": {
-            joint.name: {
-                "value": joint.torque_per_goal * factor[i],
-                "std": joint.torque_per_goal * std[i],
-                "supposed": joint.torque_per_goal,
-                "unit": f"N m/{'V' if joint.drive_mode.name == 'PWM' else 'A'}",
-            }
+    return CalibrationResult(
+        schema=SCHEMA,
+        torque_per_goal={
+            joint.name: TorqueConstant(
+                value=joint.torque_per_goal * factor[i],
+                std=joint.torque_per_goal * std[i],
+                supposed=joint.torque_per_goal,
+                unit=f"N m/{'V' if joint.drive_mode.name == 'PWM' else 'A'}",
+            )
             for i, joint in enumerate(config.joints)
         },
-        "parameters": {
-            name: {"value": float(value), "std": float(error)}
+        parameters={
+            name: Estimated(float(value), float(error))
             for name, value, error in zip(found.names, found.value, found.std, strict=True)
         },
-        "fit": {"residual_rms_ticks": found.residual_steps.tolist(), "misfit": found.misfit, "joints": base},
-    }
+        fit=CalibrationFit(
+            residual_rms_ticks=tuple(map(tuple, found.residual_steps.tolist())),
+            misfit=found.misfit,
+            joints=len(config.joints),
+        ),
+    )
 
 
-def calibration_lines(result: dict[str, Any]) -> list[str]:
+def calibration_lines(result: CalibrationResult) -> list[str]:
     """What was found and what to write into the TOML."""
     lines = []
-    for name, entry in result["torque_per_goal"].items():
+    for name, found in result.torque_per_goal.items():
         lines.append(
-            f"{name}: {entry['value']:.4f} +- {entry['std']:.4f} {entry['unit']} "
-            f"({100 * (entry['value'] / entry['supposed'] - 1):+.1f} % from the {entry['supposed']:g} supposed)"
+            f"{name}: {found.value:.4f} +- {found.std:.4f} {found.unit} "
+            f"({100 * (found.value / found.supposed - 1):+.1f} % from the {found.supposed:g} supposed)"
         )
-    worst = float(np.max(result["fit"]["residual_rms_ticks"]))
+    worst = float(np.max(result.fit.residual_rms_ticks))
     lines.append(f"Residual of both runs: {worst:.3f} encoder steps at most; rounding alone leaves 0.289.")
     lines.append("The standard errors hold noise only: the mass's own error, and its distance's, come on top in full.")
     lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these and estimate again.")

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
 from hil.estimator.selection.prediction import settled_prediction_error
 from hil.plan.plan import HELD_OUT, IDENTIFY
+from hil.results.json_form import to_json
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder, write_json
 
@@ -27,12 +28,39 @@ OURS_PLAIN = "hil_coulomb"
 """This project's estimate with the friction that mujoco.sysid has too: like against like, for the time it takes."""
 
 
-def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> dict[str, Any]:
+@dataclass(frozen=True)
+class MethodResult:
+    """One method's entry of compare.json: parameters and standard errors by name [SI], how long it took [s].
+
+    settings_tried: how many settings were tried, the best of which is shown. worst_relative_error: on a fake arm, of
+    inertias, gravity and friction. held_out_rms: free prediction of the other multisine over its motion, worst joint;
+    None where the simulation under these parameters does not settle, or no other multisine was played.
+    """
+
+    parameters: Mapping[str, float]
+    std: Mapping[str, float]
+    seconds: float
+    settings: str
+    settings_tried: int
+    held_out_rms: float | None
+    worst_relative_error: float | None = None
+    worst_parameter: str | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """compare.json: every method on one settled period; truth on a fake arm only."""
+
+    schema: int
+    config: str
+    truth: Mapping[str, float] | None
+    methods: Mapping[str, MethodResult]
+
+
+def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
     """Every method on the settled period of `run`; also written to compare.json there.
 
-    By method: parameters and std by name, worst_relative_error (on a fake arm; of inertias, gravity and friction),
-    held_out_rms (free prediction of the other multisine over its motion, worst joint; null where the simulation
-    under these parameters does not settle), seconds, settings. Raises HilError, EstimationError.
+    Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
     samples = load_samples(run.samples_path, len(config.joints))
@@ -40,8 +68,8 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> dict[str, Any]:
     held_out = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     truth = true_parameters(config)
     methods = {peer.name: judged(peer, truth, held_out) for peer in all_methods(config, period, truth, mujoco, seed)}
-    compared = {"schema": SCHEMA, "config": facts.config, "truth": truth, "methods": methods}
-    write_json(run.path / "compare.json", compared)
+    compared = Comparison(SCHEMA, facts.config, truth, methods)
+    write_json(run.path / "compare.json", to_json(compared))
     return compared
 
 
@@ -72,21 +100,19 @@ def link_length(config: Config) -> float | None:
     return None
 
 
-def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> dict[str, Any]:
+def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> MethodResult:
     """One method's entry of compare.json."""
-    entry: dict[str, Any] = {
-        "parameters": peer.parameters,
-        "std": peer.std,
-        "seconds": round(peer.seconds, 6),
-        "settings": peer.settings,
-        "settings_tried": peer.tried,
-    }
-    if truth is not None:
-        name, worst = worst_error(peer.parameters, truth)
-        entry |= {"worst_relative_error": worst, "worst_parameter": name}
-    if held_out is not None:
-        entry["held_out_rms"] = _held_out(held_out, peer.parameters)
-    return entry
+    name, worst = (None, None) if truth is None else worst_error(peer.parameters, truth)
+    return MethodResult(
+        parameters=peer.parameters,
+        std=peer.std,
+        seconds=round(peer.seconds, 6),
+        settings=peer.settings,
+        settings_tried=peer.tried,
+        held_out_rms=None if held_out is None else _held_out(held_out, peer.parameters),
+        worst_relative_error=worst,
+        worst_parameter=name,
+    )
 
 
 def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:

@@ -1,15 +1,15 @@
 """From a run folder to its result: settled period, both stages, the check on a multisine that was not used."""
 
 import time
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.estimation.model_from_config import wanted_model
-from hil.estimation.physical import physical_entries
-from hil.estimation.result import make_result
+from hil.estimation.physical import physical_of
+from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
@@ -21,13 +21,15 @@ from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import judge
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.plan.stabiliser import stabiliser_share
+from hil.results.parts import RunTiming
+from hil.results.result import SettledResult
 from hil.runs.period_file import PlayedPeriod, save_periods
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
 from hil.runs.timing import timing
 
 
-def estimate_run(run: RunFolder) -> dict[str, Any]:
+def estimate_run(run: RunFolder) -> SettledResult:
     """Estimate from the recording in `run` and write its result.json; the result. Raises HilError, EstimationError."""
     config, facts = run.load_config(), run.load_facts()
     samples = load_samples(run.samples_path, len(config.joints))
@@ -41,20 +43,20 @@ def estimate_run(run: RunFolder) -> dict[str, Any]:
         played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
-    checked = {
-        **describe_validation(validation, held_out),
-        "verdict": describe_verdict(judge(estimate, validation, held_out)),
-        "warnings": warnings_of(config, facts, samples, period),
-        **({"model_choice": describe_choice(choice)} if choice else {}),
-    }
+    checks = Checks(
+        describe_validation(validation, held_out),
+        describe_verdict(judge(estimate, validation, held_out)),
+        tuple(warnings_of(config, facts, samples, period)),
+        None if choice is None else describe_choice(choice),
+    )
     seconds = round(time.perf_counter() - started, 3)
-    kept_time = {**timing(samples, config.experiment.rate), "estimation_seconds": seconds}
-    result = make_result(config, facts.config, period, estimate, checked, kept_time)
+    kept_time = RunTiming.of(timing(samples, config.experiment.rate), seconds)
+    result = make_result(config, facts.config, period, estimate, checks, kept_time)
     if config.known is not None:
-        result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
+        result = replace(result, physical=physical_of(result, config.known.quantities(), config.arm.gravity))
     if config.stabiliser is not None:
         chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(IDENTIFY))
-        result["stabiliser"] = stabiliser_share(config, samples[chosen]).as_json()
+        result = replace(result, stabiliser=stabiliser_share(config, samples[chosen]))
     save_periods(run.path, played)
     run.write_result(result)
     return result

@@ -1,10 +1,11 @@
 """What the joints' torque constants leave open in a result, in sentences for terminal and report."""
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 from hil.config.schema import JointConfig
 from hil.drivers.servo_model import Mode
+from hil.results.parts import Quantity
 
 RATIO = "torque_scale_2"
 
@@ -23,7 +24,7 @@ class Driven(Protocol):
     def torque_per_goal_std(self) -> float: ...
 
 
-def torque_constants_said(joints: Sequence[Driven], extra: dict[str, Any]) -> str:
+def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity]) -> str:
     """Which torque constants the values scale with, and how well they are known; empty where they are exact.
 
     extra: the result's terms beside the base parameters; with their ratio found, only the first constant is left open.
@@ -39,7 +40,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: dict[str, Any]) -> st
     first, second = joints
     ratio = extra[RATIO]
     found = (
-        f"Against {first.name}, {second.name} gives {ratio['value']:.5g} +- {ratio['std']:.1g} times the torque that "
+        f"Against {first.name}, {second.name} gives {ratio.value:.5g} +- {ratio.std:.1g} times the torque that "
         f"its torque constant says. Every value scales with {first.name}'s alone"
     )
     if not first.torque_per_goal_std:

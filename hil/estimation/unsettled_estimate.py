@@ -2,8 +2,8 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from hil.config.schema import ModelConfig
 from hil.errors import ConfigError
 from hil.estimation.csv_recording import read_csv
 from hil.estimation.model_from_config import wanted_model
-from hil.estimation.physical import physical_entries
+from hil.estimation.physical import physical_of
 from hil.estimation.result_checks import describe_segment_choice
 from hil.estimation.settled_warnings import clipping_warnings
 from hil.estimation.unsettled_warnings import any_warnings
@@ -20,31 +20,33 @@ from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.selection.unsettled import choose_by_shooting
+from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Zeros
+from hil.results.result import ShootingResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
-SCHEMA = 1
 START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
 START_WIDTH = 0.05  # rad/s
 
 
-def estimate_csv(paths: Sequence[Path], config_path: Path) -> dict[str, Any]:
+def estimate_csv(paths: Sequence[Path], config_path: Path) -> ShootingResult:
     """The result of one or more CSV files of the same arm, recorded apart. Raises HilError, EstimationError."""
     config = load_csv_config(config_path)
     columns = config.columns
     recordings = [read_csv(path, columns) for path in paths]
     zeros = (columns.zeros_unknown or config.model.zeros) and config.arm.gravity > 0.0
-    result = _estimate(recordings, config.model, columns.segment, zeros)
-    result["config"] = str(config_path)
-    result["recordings"] = [str(path) for path in paths]
-    for path, zeros in zip(paths, result.get("zeros", []), strict=False):
-        zeros["recording"] = str(path)
+    result = _estimate(recordings, config.model, columns.segment, zeros, str(config_path))
+    names = tuple(map(str, paths))
+    result = replace(result, recordings=names)
+    if result.zeros is not None:
+        named = zip(names, result.zeros, strict=True)
+        result = replace(result, zeros=tuple(replace(found, recording=name) for name, found in named))
     if config.known is not None:
-        result["physical"] = physical_entries(result, config.known.quantities(), config.arm.gravity)
+        result = replace(result, physical=physical_of(result, config.known.quantities(), config.arm.gravity))
     return result
 
 
-def estimate_unsettled(run: RunFolder) -> dict[str, Any]:
+def estimate_unsettled(run: RunFolder) -> ShootingResult:
     """The result of all samples of a run whose motion never became periodic, or that was stopped before it did."""
     config, facts = run.load_config(), run.load_facts()
     samples = load_samples(run.samples_path, len(config.joints))
@@ -57,14 +59,15 @@ def estimate_unsettled(run: RunFolder) -> dict[str, Any]:
         between="held",
         command_to_sample=facts.command_to_sample,
     )
-    result = _estimate([recording], config.model, 1.0, config.model.zeros)
-    result["config"] = facts.config
-    result["warnings"] += clipping_warnings(config, samples)
+    result = _estimate([recording], config.model, 1.0, config.model.zeros, facts.config)
+    result = replace(result, warnings=(*result.warnings, *clipping_warnings(config, samples)))
     run.write_result(result)
     return result
 
 
-def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool) -> dict[str, Any]:
+def _estimate(
+    recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool, shown_path: str
+) -> ShootingResult:
     if wanted.ripple:
         raise ConfigError("model.ripple needs a settled period to find where it repeats: leave it out for any data.")
     began = time.perf_counter()
@@ -79,42 +82,40 @@ def _estimate(recordings: Sequence[Recording], wanted: ModelConfig, segment: flo
         # The encoders' zeros are each recording's own here.
         model = wanted_model(wanted, recordings[0].joints).without("zeros")
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
-    result = make_shooting_result(estimate, recordings, round(time.perf_counter() - began, 3))
-    result["warnings"] = any_warnings(recordings, estimate)
-    return result if choice is None else {**result, "model_choice": describe_segment_choice(choice)}
+    result = make_shooting_result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3))
+    result = replace(result, warnings=tuple(any_warnings(recordings, estimate)))
+    return result if choice is None else replace(result, model_choice=describe_segment_choice(choice))
 
 
-def make_shooting_result(estimate: ShootingEstimate, recordings: Sequence[Recording], seconds: float) -> dict[str, Any]:
-    """result.json of multiple shooting: as hil.estimation.result has it, without what only a settled period has.
-
-    `zeros`, if they were unknown: of each recording, true less measured angle of each joint.
-    """
+def make_shooting_result(
+    estimate: ShootingEstimate, recordings: Sequence[Recording], shown_path: str, seconds: float
+) -> ShootingResult:
+    """The result of multiple shooting. shown_path: the configuration's path. seconds: how long the estimation took."""
     base = len(estimate.model.base_names)
     entries = [
-        (name, {"value": float(value), "std": float(std), "unit": unit})
+        (name, Quantity(float(value), float(std), unit))
         for name, value, std, unit in zip(estimate.names, estimate.value, estimate.std, estimate.units, strict=True)
     ]
     steps = np.max([recording.position_step for recording in recordings], axis=0)
-    zeros = [
-        {"zero": zero.tolist(), "std": std.tolist(), "unit": "rad"}
+    zeros = tuple(
+        Zeros(zero=tuple(zero.tolist()), std=tuple(std.tolist()))
         for zero, std in zip(estimate.zeros, estimate.zeros_std, strict=True)
-    ]
-    return {
-        "schema": SCHEMA,
-        "method": f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
+    )
+    return ShootingResult(
+        method=f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
         f"starting states; {estimate.model.description}; standard errors robust "
         "against model error",
-        "joints": estimate.model.joints,
-        "parameters": dict(entries[:base]),
-        "extra": dict(entries[base:]),
-        "covariance": {"names": list(estimate.names), "matrix": estimate.covariance.tolist()},
-        "fit": {
-            "residual_rms_rad": estimate.residual_rms.tolist(),
-            "residual_rms_ticks": (estimate.residual_rms / steps).tolist(),
-            "samples": int(sum(recording.time.size for recording in recordings)),
-            "segments": estimate.segments,
-        },
-        **({"zeros": zeros} if zeros else {}),
-        "validation": {},
-        "timing": {"estimation_seconds": seconds},
-    }
+        config=shown_path,
+        joints=estimate.model.joints,
+        parameters=dict(entries[:base]),
+        extra=dict(entries[base:]),
+        covariance=Covariance(tuple(estimate.names), tuple(map(tuple, estimate.covariance.tolist()))),
+        fit=ShootingFit(
+            residual_rms_rad=tuple(estimate.residual_rms.tolist()),
+            residual_rms_ticks=tuple((estimate.residual_rms / steps).tolist()),
+            samples=int(sum(recording.time.size for recording in recordings)),
+            segments=estimate.segments,
+        ),
+        timing=Timing(estimation_seconds=seconds),
+        zeros=zeros or None,
+    )

@@ -51,7 +51,7 @@ def _write(writer: Any, source: Source) -> None:
             message = shared | {name: _number(columns[name][row][joint]) for name in _PER_JOINT}
             data = json.dumps(message, allow_nan=False).encode()
             writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, data=data, sequence=row)
-    result = strict_json.dumps(source.result, indent=2).encode()
+    result = strict_json.dumps(source.result.to_json(), indent=2).encode()
     writer.add_attachment(
         create_time=start, log_time=start, name="result.json", media_type="application/json", data=result
     )

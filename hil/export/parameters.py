@@ -25,7 +25,8 @@ def export_toml(source: Source, path: Path) -> list[str]:
 
 
 def _kept(source: Source) -> dict[str, Any]:
-    return {key: source.result[key] for key in _KEPT if key in source.result}
+    result = source.result.to_json()
+    return {key: result[key] for key in _KEPT if key in result}
 
 
 def _write_table(lines: list[str], path: tuple[str, ...], table: dict[str, Any]) -> None:

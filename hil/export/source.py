@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
 from hil.errors import RunFolderError
-from hil.model_file import model_of, read_result
+from hil.model_file import model_of, read_settled_result
+from hil.results.result import SettledResult
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,14 @@ class Source:
     """A run with a result. link_length: of link 1 [m], where the parameters do not say it (see `mass_distribution`)."""
 
     run: Path
-    result: dict[str, Any]
+    result: SettledResult
     model: ArmModel
     link_length: float | None = None
 
     @classmethod
     def open(cls, run: Path, link_length: float | None = None) -> "Source":
         """Read a run folder; raises ResultError."""
-        result = read_result(run)
+        result = read_settled_result(run)
         return cls(run, result, model_of(result, run), link_length)
 
     @cached_property

@@ -37,7 +37,7 @@ def export_parquet(source: Source, path: Path) -> list[str]:
     fields = [
         pa.field(name, pa.from_numpy_dtype(col.dtype), metadata={"unit": unit(name)}) for name, col in table.items()
     ]
-    schema = pa.schema(fields, metadata={"hil_result": strict_json.dumps(source.result)})
+    schema = pa.schema(fields, metadata={"hil_result": strict_json.dumps(source.result.to_json())})
     arrays = [pa.array(np.ascontiguousarray(column)) for column in table.values()]
     try:
         parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), path)
@@ -56,7 +56,7 @@ def export_mat(source: Source, path: Path) -> list[str]:
         "units": {name: unit(name) for name in table},
         "parameters": dict(source.model.values),
         "std": dict(source.model.stds),
-        "result_json": strict_json.dumps(source.result),
+        "result_json": strict_json.dumps(source.result.to_json()),
     }
     try:
         savemat(path, content, oned_as="column", do_compression=True, long_field_names=True)

@@ -60,8 +60,8 @@ def make_page(data: RunData) -> str:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(folder.joinpath("page.html.j2").read_text(encoding="utf-8"))
     return template.render(
-        title=Path(str(data.facts["config"])).stem,
-        started=datetime.fromisoformat(data.facts["started"]).strftime("%Y-%m-%d %H:%M"),
+        title=Path(data.record.config).stem,
+        started=datetime.fromisoformat(data.record.started).strftime("%Y-%m-%d %H:%M"),
         version=__version__,
         sections=sections(data),
         style=Markup(folder.joinpath("page.css").read_text(encoding="utf-8")),

@@ -3,7 +3,6 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +10,22 @@ from numpy.typing import NDArray
 from hil.arm_model import ArmModel
 from hil.config.schema import Config
 from hil.errors import RunFolderError
-from hil.model_file import model_of, read_result
+from hil.model_file import model_of, read_settled_result
 from hil.plan.plan import HELD_OUT, IDENTIFY
+from hil.results.result import SettledResult
 from hil.runs.period_file import PlayedPeriod, load_periods
 from hil.runs.recording import load_samples
-from hil.runs.run_folder import RunFolder
+from hil.runs.run_folder import RunFolder, RunRecord
 
 
 @dataclass(frozen=True)
 class RunData:
-    """A finished run. facts: run.json; events: (time on the port's clock [s], what happened)."""
+    """A finished run. events: (time on the port's clock [s], what happened)."""
 
     run: RunFolder
     config: Config
-    facts: dict[str, Any]
-    result: dict[str, Any]
+    record: RunRecord
+    result: SettledResult
     model: ArmModel
     samples: NDArray[np.void]
     periods: dict[str, PlayedPeriod]
@@ -34,14 +34,13 @@ class RunData:
     @classmethod
     def load(cls, path: Path) -> "RunData":
         """Raises RunFolderError, ResultError and ConfigError, which name the file."""
-        result = read_result(path)
+        result = read_settled_result(path)
         run = RunFolder.open(path)
         config = run.load_config()
-        run.load_facts()  # says what is wrong with run.json, if anything is
         return cls(
             run,
             config,
-            json.loads(run.run_path.read_text(encoding="utf-8")),
+            run.load_record(),
             result,
             model_of(result, path),
             load_samples(run.samples_path, len(config.joints)),

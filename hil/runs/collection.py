@@ -126,8 +126,7 @@ def _outcome(path: Path) -> tuple[str, float | None]:
         return "not estimated" if (path / "samples.npy").is_file() else "not finished", None
     try:
         result = read_result(path)
-        verdict = str(result.get("verdict", {}).get("trust", "no verdict"))
-        residual = [float(each) for each in result.get("fit", {}).get("residual_rms_ticks", ())]
-    except (ResultError, AttributeError, TypeError, ValueError):
+    except ResultError:
         return "result.json is damaged", None
-    return verdict, max(residual, default=None)
+    verdict = "no verdict" if result.verdict is None else result.verdict.trust
+    return verdict, max(result.fit.residual_rms_ticks, default=None)

@@ -12,11 +12,12 @@ period.npz      the settled periods as measured and as the model has them (hil.r
 
 import json
 import platform
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -24,6 +25,8 @@ from hil import __version__, strict_json
 from hil.config.schema import Config, ExperimentConfig, parse_config
 from hil.errors import RunFolderError
 from hil.plan.plan import Plan
+from hil.results.json_form import FormError, from_json, to_json
+from hil.results.result import Result
 
 SCHEMA = 1
 _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
@@ -39,8 +42,31 @@ class RunFacts:
 
     config: str
     command_to_sample: float
-    position_step: list[float]
-    segments: list[str]
+    position_step: Sequence[float]
+    segments: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """One multisine as it was played: its role, and per joint the excited harmonics and the crest factor."""
+
+    role: str
+    lines: tuple[tuple[int, ...], ...]
+    crest_factor: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class RunRecord(RunFacts):
+    """run.json: the facts, and what was run on what. started: ISO 8601 with the offset from UTC."""
+
+    started: str
+    versions: Mapping[str, str]
+    python: str
+    machine: str
+    excitation: Sequence[Excitation]
+
+
+Facts = TypeVar("Facts", bound=RunFacts)
 
 
 class RunFolder:
@@ -131,39 +157,41 @@ class RunFolder:
 
     def write_facts(self, facts: RunFacts, plan: Plan) -> None:
         """Write run.json: the facts, and what was run on what."""
-        described = {
-            "schema": SCHEMA,
-            **asdict(facts),
-            "started": datetime.now().astimezone().isoformat(timespec="seconds"),
-            "versions": {"hil": __version__, **{name: version(name) for name in _PACKAGES}},
-            "python": platform.python_version(),
-            "machine": platform.platform(),
-            "excitation": [
-                {
-                    "role": segment.role,
-                    "lines": [list(map(int, lines)) for lines in segment.multisine.lines],
-                    "crest_factor": [round(float(value), 4) for value in segment.multisine.crest_factor],
-                }
+        record = RunRecord(
+            **{each.name: getattr(facts, each.name) for each in fields(RunFacts)},
+            started=datetime.now().astimezone().isoformat(timespec="seconds"),
+            versions={"hil": __version__, **{name: version(name) for name in _PACKAGES}},
+            python=platform.python_version(),
+            machine=platform.platform(),
+            excitation=[
+                Excitation(
+                    segment.role,
+                    tuple(tuple(map(int, lines)) for lines in segment.multisine.lines),
+                    tuple(round(float(value), 4) for value in segment.multisine.crest_factor),
+                )
                 for segment in plan.segments
             ],
-        }
-        write_json(self.run_path, described)
+        )
+        write_json(self.run_path, {"schema": SCHEMA, **to_json(record)})
 
     def load_facts(self) -> RunFacts:
+        """What of run.json an estimate needs. Raises RunFolderError."""
+        return self._load_run(RunFacts)
+
+    def load_record(self) -> RunRecord:
+        """All of run.json. Raises RunFolderError."""
+        return self._load_run(RunRecord)
+
+    def _load_run(self, kind: type[Facts]) -> Facts:
         values = _read_json(self.run_path)
         if values.get("schema") != SCHEMA:
             raise RunFolderError(
                 f"{self.run_path}: schema {values.get('schema')!r} is not {SCHEMA}; this run was made by another hil."
             )
         try:
-            return RunFacts(
-                str(values["config"]),
-                float(values["command_to_sample"]),
-                [float(step) for step in values["position_step"]],
-                [str(role) for role in values["segments"]],
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise RunFolderError(f"{self.run_path} is damaged: {error!r}.") from error
+            return from_json(kind, values)
+        except FormError as error:
+            raise RunFolderError(f"{self.run_path} is damaged: it {error}.") from error
 
     def event(self, time: float, what: str) -> None:
         """Append one event, with its time on the port's clock [s]; raises RunFolderError."""
@@ -175,11 +203,12 @@ class RunFolder:
         except OSError as error:
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
 
-    def write_result(self, result: dict[str, Any]) -> None:
-        write_json(self.result_path, result)
+    def write_result(self, result: Result) -> None:
+        """Write result.json. Raises RunFolderError."""
+        write_json(self.result_path, result.to_json())
 
 
-def write_json(path: Path, value: dict[str, Any]) -> None:
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON file whole or not at all."""
     temporary = path.with_suffix(".partial")
     try:

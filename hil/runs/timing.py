@@ -1,9 +1,9 @@
 """How the stream kept time, from what every sample says of itself."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
+
+from hil.results.parts import Quantiles, StreamTiming
 
 SERVO_CLOCK_WRAP_S = 32.768
 """Realtime Tick counts milliseconds from 0 to 32767."""
@@ -12,31 +12,27 @@ _FEWEST_READINGS = 5
 _EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6)
 
 
-def timing(samples: NDArray[np.void], rate: float) -> dict[str, Any]:
-    """Rate held, lateness of the writes, round trips, missed ticks, lost replies and clock drifts of a recording.
-
-    drift_us: how much later the last tenth of the writes was than the first, against the deadlines.
-    servo_clock_ppm: how much faster each servo's own clock runs than the computer's; None where it was read too seldom.
-    """
+def timing(samples: NDArray[np.void], rate: float) -> StreamTiming:
+    """Rate held, lateness of the writes, round trips, missed ticks, lost replies and clock drifts of a recording."""
     sent = _sent(samples)
     lateness_us = _lateness_us(sent)
     round_trip_us = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
     span = float(samples["deadline"][-1] - samples["deadline"][0]) + 1 / rate
     tenth = max(1, len(sent) // 10)
-    return {
-        "samples": len(samples),
-        "seconds": round(span, 6),
-        "rate_held": round(len(sent) / span, 3),
-        "lateness_us": _quantiles(lateness_us),
-        "round_trip_us": _quantiles(round_trip_us),
-        "missed_ticks": int(len(samples) - len(sent)),
-        "lost_replies": int(sent["missing"].sum()),
-        "drift_us": round(float(np.median(lateness_us[-tenth:]) - np.median(lateness_us[:tenth])), 1),
-        "servo_clock_ppm": _servo_clock_ppm(sent),
-    }
+    return StreamTiming(
+        samples=len(samples),
+        seconds=round(span, 6),
+        rate_held=round(len(sent) / span, 3),
+        lateness_us=_quantiles(lateness_us),
+        round_trip_us=_quantiles(round_trip_us),
+        missed_ticks=int(len(samples) - len(sent)),
+        lost_replies=int(sent["missing"].sum()),
+        drift_us=round(float(np.median(lateness_us[-tenth:]) - np.median(lateness_us[:tenth])), 1),
+        servo_clock_ppm=tuple(_servo_clock_ppm(sent)),
+    )
 
 
-def lateness_histogram(samples: NDArray[np.void]) -> dict[str, Any]:
+def lateness_histogram(samples: NDArray[np.void]) -> dict[str, list[float]]:
     """How many writes were how late: `counts[i]` between `edges_us[i]` and `edges_us[i + 1]`, the last one open."""
     counts, _ = np.histogram(_lateness_us(_sent(samples)), [*_EDGES_US, np.inf])
     return {"edges_us": list(_EDGES_US), "counts": counts.tolist()}
@@ -54,10 +50,9 @@ def _lateness_us(sent: NDArray[np.void]) -> NDArray[np.float64]:
     return late
 
 
-def _quantiles(values: NDArray[np.float64]) -> dict[str, float]:
-    p50, p99, p999 = np.quantile(values, [0.5, 0.99, 0.999])
-    numbers = {"p50": p50, "p99": p99, "p99_9": p999, "max": values.max()}
-    return {name: round(float(value), 1) for name, value in numbers.items()}
+def _quantiles(values: NDArray[np.float64]) -> Quantiles:
+    numbers = (*np.quantile(values, [0.5, 0.99, 0.999]), values.max())
+    return Quantiles(*(round(float(value), 1) for value in numbers))
 
 
 def _servo_clock_ppm(sent: NDArray[np.void]) -> list[float | None]:

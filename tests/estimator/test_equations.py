@@ -14,6 +14,7 @@ from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.regressor import inverse_dynamics, regressor
 from hil.estimator.models.terms import base_names, units_of
+from hil.estimator.options import CoordinateOptions
 from hil.estimator.simulation.arm import simulate
 from hil.estimator.simulation.drive import motor_torque
 
@@ -111,7 +112,7 @@ def test_motor_torque_is_the_mean_of_the_late_command(
 @given(arrays(float, (21,), elements=st.floats(-2.0, 2.0)))
 def test_every_coordinate_is_a_physical_arm(x: np.ndarray) -> None:
     names = Model(2, "stribeck_load", "lag").names
-    there = Coordinates(names, scales_of(names, 0.3, 3.0, 0.02), 1e-3)
+    there = Coordinates(names, scales_of(names, 0.3, 3.0, 0.02), CoordinateOptions(1e-3))
     value = dict(zip(names, there.values(x), strict=True))
     a, b, d, ia = (value[name] for name in ("inertia_1", "coupling", "inertia_2", "armature_2"))
     for c in np.cos(np.linspace(0.0, np.pi, 7)):

@@ -136,8 +136,13 @@ def test_it_needs_numpy_only_and_hil_itself_not_even_that(identified: Path) -> N
 
 def test_an_infinite_error_bar_is_null_on_file_and_infinite_again_when_read(identified: Path) -> None:
     result = read_result(identified)
-    result["parameters"]["offset_1"]["std"] = math.inf
-    result["covariance"]["matrix"][0][0] = math.inf
+    unseen = dataclasses.replace(result.parameters["offset_1"], std=math.inf)
+    first, *others = result.covariance.matrix
+    result = dataclasses.replace(
+        result,
+        parameters={**result.parameters, "offset_1": unseen},
+        covariance=dataclasses.replace(result.covariance, matrix=((math.inf, *first[1:]), *others)),
+    )
     RunFolder.open(identified).write_result(result)
 
     def refuse(constant: str) -> float:

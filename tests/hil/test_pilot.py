@@ -1,6 +1,6 @@
 """Pilot, then full, from joint limits and link lengths only; and arms that need a stabiliser."""
 
-import json
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,18 @@ from hil.config.schema import load_config
 from hil.errors import NoSafeTorque
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
+from hil.model_file import read_result
 from hil.pilot import Step, identify_in_steps, next_amplitude
 from hil.plan.plan import make_plan
-from hil.plan.stabiliser import StabiliserShare
 from hil.report.page import make_page
 from hil.report.run_data import RunData
+from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 from tests.support.paths import CONFIGS
 
 
 @pytest.fixture(scope="module")
-def in_steps(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path, list[str]]:
+def in_steps(tmp_path_factory: pytest.TempPathFactory) -> tuple[SettledResult, Path, list[str]]:
     config = load_config(CONFIGS / "first_time.toml")
     assert config.experiment.peak_torque is None and config.arm.prior is None
     run = RunFolder.create(tmp_path_factory.mktemp("steps") / "run", config)
@@ -37,46 +38,47 @@ def in_steps(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
 def test_the_full_run_uses_the_room_and_beats_the_pilot(in_steps: Any) -> None:
     result, path, _ = in_steps
     config = load_config(CONFIGS / "first_time.toml")
-    full = result["steps"][-1]
-    low, high = np.array(full["seen"])[:2]
+    full = result.steps[-1]
+    low, high = np.array(full.seen)[:2]
     allowed = np.ptp([joint.position_limit for joint in config.joints], axis=1)
     assert ((high - low) / allowed >= 0.7).all()
-    pilot = json.loads((path / "pilot-1" / "result.json").read_text(encoding="utf-8"))
+    pilot = read_result(path / "pilot-1")
     assert worst_relative_std(pilot) / worst_relative_std(result) >= 10
-    for name, entry in result["parameters"].items():
-        assert entry["std"] < pilot["parameters"][name]["std"], name
-        assert abs(entry["value"] - result["truth"][name]) <= 0.01 * abs(result["truth"][name]), name
+    for name, entry in result.parameters.items():
+        assert entry.std < pilot.parameters[name].std, name
+        assert abs(entry.value - result.truth[name]) <= 0.01 * abs(result.truth[name]), name
 
 
 def test_every_step_says_predicted_against_seen(in_steps: Any) -> None:
     result, _, said = in_steps
-    assert result["steps"][0]["name"] == "Pilot"
-    assert sum("predicted" in line and "seen" in line for line in said) == len(result["steps"])
-    full = result["steps"][-1]
+    assert result.steps[0].name == "Pilot"
+    assert sum("predicted" in line and "seen" in line for line in said) == len(result.steps)
+    full = result.steps[-1]
     rest = np.array([-np.pi / 2, 0.0])
     for row, origin in ((0, rest), (1, rest), (2, 0.0)):
-        foreseen, seen = (np.array(full[key])[row] - origin for key in ("predicted_median", "seen"))
+        foreseen, seen = (np.array(rows)[row] - origin for rows in (full.predicted_median, full.seen))
         assert np.abs(foreseen / seen - 1).max() <= 0.10
 
 
 def test_the_run_folder_estimates_again_with_the_torque_that_was_found(in_steps: Any) -> None:
     result, path, _ = in_steps
     folder = RunFolder.open(path)
-    assert folder.load_config().experiment.peak_torque == pytest.approx(result["steps"][-1]["peak_torque"])
+    assert folder.load_config().experiment.peak_torque == pytest.approx(result.steps[-1].peak_torque)
     assert (path / "config.toml").read_bytes() == (CONFIGS / "first_time.toml").read_bytes()
-    assert estimate_run(folder)["parameters"] == result["parameters"]
+    assert estimate_run(folder).parameters == result.parameters
 
 
 def test_an_arm_that_does_not_replay_its_own_run_is_not_built_upon(in_steps: Any) -> None:
     result, path, _ = in_steps
     folder = RunFolder.open(path / "pilot-1")
     config = folder.load_config()
-    pilot = json.loads(folder.result_path.read_text(encoding="utf-8"))
-    told = result["steps"][0]
-    figures = (np.array(told[key]) for key in ("peak_torque", "predicted_median", "predicted_quantile_99", "seen"))
+    pilot = read_result(folder.path)
+    told = result.steps[0]
+    figures = map(np.array, (told.peak_torque, told.predicted_median, told.predicted_quantile_99, told.seen))
     step, plan = Step("Pilot", *figures), make_plan(config)
     assert next_amplitude(config, pilot, plan, step).peak_torque.min() > 0.0
-    pilot["extra"]["stribeck_rise_1"]["value"] = 8e3  # holds the joint at rest for ever
+    stuck = replace(pilot.extra["stribeck_rise_1"], value=8e3)  # holds the joint at rest for ever
+    pilot = replace(pilot, extra={**pilot.extra, "stribeck_rise_1": stuck})
     with pytest.raises(NoSafeTorque, match="does not replay the motion"):
         next_amplitude(config, pilot, plan, step)
 
@@ -87,10 +89,10 @@ def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None
     run_experiment(config, run, config.path, lambda _: None)
     result = estimate_run(run)
     for name in ("inertia_1", "inertia_2", "armature_2", "gravity_1", "gravity_2", "viscous_1", "coulomb_1"):
-        assert abs(result["parameters"][name]["value"] / result["truth"][name] - 1) <= 0.02, name
-    assert max(result["validation"]["held_out_rms"]) <= 0.01
-    share = StabiliserShare.from_json(result["stabiliser"])
-    assert (share.rms > 0.0).all() and (share.peak > share.rms).all()
+        assert abs(result.parameters[name].value / result.truth[name] - 1) <= 0.02, name
+    assert max(result.validation.held_out_rms) <= 0.01
+    share = result.stabiliser
+    assert min(share.rms) > 0.0 and np.greater(share.peak, share.rms).all()
     console = Console(record=True, width=200, file=StringIO())
     print_result(result, config, run.path, console)
     shoulder = f"shoulder {share.rms[0]:.3f} of {share.commanded_rms[0]:.3f} N m RMS"

@@ -123,12 +123,12 @@ def test_an_arm_driven_by_voltage_is_identified(arm_file: ArmFile, tmp_path: Pat
     run = RunFolder.create(tmp_path / "run", config)
     run_experiment(config, run, path, lambda _: None)
     result = estimate_run(run)
-    assert max(result["fit"]["residual_rms_ticks"]) <= 0.30
-    found, truth = result["parameters"], result["truth"]
+    assert max(result.fit.residual_rms_ticks) <= 0.30
+    found, truth = result.parameters, result.truth
     by_back_emf = 1.80 * motor.back_emf_v_s / motor.resistance_ohm
     assert truth["viscous_1"] == pytest.approx(0.045 + by_back_emf)
     for name, within in (("gravity", 0.002), ("viscous", 0.005), ("coulomb", 0.02)):
         for joint in (1, 2):
-            assert found[f"{name}_{joint}"]["value"] == pytest.approx(truth[f"{name}_{joint}"], rel=within)
+            assert found[f"{name}_{joint}"].value == pytest.approx(truth[f"{name}_{joint}"], rel=within)
     for name, entry in found.items():
-        assert abs(entry["value"] - truth[name]) <= 3.5 * entry["std"], name
+        assert abs(entry.value - truth[name]) <= 3.5 * entry.std, name

@@ -10,12 +10,11 @@ STRONG = 0.9
 
 
 def correlation(data: RunData) -> Section | None:
-    """Where the result has a covariance."""
-    kept = data.result.get("covariance")
-    if not kept:
+    """Where the result has parameters."""
+    names = data.result.covariance.names
+    if not names:
         return None
-    names = tuple(kept["names"])
-    values = correlations(np.array(kept["matrix"], dtype=np.float64))
+    values = correlations(data.result.covariance.array())
     strong = sorted(
         (
             (float(values[row, column]), names[row], names[column])

@@ -66,10 +66,10 @@ def _torque(model: ArmModel, speed: Array) -> Array:
 
 def _interval(data: RunData, speed: Array, joint: int) -> tuple[Array, Array]:
     """The curve's 2.5 and 97.5 percentiles under the parameters' covariance."""
-    kept = data.result["covariance"]
-    names = [name for name in kept["names"] if name.endswith(f"_{joint + 1}")]
-    index = [kept["names"].index(name) for name in names]
-    covariance = np.array(kept["matrix"], dtype=np.float64)[np.ix_(index, index)]
+    kept = data.result.covariance
+    names = [name for name in kept.names if name.endswith(f"_{joint + 1}")]
+    index = [kept.names.index(name) for name in names]
+    covariance = kept.array()[np.ix_(index, index)]
     seen = np.isfinite(np.diag(covariance))
     covariance = np.where(seen[:, None] & seen, covariance, 0.0)
     value = np.array([data.model.values[name] for name in names])

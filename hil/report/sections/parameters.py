@@ -1,24 +1,23 @@
 """Parameters with their intervals, what each is, and on a fake arm the truth."""
 
 import math
-from typing import Any
+from collections.abc import Mapping
 
 from hil.estimator.models.terms import term_of
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import number, percent
+from hil.results.parts import Quantity
 
 TWO_SIDED_95 = 1.96
 
 
 def parameters(data: RunData) -> Section:
     """Always there."""
-    truth = data.result.get("truth", {})
-    tables = [
-        _table(data.result[key], truth if key == "parameters" else {}, caption)
-        for key, caption in (("parameters", "Base parameters"), ("extra", "What the model needed beside them"))
-        if data.result[key]
-    ]
+    result = data.result
+    tables = [_table(result.parameters, result.truth or {}, "Base parameters")]
+    if result.extra:
+        tables.append(_table(result.extra, {}, "What the model needed beside them"))
     words = (
         "The interval is what the noise of this one recording leaves open. It holds neither the error of the torque "
         "constants, with which all values of a joint scale, nor what the model lacks.",
@@ -26,15 +25,15 @@ def parameters(data: RunData) -> Section:
     return Section("parameters", "Parameters", words, tuple(tables))
 
 
-def _table(entries: dict[str, Any], truth: dict[str, float], caption: str) -> Table:
+def _table(entries: Mapping[str, Quantity], truth: Mapping[str, float], caption: str) -> Table:
     head = ("parameter", "what it is", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
     return Table(head, tuple(_row(name, entry, truth) for name, entry in entries.items()), 3, caption, 1)
 
 
-def _row(name: str, entry: dict[str, Any], truth: dict[str, float]) -> tuple[str, ...]:
-    value, std = entry["value"], entry["std"]
+def _row(name: str, entry: Quantity, truth: Mapping[str, float]) -> tuple[str, ...]:
+    value, std = entry.value, entry.std
     known = (number(truth[name]) if name in truth else "",) if truth else ()
-    unit = "" if entry["unit"] == "1" else entry["unit"].replace("^2", "²")
+    unit = "" if entry.unit == "1" else entry.unit.replace("^2", "²")
     meaning = term_of(name).meaning
     if not math.isfinite(std):
         return (name, meaning, unit, number(value), "not determined", "", *known)

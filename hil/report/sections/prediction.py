@@ -42,7 +42,7 @@ def _position(period: PlayedPeriod, joint: int, name: str, role: str, said: str)
 
 def _residual(data: RunData, joint: int, name: str) -> Picture:
     assert data.fitted is not None  # the caller looked
-    left = data.fitted.error[joint] / abs(float(data.facts["position_step"][joint]))
+    left = data.fitted.error[joint] / abs(float(data.record.position_step[joint]))
     time = np.arange(len(left)) / data.fitted.rate
     series = [Series("measured minus predicted", time, left, BLUE, "dots")]
     for level in (-0.5, 0.5):
@@ -51,5 +51,5 @@ def _residual(data: RunData, joint: int, name: str) -> Picture:
     chart = Chart(
         f"residual_{joint + 1}", f"Residual of {name}", "time in the period [s]", "encoder steps", tuple(series)
     )
-    rms = steps(data.result["fit"]["residual_rms_ticks"][joint])
+    rms = steps(data.result.fit.residual_rms_ticks[joint])
     return Picture(chart, f"{name}: {rms} steps RMS are left; half a step either way is what rounding alone leaves.")

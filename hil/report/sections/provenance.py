@@ -2,24 +2,25 @@
 
 from hil.report.run_data import RunData
 from hil.report.section import Folded, Section, Table
+from hil.runs.run_folder import Excitation
 
 
 def provenance(data: RunData) -> Section:
     """Always there."""
-    facts, config = data.facts, data.config
+    record, config = data.record, data.config
     servos = "; ".join(f"{joint.name}: {joint.model}, ID {joint.id}" for joint in config.joints)
     rows = [
-        ("configuration", str(facts["config"])),
-        ("started", str(facts["started"])),
+        ("configuration", record.config),
+        ("started", record.started),
         ("port", f"{config.port.url} at {config.port.baud} baud"),
         ("servos", servos),
-        ("method", str(data.result["method"])),
+        ("method", data.result.method),
         ("period", f"{config.experiment.period:g} s at {config.experiment.rate:g} Hz, seed {config.experiment.seed}"),
-        ("machine", f"{facts['machine']}, Python {facts['python']}"),
-        ("versions", ", ".join(f"{name} {version}" for name, version in facts["versions"].items())),
+        ("machine", f"{record.machine}, Python {record.python}"),
+        ("versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
         ("run folder", data.run.path.name),
     ]
-    rows += [_excitation(entry, data.names) for entry in facts["excitation"]]
+    rows += [_excitation(entry, data.names) for entry in record.excitation]
     folded = [Folded("Configuration", data.run.config_path.read_text(encoding="utf-8"))]
     if data.events:
         start = data.events[0][0]
@@ -28,11 +29,9 @@ def provenance(data: RunData) -> Section:
     return Section("provenance", "What was run on what", (), (Table(("", ""), tuple(rows), 2),), folded=tuple(folded))
 
 
-def _excitation(entry: dict[str, object], names: list[str]) -> tuple[str, str]:
-    lines, crest = entry["lines"], entry["crest_factor"]
-    assert isinstance(lines, list) and isinstance(crest, list)
+def _excitation(entry: Excitation, names: list[str]) -> tuple[str, str]:
     each = "; ".join(
         f"{name}: {len(found)} lines, crest factor {factor:.2f}"
-        for name, found, factor in zip(names, lines, crest, strict=True)
+        for name, found, factor in zip(names, entry.lines, entry.crest_factor, strict=True)
     )
-    return f"excitation, {str(entry['role']).replace('_', ' ')}", each
+    return f"excitation, {entry.role.replace('_', ' ')}", each

@@ -37,24 +37,23 @@ def spectra(data: RunData) -> Section | None:
 
 def _levels(data: RunData) -> tuple[Table, ...]:
     """Motion on one line of each kind, and what the model leaves of it; older results do not have it."""
-    levels = data.result["validation"].get("line_levels_ticks")
-    if not levels:
+    levels = data.result.validation.line_levels_ticks
+    if levels is None:
         return ()
     rows = [
-        (f"{said}, {name}", str(group["lines"]), steps(group["motion"][joint]), steps(group["left"][joint]))
-        for key, said in _KINDS.items()
-        if (group := levels.get(key))
+        (f"{_KINDS[key]}, {name}", str(group.lines), steps(group.motion[joint]), steps(group.left[joint]))
+        for key, group in levels.groups.items()
         for joint, name in enumerate(data.names)
     ]
-    rows += [(f"noise, {name}", "", steps(levels["noise"][joint]), "") for joint, name in enumerate(data.names)]
+    rows += [(f"noise, {name}", "", steps(levels.noise[joint]), "") for joint, name in enumerate(data.names)]
     head = ("lines", "how many", "motion on one [steps]", "left by the model [steps]")
     return (Table(head, tuple(rows), caption="RMS of one line, by kind"),)
 
 
 def _excited(data: RunData) -> list[list[int]]:
     """Excited harmonics per joint."""
-    entry = next(entry for entry in data.facts["excitation"] if entry["role"] == IDENTIFY)
-    return [list(map(int, lines)) for lines in entry["lines"]]
+    entry = next(entry for entry in data.record.excitation if entry.role == IDENTIFY)
+    return [list(lines) for lines in entry.lines]
 
 
 def _excitation(data: RunData, period: PlayedPeriod, excited: list[list[int]]) -> Picture:

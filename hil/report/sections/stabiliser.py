@@ -1,6 +1,5 @@
 """What the stabiliser gave of the torque that was commanded."""
 
-from hil.plan.stabiliser import StabiliserShare
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import number
@@ -8,9 +7,9 @@ from hil.report.words import number
 
 def stabiliser(data: RunData) -> Section | None:
     """Where a stabiliser held the arm."""
-    if "stabiliser" not in data.result:
+    share = data.result.stabiliser
+    if share is None:
         return None
-    share = StabiliserShare.from_json(data.result["stabiliser"])
     rows = [
         (name, number(rms, 3), number(peak, 3), number(whole, 3), f"{100 * part:.0f} %")
         for name, rms, peak, whole, part in zip(

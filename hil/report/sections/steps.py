@@ -1,20 +1,19 @@
 """What the dry runs had predicted of each step, pilot to full size, and what was then seen."""
 
-from typing import Any
-
 from hil.config.schema import Config
 from hil.dry_run.prediction import quantities_of
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import listed, number
+from hil.results.parts import PlayedStep
 
 
 def steps(data: RunData) -> Section | None:
     """Where the run was played in steps."""
-    played = data.result.get("steps")
+    played = data.result.steps
     if not played:
         return None
-    outside = [str(step["name"]) for step in played if not step["within_quantile"]]
+    outside = [step.name for step in played if not step.within_quantile]
     said = (
         f"In {listed(outside)} a peak went beyond what the dry run had given as the most in 99 of 100 arms."
         if outside
@@ -24,16 +23,16 @@ def steps(data: RunData) -> Section | None:
     return Section("steps", "Predicted before, seen after", (said,), tables)
 
 
-def _table(step: dict[str, Any], config: Config) -> Table:
+def _table(step: PlayedStep, config: Config) -> Table:
     names = [joint.name for joint in config.joints]
     rows = [
         (
             f"{name}: {quantity} [{unit}]",
-            *(number(step[key][row][joint], 3) for key in ("predicted_median", "predicted_quantile_99", "seen")),
+            *(number(peaks[row][joint], 3) for peaks in (step.predicted_median, step.predicted_quantile_99, step.seen)),
         )
         for joint, name in enumerate(names)
         for row, (quantity, unit) in enumerate(quantities_of(config))
     ]
-    torque = listed([f"{name} {number(peak, 3)} N m" for name, peak in zip(names, step["peak_torque"], strict=True)])
+    torque = listed([f"{name} {number(peak, 3)} N m" for name, peak in zip(names, step.peak_torque, strict=True)])
     head = ("joint and peak", "typical arm", "99 of 100 arms", "seen")
-    return Table(head, tuple(rows), caption=f"{step['name']}, peak torque {torque}")
+    return Table(head, tuple(rows), caption=f"{step.name}, peak torque {torque}")

@@ -7,6 +7,7 @@ from hil.report.chart import BLUE, GREEN, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section, Table
 from hil.report.words import number
+from hil.results.parts import Quantiles
 
 _BINS = 60
 
@@ -17,15 +18,15 @@ def timing(data: RunData) -> Section:
     sent = samples[samples["time_after_read"] > samples["time_before_write"]]
     lateness = 1e6 * (sent["time_before_write"] - sent["deadline"])
     round_trip = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
-    kept = data.result["timing"]
+    kept = data.result.timing
     rows = [
         ("rate asked for", f"{data.config.experiment.rate:g} Hz"),
-        ("rate held", f"{kept['rate_held']:g} Hz"),
-        ("ticks missed", f"{kept['missed_ticks']} of {kept['samples']}"),
-        ("replies lost", f"{kept['lost_replies']}"),
-        ("lateness p50, p99, most", _quantiles(kept["lateness_us"])),
-        ("round trip p50, p99, most", _quantiles(kept["round_trip_us"])),
-        ("estimation took", f"{kept['estimation_seconds']:.2f} s"),
+        ("rate held", f"{kept.rate_held:g} Hz"),
+        ("ticks missed", f"{kept.missed_ticks} of {kept.samples}"),
+        ("replies lost", f"{kept.lost_replies}"),
+        ("lateness p50, p99, most", _quantiles(kept.lateness_us)),
+        ("round trip p50, p99, most", _quantiles(kept.round_trip_us)),
+        ("estimation took", f"{kept.estimation_seconds:.2f} s"),
     ]
     virtual = ("On the fake bus this is virtual time: its own wire and adapter, not this machine.",)
     return Section(
@@ -40,8 +41,8 @@ def timing(data: RunData) -> Section:
     )
 
 
-def _quantiles(values: dict[str, float]) -> str:
-    return ", ".join(number(values[key], 4) for key in ("p50", "p99", "max")) + " µs"
+def _quantiles(values: Quantiles) -> str:
+    return ", ".join(number(value, 4) for value in (values.p50, values.p99, values.max)) + " µs"
 
 
 def _histogram(name: str, title: str, values: NDArray[np.float64], colour: str) -> Picture:

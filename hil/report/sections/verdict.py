@@ -14,46 +14,44 @@ _TITLES = {
 
 def verdict(data: RunData) -> Section:
     """Always there."""
-    judged = data.result["verdict"]
-    tone, title = _TITLES[judged["trust"]]
-    warnings = [f"Warning: {warning}" for warning in data.result.get("warnings", [])]
+    judged = data.result.verdict
+    tone, title = _TITLES[judged.trust]
+    warnings = [f"Warning: {warning}" for warning in data.result.warnings]
     words = [
         *(_residual(data), _truth(data), _limits(data)),
         *(_torque_constants(data), by_voltage_said(data.config.joints), _hardware(data)),
     ]
-    bullets = (*judged["sentences"], *warnings, *(word for word in words if word))
+    bullets = (*judged.sentences, *warnings, *(word for word in words if word))
     return Section("verdict", title, tone=tone, bullets=bullets)
 
 
 def _residual(data: RunData) -> str:
-    fit = data.result["fit"]
-    left = listed([steps(value) for value in fit["residual_rms_ticks"]])
-    floor = fit["quantisation_floor_ticks"]
+    fit = data.result.fit
+    left = listed([steps(value) for value in fit.residual_rms_ticks])
+    floor = fit.quantisation_floor_ticks
     return f"{left} encoder steps of the motion are left unexplained; rounding alone leaves {floor}."
 
 
 def _truth(data: RunData) -> str:
-    truth = data.result.get("truth")
+    truth = data.result.truth
     if not truth:
         return ""
-    found = data.result["parameters"]
-    errors = {name: abs(found[name]["value"] / value - 1) for name, value in truth.items() if value and name in found}
+    found = data.result.parameters
+    errors = {name: abs(found[name].value / value - 1) for name, value in truth.items() if value and name in found}
     worst = max(errors, key=lambda name: errors[name])
     return f"The arm is a fake one and knows its truth: the worst parameter is {percent(errors[worst])} off ({worst})."
 
 
 def _limits(data: RunData) -> str:
-    timing = data.result["timing"]
-    lost, missed = timing["lost_replies"], timing["missed_ticks"]
+    timing = data.result.timing
+    lost, missed = timing.lost_replies, timing.missed_ticks
     if not lost and not missed:
-        return (
-            f"No reply was lost and no tick missed in {timing['seconds']:.0f} s at {data.config.experiment.rate:g} Hz."
-        )
-    return f"{lost} replies were lost and {missed} of {timing['samples']} ticks missed."
+        return f"No reply was lost and no tick missed in {timing.seconds:.0f} s at {data.config.experiment.rate:g} Hz."
+    return f"{lost} replies were lost and {missed} of {timing.samples} ticks missed."
 
 
 def _torque_constants(data: RunData) -> str:
-    return torque_constants_said(data.model.joints, data.result["extra"])
+    return torque_constants_said(data.model.joints, data.result.extra)
 
 
 def _hardware(data: RunData) -> str:

@@ -27,6 +27,7 @@ from hil.estimator.models.terms import (
     term_of,
     units_of,
 )
+from hil.estimator.options import CoordinateOptions
 
 models = st.builds(
     Model,
@@ -81,7 +82,7 @@ def test_a_model_has_only_declared_terms_each_once(model: Model) -> None:
 
 @given(models)
 def test_initial_guesses_lie_in_range_and_coordinates_map_back(model: Model) -> None:
-    coordinates = Coordinates(model.names, scales_of(model.names, 0.3, 2.0, 0.02), 1e-4)
+    coordinates = Coordinates(model.names, scales_of(model.names, 0.3, 2.0, 0.02), CoordinateOptions(1e-4))
     scale = scales_of(model.names, 0.3, 2.0, 0.02)
     value = np.array([term_of(name).initial or 0.5 * each for name, each in zip(model.names, scale, strict=True)])
     x = coordinates.coordinates(value)

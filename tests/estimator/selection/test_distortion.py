@@ -48,7 +48,7 @@ def test_what_the_model_lacks_stands_on_the_lines_that_it_makes(
 ) -> None:
     rising = changed(ideal_arm, offset=0.0, coulomb_width=0.0, stribeck_rise=0.6, stribeck_velocity=0.3)
     period = recorded(rising, odd_wave)
-    estimate = identify(period, Model(2, "coulomb", "delay"), hasty=True)
+    estimate = identify(period, Model(2, "coulomb", "delay"), coarse=True)
     found = distortion(period, estimate)
     assert found.odd is not None and found.even is not None
     assert np.all(found.odd.left > 5.0 * found.noise)

@@ -63,7 +63,8 @@ def test_pulled_motion_keeps_to_its_target_and_has_its_own_derivatives() -> None
     target = np.tile([[-1.5], [0.1]], SAMPLES)
 
     def pulled(values: dict[str, float], pull: float) -> tuple[np.ndarray, np.ndarray]:
-        motion = Sensitive(Physics.of(values), start, ("inertia_1",), 1.0 / (RATE * STEPS), pull=np.full(2, pull))
+        physics, step = Physics.of(values), 1.0 / (RATE * STEPS)
+        motion = Sensitive(physics, start, ("inertia_1",), step, tracking_stiffness=np.full(2, pull))
         return motion.advance(motor, slopes, target)
 
     free, held = (pulled(ARM, pull)[0] for pull in (0.0, 20.0))

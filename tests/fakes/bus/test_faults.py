@@ -361,3 +361,43 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
         return received
 
     assert played() == played()
+
+
+# What servos answer, and who else speaks
+
+
+@pytest.mark.parametrize("error", [1, 2, 7, 0x84])
+def test_status_error_refuses_and_says_which(bench: Any, error: int) -> None:
+    bench.bus.faults.add(Fault(kind="status_error", servo=1, amount=float(error)))
+    assert bench.write(1, 65, 1) == error
+    assert bench.ask(1, Instruction.READ, b"\x41\0\x01\0").error == error
+    assert bench.ask(1, Instruction.PING).error == error
+    assert bench.write(2, 65, 1) == 0
+    bench.exchange(encode(254, Instruction.SYNC_WRITE, b"\x41\0\x01\0\x01\x01\x02\x00"))
+    answers = bench.exchange(encode(254, Instruction.SYNC_READ, b"\x7e\0\x0a\0\x01\x02"))
+    assert [(status.id, status.error, len(status.data)) for status in answers] == [(1, error, 0), (2, 0, 10)]
+    bench.bus.faults.clear()
+    assert [bench.servo(i).value("LED") for i in (1, 2)] == [0, 0]
+    assert bench.write(1, 65, 1) == 0
+
+
+def test_an_alert_alone_is_obeyed(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="status_error", amount=128.0))
+    assert bench.write(1, 65, 1) == 128
+    assert bench.servo().value("LED") == 1
+
+
+def test_another_master_is_heard_and_answered(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="other_master", servo=2, at=0.1, duration=0.09, amount=0.02))
+    assert bench.bus.read(1000, 0.09) == b""
+    packets = list(Framer().feed(bench.bus.read(1000, 0.2)))
+    assert [packet.id for packet in packets] == [2] * 10
+    assert [packet.is_status for packet in packets] == [False, True] * 5
+    assert bench.bus.read(1000, 1.0) == b""
+
+
+def test_another_master_runs_into_the_hosts_packets(bench: Any) -> None:
+    bench.bus.faults.add(Fault(kind="other_master", servo=1, amount=0.0013))
+    heard = [status.id for _ in range(100) for status in bench.exchange(encode(2, Instruction.PING), 0.0005)]
+    assert 0 < heard.count(2) < 100
+    assert bench.bus.collisions > 0

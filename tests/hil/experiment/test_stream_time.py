@@ -42,8 +42,8 @@ def test_a_stall_costs_the_periods_it_covers_and_no_burst_follows(arm: Arm, tmp_
     run_experiment(config, run, config.path, once_at(900, stall))
     samples = load_samples(run.samples_path, 2)
     kept = timing(samples, 400.0)
-    assert kept["missed_ticks"] == 9
-    assert kept["lost_replies"] == 0
+    assert kept.missed_ticks == 9
+    assert kept.lost_replies == 0
     # The exchange before the stall took a third of a period; what came after it stayed on the old deadlines.
     sent = samples[samples["time_after_read"] > samples["time_before_write"]]
     assert np.diff(sent["time_before_write"]).min() > 0.15 / 400
@@ -61,7 +61,7 @@ def test_the_servos_clocks_supply_and_temperature_are_on_file(arm: Arm, tmp_path
         read = samples[name][np.isfinite(samples[name][:, 0])]
         assert len(read) == pytest.approx(len(samples) / 200, abs=2)
         assert read == pytest.approx(value)
-    assert timing(samples, 400.0)["servo_clock_ppm"] == pytest.approx([0.0, 0.0], abs=10.0)
+    assert timing(samples, 400.0).servo_clock_ppm == pytest.approx([0.0, 0.0], abs=10.0)
 
 
 def test_a_lost_port_carries_the_last_samples(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:

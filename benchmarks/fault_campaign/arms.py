@@ -1,0 +1,108 @@
+"""Every shipped configuration made ready for a campaign: another rate, short periods, and a fake arm where it has none."""
+
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+RATES = (20, 100, 400, 1000)
+PERIOD_S = 2.0
+SCHEME = "campaign://"
+
+_DONOR = "fake_two_link"
+_DONOR_TORQUE = 0.312  # N m: the first joint's in xm430_two_link.toml, whose arm the donor's could be
+_FAST_BAUD = 4_000_000  # 1 kHz does not fit on a wire of 1 Mbaud
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One shipped configuration at one rate [Hz]."""
+
+    name: str
+    rate: int
+
+
+def names() -> list[str]:
+    """The shipped configurations, by file name."""
+    return sorted(path.stem for path in CONFIGS.glob("*.toml"))
+
+
+def settings() -> list[Setting]:
+    """Every shipped configuration at every rate."""
+    return [Setting(name, rate) for name in names() for rate in RATES]
+
+
+def make_document(setting: Setting, period: float = PERIOD_S) -> dict[str, Any]:
+    """The configuration as a document, at this rate, with multisines of `period` [s] that count as settled soon.
+
+    What is lowered is the experiment's length; limits, torques, models and safety stay as they are shipped.
+    """
+    document = _load(setting.name)
+    experiment: dict[str, Any] = document["experiment"]
+    if experiment.pop("pilot", False):
+        # A pilot's steps are runs as any other; finding their torques takes the time of hundreds of injections.
+        experiment["peak_torque"] = _load(_DONOR)["experiment"]["peak_torque"]
+    experiment.pop("lines", None)
+    experiment.pop("design", None)
+    experiment |= {
+        "rate": float(setting.rate),
+        "period": period,
+        "band": [1.0 / period, min(5.0, setting.rate / 4 - 0.05)],
+        "ramp": 0.3,
+        "rest": 0.2,
+        "periods": 1,
+        "settle_within": 0.9,
+        "held_out": False,
+    }
+    if "fake" not in document:
+        document["fake"] = _fake_arm(document)
+    baud = _FAST_BAUD if setting.rate >= RATES[-1] else document["port"].get("baud", 1_000_000)
+    document["port"] |= {"url": f"{SCHEME}arm", "baud": baud}
+    for servo in document["fake"]["servos"]:
+        servo["baud"] = baud
+    return document
+
+
+def dump(document: dict[str, Any]) -> str:
+    """The document as TOML; tables below the first level are written inline."""
+    lines = []
+    for key, value in document.items():
+        if isinstance(value, dict):
+            lines += [f"\n[{key}]", *(f"{name} = {_inline(each)}" for name, each in value.items())]
+        else:
+            lines.insert(0, f"{key} = {_inline(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{name} = {_inline(each)}" for name, each in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_inline, value)) + "]"
+    return json.dumps(value) if isinstance(value, str | bool | int) else repr(value)
+
+
+def _load(name: str) -> dict[str, Any]:
+    return tomllib.loads((CONFIGS / f"{name}.toml").read_text(encoding="utf-8"))
+
+
+def _fake_arm(document: dict[str, Any]) -> dict[str, Any]:
+    """An arm for a configuration of real servos: the donor's links and friction, as heavy as its torques can move."""
+    arm = _load(_DONOR)["fake"]["arm"]
+    share = document["experiment"]["peak_torque"][0] / _DONOR_TORQUE
+    for link in arm["links"]:
+        link["mass"] *= share
+        link["inertia"] *= share
+    for drive, joint in zip(arm["drives"], document["joints"], strict=True):
+        for key in ("mass", "rotor_inertia", "viscous", "coulomb", "offset"):
+            drive[key] *= share
+        # A voltage-driven servo's motor is emulated by its own resistance and back-EMF, a current by this constant.
+        drive["torque_constant"] = joint.get("torque_constant", 1.8)
+    arm["start"] = document["arm"]["rest_pose"]
+    servos = [
+        {"id": joint["id"], "model": joint["model"], "zero_ticks": joint["zero_ticks"], "direction": joint["direction"]}
+        for joint in document["joints"]
+    ]
+    return {"seed": 1, "adapter_latency_us": 60.0, "servos": servos, "arm": arm}

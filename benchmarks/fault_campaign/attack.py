@@ -1,0 +1,153 @@
+"""What a man in the middle does to the bytes between host and servos, and what a hand does to the servos themselves."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from hil.drivers.packet import HEADER, Framer, Packet, crc, encode_status
+
+PRESENT = {"current": (126, 2), "velocity": (128, 4), "position": (132, 4)}
+"""Address and size of the present registers whose values can be forged."""
+
+
+class Kind(StrEnum):
+    """What can be done. Of replies first, then of instructions, of servos, and of the program's own surroundings."""
+
+    HOLD = "hold"
+    SPLIT = "split"
+    DROP = "drop"
+    CUT = "cut"
+    REPEAT = "repeat"
+    FLIP = "flip"
+    ECHO = "echo"
+    SWAP = "swap"
+    FREEZE = "freeze"
+    SCALE = "scale"
+    REPLAY = "replay"
+    DEAF = "deaf"
+    DEAF_TO_GOALS = "deaf_to_goals"
+    TWICE_TOLD = "twice_told"
+    TORQUE_TAKEN = "torque_taken"
+    WATCHDOG_TRIPPED = "watchdog_tripped"
+    STRANGE_GOAL = "strange_goal"
+    STALL = "stall"
+    SIGINT = "SIGINT"
+    SIGTERM = "SIGTERM"
+    SIGHUP = "SIGHUP"
+    KILLED = "killed"
+
+
+ON_REPLIES = frozenset(
+    {Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.SWAP, Kind.FREEZE, Kind.SCALE}
+) | {Kind.REPLAY}
+ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD})
+AT_ONCE = frozenset(set(Kind) - ON_REPLIES - ON_INSTRUCTIONS - {Kind.ECHO})
+"""These happen once, at their beginning."""
+
+
+@dataclass(frozen=True)
+class Attack:
+    """One thing that is done from `start` to `end` [s on the port's clock].
+
+    servo: bus ID, None for all. chance: that it strikes a packet. amount: seconds, bits or a factor, by kind.
+    field: the register that is forged, "state" for all three.
+    """
+
+    kind: Kind
+    start: float
+    end: float
+    servo: int | None = None
+    chance: float = 1.0
+    amount: float = 0.0
+    field: str = "state"
+
+    def concerns(self, servo_id: int) -> bool:
+        return self.servo is None or self.servo == servo_id
+
+
+@dataclass(frozen=True)
+class Request:
+    """The group read that is being answered: where its block begins, how long it is, whom it asks."""
+
+    address: int
+    length: int
+    ids: tuple[int, ...]
+    fast: bool
+
+
+def packets_of(data: bytes) -> list[bytes]:
+    """The packets of one write, each with its bytes; what is no packet stands with the one before it."""
+    starts = [at for at in range(len(data)) if data.startswith(HEADER, at)]
+    return [data[at:end] for at, end in zip(starts, [*starts[1:], len(data)], strict=True)] or [data]
+
+
+def request_in(data: bytes) -> Request | None:
+    """The group read in these bytes of the host, if there is one."""
+    for packet in Framer().feed(data):
+        if packet.instruction in (0x82, 0x8A) and len(packet.body) > 4:
+            address, length = int.from_bytes(packet.body[:2], "little"), int.from_bytes(packet.body[2:4], "little")
+            return Request(address, length, tuple(packet.body[4:]), packet.instruction == 0x8A)
+    return None
+
+
+def goals_in(packet: Packet) -> dict[int, tuple[int, int]]:
+    """ID to (address, goal) of a Sync Write of a two-byte goal; empty for any other packet."""
+    body = packet.body
+    if packet.instruction != 0x83 or len(body) < 7 or body[2:4] != b"\x02\x00" or body[0] not in (100, 102):
+        return {}
+    return {
+        body[at]: (body[0], int.from_bytes(body[at + 1 : at + 3], "little", signed=True))
+        for at in range(4, len(body) - 2, 3)
+    }
+
+
+def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
+    """ID to (ERR, block of registers) of the whole answers to `request` in these bytes."""
+    found: dict[int, tuple[int, bytes]] = {}
+    for packet in Framer().feed(data):
+        if packet.instruction != 0x55:
+            continue
+        if packet.id == 0xFE:
+            at = 0  # of the body: ERR ID data CRC for each
+            for servo_id in request.ids:
+                part = packet.body[at : at + 2 + request.length]
+                if len(part) == 2 + request.length and part[1] == servo_id:
+                    found[servo_id] = part[0], part[2:]
+                at += request.length + 4
+        elif packet.id in request.ids and len(packet.data) == request.length:
+            found[packet.id] = packet.error, packet.data
+    return found
+
+
+def field_of(block: bytes, request: Request, name: str) -> int | None:
+    """The present register `name` in a block, in ticks; None when the block does not cover it."""
+    address, size = PRESENT[name]
+    at = address - request.address
+    if at < 0 or at + size > request.length:
+        return None
+    return int.from_bytes(block[at : at + size], "little", signed=True)
+
+
+def with_field(block: bytes, request: Request, name: str, value: int) -> bytes:
+    """The block with another value of one present register."""
+    address, size = PRESENT[name]
+    at = address - request.address
+    if at < 0 or at + size > request.length:
+        return block
+    bound = 1 << 8 * size - 1
+    value = max(-bound, min(bound - 1, value))
+    return block[:at] + value.to_bytes(size, "little", signed=True) + block[at + size :]
+
+
+def forged(answers: dict[int, tuple[int, bytes]], request: Request) -> bytes:
+    """The bytes of answers in which somebody has changed values; every CRC is right."""
+    if not request.fast:
+        return b"".join(encode_status(servo_id, error, block) for servo_id, (error, block) in answers.items())
+    length = 1 + (request.length + 4) * len(request.ids)
+    whole = HEADER + b"\xfe" + length.to_bytes(2, "little") + b"\x55"
+    for servo_id in request.ids:
+        error, block = answers[servo_id]
+        whole += bytes((error, servo_id)) + block
+        whole += crc(whole).to_bytes(2, "little")
+    return whole
+
+

@@ -1,0 +1,260 @@
+"""One injection after another: the whole command in this process, on a virtual arm behind a man in the middle."""
+
+import contextlib
+import io
+import os
+import signal
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import serial
+
+from benchmarks.fault_campaign import arms
+from benchmarks.fault_campaign.arms import PERIOD_S, Setting
+from benchmarks.fault_campaign.attack import Kind
+from benchmarks.fault_campaign.draw import Drawn, draw
+from benchmarks.fault_campaign.judge import Story, Verdict, describe, judge
+from benchmarks.fault_campaign.middle import Killed, Middle
+from benchmarks.fault_campaign.protocol_campaign import Bench
+from benchmarks.fault_campaign.witness import Witness
+from hil.cli.app import main
+from hil.config.schema import Config, parse_config
+from hil.dry_run.ensemble import prior_ensemble
+from hil.dry_run.stopping_distance import stopping_distance
+from hil.errors import HilError
+from hil.plan import plan as plan_module
+from hil.plan.plan import make_plan
+from hil.runs.recording import load_samples
+
+AFTER_S = 1.5
+"""How long the arm is watched after the program has ended [s]."""
+
+STATE = "XDG_STATE_HOME"
+FREE = frozenset({"Goal Position", "Registered Instruction"})
+"""Registers that a servo writes itself, whatever a program does."""
+
+_PACKAGE = "benchmarks.fault_campaign"
+_ARMS = 12
+
+
+class DoesNotRun(Exception):
+    """A configuration that cannot be played at a rate even without faults: nothing can be learnt from it there."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One injection. not_restored: registers that differ from before, after the next start; unreadable: neither a
+    foreseen message nor a recording that can be read.
+    """
+
+    setting: Setting
+    drawn: Drawn
+    verdict: Verdict
+    beyond_limit: bool
+    unreadable: bool
+    not_restored: tuple[str, ...]
+    code: int | None
+    text: str
+
+    @property
+    def is_good(self) -> bool:
+        bad = self.verdict.unsafe or self.beyond_limit or self.unreadable or self.not_restored
+        return not (bad or self.verdict.misleading or self.verdict.named is False)
+
+    def __str__(self) -> str:
+        flags = ["BEYOND LIMIT"] * self.beyond_limit + ["UNREADABLE"] * self.unreadable
+        flags += [f"NOT RESTORED {', '.join(self.not_restored)}"] * bool(self.not_restored)
+        head = f"{self.setting.name} {self.setting.rate} Hz: {self.drawn}: {', '.join([describe(self.verdict), *flags])}"
+        return f"{head}\n    exit {self.code}: {self.text.strip()[-700:]}"
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A configuration at a rate, and how it goes undisturbed."""
+
+    setting: Setting
+    path: Path
+    config: Config
+    undisturbed: Story
+    not_restored: tuple[str, ...] = ()
+
+
+@cache
+def prepare(setting: Setting, period: float = PERIOD_S) -> Ready:
+    """Play it once without faults; raises DoesNotRun when that does not end well."""
+    if _PACKAGE not in serial.protocol_handler_packages:
+        serial.protocol_handler_packages.append(_PACKAGE)
+    # The same waves again and again: designing them takes as long as playing them.
+    if not hasattr(plan_module.design_multisine, "cache_info"):
+        plan_module.design_multisine = _cached(plan_module.design_multisine)
+    folder = Path(tempfile.mkdtemp(prefix="campaign-"))
+    path = folder / f"{setting.name}.toml"
+    path.write_text(arms.dump(arms.make_document(setting, period)), encoding="utf-8")
+    config = parse_config(path.read_text(encoding="utf-8"), path)
+    ready = Ready(setting, path, config, Story(np.empty(0), None, 0.0, None, ""))  # type: ignore[arg-type]
+    story, _, changed = _play(ready, Drawn((), ()), 0)
+    if story.code:
+        raise DoesNotRun(f"{setting.name} at {setting.rate} Hz does not run undisturbed: {story.text.strip()}")
+    return Ready(setting, path, config, story, changed)
+
+
+def inject(setting: Setting, seed: int, period: float = PERIOD_S) -> Outcome:
+    """Draw faults and let them happen in one run."""
+    ready = prepare(setting, period)
+    drawn = draw(f"{setting.name} {setting.rate} {seed}", ready.undisturbed.ended, [j.id for j in ready.config.joints])
+    return inject_drawn(ready, drawn, seed)
+
+
+def inject_drawn(ready: Ready, drawn: Drawn, seed: int) -> Outcome:
+    """Let these faults happen in one run."""
+    story, readable, changed = _play(ready, drawn, seed)
+    verdict = judge(ready.config, drawn, story, ready.undisturbed)
+    beyond = bool((verdict.beyond > 0).any()) and bool((verdict.beyond > _allowed(ready)).any())
+    killed = any(each.kind == Kind.KILLED for each in drawn.attacks)
+    unreadable = not readable or (not killed and (story.code is None or (story.code != 0 and not story.text.strip())))
+    return Outcome(ready.setting, drawn, verdict, beyond, unreadable, changed, story.code, story.text)
+
+
+def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str, ...]]:
+    """One `hil record`; its story, whether its recording can be read, and which registers it left otherwise."""
+    witnesses: list[Witness] = []
+    before: dict[int, dict[str, int]] = {}
+
+    def opened(port: Middle) -> None:
+        witnesses.append(Witness(port.bus))
+        before.update(_registers(port))
+        port.attack(drawn.attacks, seed)
+        port.bus.faults.add(*drawn.faults)
+
+    assert ready.config.fake is not None
+    Bench.lay(ready.config.fake, opened)
+    with tempfile.TemporaryDirectory() as name, _environment(Path(name) / "state"), _signals_ignored():
+        folder = Path(name) / "run"
+        code, text = _command("record", str(ready.path), "--out", str(folder))
+        port = Bench.port
+        assert port is not None
+        port.over = True
+        ended = port.clock.now()
+        port.bus.faults.clear()
+        port.clock.wait_until(ended + AFTER_S)
+        port.bus.advance(port.clock.now())
+        changed = _changed(before, port)
+        readable = _is_readable(folder, len(ready.config.joints))
+        if changed:
+            port.dead = False
+            port.close()
+            _command("check", str(ready.path))
+            changed = _changed(before, port)
+    return Story(witnesses[0].record(), port.traffic, ended, code, text), readable, changed
+
+
+def _command(*arguments: str) -> tuple[int | None, str]:
+    """Exit code and what a user reads; no code where it ended in an error that the command does not foresee."""
+    said = io.StringIO()
+    kept, sys.argv = sys.argv, ["hil", *arguments]
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            main()
+    except SystemExit as ended:
+        return int(ended.code or 0), said.getvalue()
+    except Killed:
+        return None, said.getvalue()
+    except BaseException:
+        return None, f"{said.getvalue()}\n{traceback.format_exc()}"
+    finally:
+        sys.argv = kept
+    return None, said.getvalue()
+
+
+def _is_readable(folder: Path, joints: int) -> bool:
+    path = folder / "samples.npy"
+    if not path.exists():
+        return True
+    try:
+        load_samples(path, joints)
+    except HilError:
+        return False
+    return True
+
+
+def _registers(port: Middle) -> dict[int, dict[str, int]]:
+    return {
+        number: {
+            register.name: servo.memory.value(register.name)
+            for register in servo.model.registers.values()
+            if register.writable and register.name not in FREE
+        }
+        for number, servo in enumerate(port.bus._servos)
+    }
+
+
+def _changed(before: Mapping[int, Mapping[str, int]], port: Middle) -> tuple[str, ...]:
+    after = _registers(port)
+    return tuple(
+        f"{name} of servo {number + 1}: {value} -> {after[number][name]}"
+        for number, registers in before.items()
+        for name, value in registers.items()
+        if after[number][name] != value
+    )
+
+
+@cache
+def _allowed_of(path: Path) -> Any:
+    text = path.read_text(encoding="utf-8")
+    config = parse_config(text, path)
+    if config.arm.link_lengths is None:
+        assert config.fake is not None and config.fake.arm is not None
+        lengths = [link.length for link in config.fake.arm.links]
+        config = config.model_copy(update={"arm": config.arm.model_copy(update={"link_lengths": lengths})})
+    fastest = np.array([joint.velocity_limit for joint in config.joints])
+    foreseen = stopping_distance(config, make_plan(config), prior_ensemble(config, _ARMS), fastest)
+    return np.max([*foreseen.planned.values(), *foreseen.passed.values()], axis=0)
+
+
+def _allowed(ready: Ready) -> Any:
+    """How far a stopped joint may get beyond its limit, as the dry run promises (joints,) [rad]."""
+    return _allowed_of(ready.path)
+
+
+def _cached(design: Any) -> Any:
+    @cache
+    def designed(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Any:
+        return design(rate, period, lines, peaks, seed)
+
+    def design_multisine(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Any:
+        return designed(rate, period, tuple(map(tuple, lines)), tuple(peaks), seed)
+
+    design_multisine.cache_info = designed.cache_info  # type: ignore[attr-defined]
+    return design_multisine
+
+
+@contextlib.contextmanager
+def _environment(state: Path) -> Iterator[None]:
+    """What the program keeps for its user lies where the campaign can throw it away."""
+    kept = os.environ.get(STATE)
+    os.environ[STATE] = str(state)
+    try:
+        yield
+    finally:
+        os.environ.pop(STATE)
+        if kept is not None:
+            os.environ[STATE] = kept
+
+
+@contextlib.contextmanager
+def _signals_ignored() -> Iterator[None]:
+    """A signal outside the experiment must not end the campaign."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    kept = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)

@@ -1,0 +1,189 @@
+"""Which faults befall a run: drawn at random in kind, time, length, strength and combination, and the words for them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from random import Random
+
+from benchmarks.fault_campaign.attack import AT_ONCE, Attack, Kind
+from hil.fakes.bus.faults import INSTRUCTION_FAULTS, REPLY_FAULTS, Fault, FaultKind
+
+PAIRS = 0.35
+"""Share of injections that are two faults."""
+
+TOGETHER_S = 0.3
+"""Half of the pairs follow each other this closely [s]."""
+
+SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
+HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
+LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
+
+WORDS = {
+    SILENCE: r"no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response|repl(y|ies).{0,30}(missing|lost)",
+    GARBLED: r"damaged|corrupt|\bCRC|not an answer|not one to the question|garbled|broken packet|unreadable repl|incorrect|echo",
+    LATE: r"\blate\b|\blater\b|deadlines?\b|latency|too slow",
+    CABLE: r"[Pp]ort .{0,80}(failed|closed|lost)|unplugged|cable (is|was)|Is the cable|adapter",
+    TORQUE: r"torque (is|was|seems|has been) (off|lost|cut|switched off|gone)|lost (its )?torque|carries|not follow"
+    r"|without torque|goals? .{0,30}(lost|dropped|refused|ignored|not (arrive|reach))|watchdog|Torque Enable",
+    REBOOT: r"reboot|restarted|power.cycle|supply (broke|was interrupted|failed)",
+    HEAT: r"overheat|temperature|degrees C|too hot",
+    OVERLOAD: r"overload",
+    VOLTAGE: r"voltage|\d V\b",
+    STUCK: r"stuck|\bheld\b|jammed|not move|stands? still|blocked|not moving|something holds",
+    ENCODER: r"encoder|magnet|seems to have moved|implausible|frozen|velocity and position|position.{0,40}(disagree|contradict)",
+    LIMIT: r"(position|velocity)[ _]limit",
+    SIGN: r"sign of|against its command|wrong way|turned? round",
+    PROGRAM: r"deadlines?\b|the computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
+    SIGNAL: r"Ctrl-C|SIGINT|SIGTERM|SIGHUP",
+    MODEL: r"any arm|than (the )?model|predicted|not as planned|foreseen|the dry run",
+    POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
+}
+"""What a message has to say for a cause to count as named."""
+
+_FORGED = frozenset({ENCODER, STUCK, MODEL, TORQUE, SIGN})
+_LOST_GOALS = frozenset({TORQUE, MODEL, STUCK})
+_BYTES = frozenset({SILENCE, GARBLED})
+_SLOW = frozenset({LATE, SILENCE})
+
+CAUSES: dict[str, frozenset[str]] = {
+    Kind.HOLD: _SLOW,
+    Kind.SPLIT: _SLOW | _BYTES,
+    Kind.DROP: frozenset({SILENCE}),
+    Kind.CUT: _BYTES,
+    Kind.REPEAT: _BYTES,
+    Kind.FLIP: _BYTES,
+    Kind.ECHO: _BYTES,
+    Kind.SWAP: _FORGED,
+    Kind.FREEZE: _FORGED,
+    Kind.SCALE: _FORGED | {LIMIT},
+    Kind.REPLAY: _FORGED | {LATE},
+    Kind.DEAF: frozenset({SILENCE}),
+    Kind.DEAF_TO_GOALS: _LOST_GOALS,
+    Kind.TWICE_TOLD: _BYTES,
+    Kind.TORQUE_TAKEN: _LOST_GOALS,
+    Kind.WATCHDOG_TRIPPED: _LOST_GOALS,
+    Kind.STRANGE_GOAL: _LOST_GOALS | {LIMIT},
+    Kind.STALL: frozenset({PROGRAM, LATE}),
+    Kind.SIGINT: frozenset({SIGNAL}),
+    Kind.SIGTERM: frozenset({SIGNAL}),
+    Kind.SIGHUP: frozenset({SIGNAL}),
+    Kind.KILLED: frozenset(),
+    FaultKind.LOST_REPLY: frozenset({SILENCE}),
+    FaultKind.CORRUPTED_REPLY: _BYTES,
+    FaultKind.TRUNCATED_REPLY: _BYTES,
+    FaultKind.DUPLICATED_REPLY: _BYTES,
+    FaultKind.LATE_REPLY: _SLOW,
+    FaultKind.NOISE: _BYTES,
+    FaultKind.LOST_INSTRUCTION: _LOST_GOALS | {SILENCE},
+    FaultKind.CORRUPTED_INSTRUCTION: _LOST_GOALS | _BYTES,
+    FaultKind.SILENT_SERVO: frozenset({SILENCE}),
+    FaultKind.REBOOT: frozenset({SILENCE, REBOOT, TORQUE}),
+    FaultKind.OVERHEATING: frozenset({HEAT}),
+    FaultKind.OVERLOAD: frozenset({OVERLOAD}),
+    FaultKind.LOW_VOLTAGE: frozenset({VOLTAGE}),
+    FaultKind.STUCK_JOINT: frozenset({STUCK, ENCODER, MODEL}),
+    FaultKind.ENCODER_JUMP: frozenset({ENCODER, POSE}),
+    FaultKind.CABLE_PULLED: frozenset({CABLE}),
+}
+"""What each fault may rightly be called. Held fast and a dead encoder cannot be told apart from the host's side."""
+
+UNHEARD = frozenset(
+    {Kind.DEAF, Kind.STALL, Kind.KILLED, FaultKind.CABLE_PULLED, FaultKind.SILENT_SERVO, FaultKind.CORRUPTED_INSTRUCTION}
+) | {FaultKind.LOST_INSTRUCTION, FaultKind.REBOOT}
+"""Where the program cannot reach a servo, the watchdog's time counts."""
+
+SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SPLIT, FaultKind.LATE_REPLY})
+"""After these the program may rightly play its plan later than undisturbed."""
+
+_LAST = frozenset({Kind.KILLED})
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is done to one run: attacks of the man in the middle, faults of the fake bus [their times from its start]."""
+
+    attacks: tuple[Attack, ...]
+    faults: tuple[Fault, ...]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        return (*(str(each.kind) for each in self.attacks), *(str(each.kind) for each in self.faults))
+
+    @property
+    def start(self) -> float:
+        return min([each.start for each in self.attacks] + [each.at for each in self.faults])
+
+    def __str__(self) -> str:
+        told = [
+            f"{each.kind} servo {each.servo or 'all'} {each.start:.3f}-{each.end:.3f} s, chance {each.chance:g}, "
+            f"{each.amount:.3g} {each.field}"
+            for each in self.attacks
+        ]
+        told += [
+            f"{each.kind} servo {each.servo or 'all'} {each.at:.3f}-{each.end:.3f} s, chance {each.probability:g}, "
+            f"{each.size:g}"
+            for each in self.faults
+        ]
+        return " and ".join(told)
+
+
+def draw(seed: object, until: float, ids: Sequence[int]) -> Drawn:
+    """One fault or two within an undisturbed run that lasts `until` [s]; the same seed draws the same."""
+    random = Random(f"drawn {seed}")
+    first = random.uniform(0.0, until)
+    times = [first]
+    if random.random() < PAIRS:
+        close = first + random.uniform(0.0, TOGETHER_S)
+        times.append(close if random.random() < 0.5 else random.uniform(0.0, until))
+    attacks, faults = [], []
+    for at in times:
+        kind = random.choice([*Kind, *FaultKind])
+        if kind in _LAST and len(times) > 1:
+            at = max(times)
+        if isinstance(kind, Kind):
+            attacks.append(_attack(kind, at, ids, random))
+        else:
+            faults.append(_fault(kind, at, ids, random))
+    return Drawn(tuple(attacks), tuple(faults))
+
+
+def _length(random: Random) -> float:
+    """Of a fault [s]: from some milliseconds to the end of the run."""
+    return math.inf if random.random() < 0.4 else 10 ** random.uniform(-2.3, 0.7)
+
+
+def _chance(random: Random) -> float:
+    return random.choice((1.0, 1.0, 0.5, 0.1))
+
+
+def _attack(kind: Kind, at: float, ids: Sequence[int], random: Random) -> Attack:
+    if kind in AT_ONCE:
+        amount = {
+            Kind.STALL: 10 ** random.uniform(-2, 0.5),
+            Kind.STRANGE_GOAL: random.choice((-1, 1)) * random.uniform(0.05, 1.0),
+        }.get(kind, 0.0)
+        return Attack(kind, at, at, random.choice((None, *ids)), amount=amount)
+    amounts = {
+        Kind.HOLD: 10 ** random.uniform(-3, -0.7),
+        Kind.SPLIT: 10 ** random.uniform(-4, -1.3),
+        Kind.FLIP: float(random.randrange(1, 9)),
+        Kind.SCALE: random.choice((-1.0, 0.0, 0.5, 0.8, 1.25, 2.0)),
+        Kind.REPLAY: random.uniform(0.02, 0.5),
+    }
+    # A forged value stays forged: one that comes and goes is another fault at every sample.
+    chance = 1.0 if kind in (Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY, Kind.ECHO) else _chance(random)
+    field = random.choice(("state", "position", "velocity", "current"))
+    return Attack(kind, at, at + _length(random), random.choice((None, *ids)), chance, amounts.get(kind, 0.0), field)
+
+
+def _fault(kind: FaultKind, at: float, ids: Sequence[int], random: Random) -> Fault:
+    servo = random.choice((None, *ids))
+    if kind == FaultKind.CABLE_PULLED:
+        return Fault(kind=kind, at=at)
+    if kind in REPLY_FAULTS | INSTRUCTION_FAULTS:
+        return Fault(kind=kind, at=at, duration=_length(random), servo=servo, probability=_chance(random))
+    amount = None
+    if kind == FaultKind.ENCODER_JUMP:
+        amount = float(random.choice((-1, 1)) * random.randrange(60, 2049))
+    lasting = kind in (FaultKind.STUCK_JOINT, FaultKind.SILENT_SERVO, FaultKind.LOW_VOLTAGE, FaultKind.ENCODER_JUMP)
+    return Fault(kind=kind, at=at, duration=_length(random) if lasting else math.inf, servo=servo, amount=amount)

@@ -1,0 +1,267 @@
+"""The second oracle: what a run owed its arm, and whether the emulated servos' own record says that it kept it.
+
+It knows no kinds of faults. From the record it takes, millisecond by millisecond, whether the program was told the
+truth, heard anything, was obeyed, and had the arm within its limits and near its undisturbed motion. From the first
+moment on at which one of these failed for good, current has `BOUND_MS` to end.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_in
+from benchmarks.fault_campaign.draw import CAUSES, SHIFTED, UNHEARD, WORDS, Drawn
+from benchmarks.fault_campaign.middle import Traffic
+from benchmarks.fault_campaign.witness import STEP_S
+from hil.config.schema import Config
+from hil.drivers.packet import Framer
+from hil.fakes.bus.faults import FaultKind
+
+BOUND_MS = 100.0
+TRIP_MS = 40.0
+"""Beyond a watchdog's time: its step of 20 ms, and the packet that fed it last."""
+
+LASTING_MS = 100
+"""A failure that passes sooner may be ridden out."""
+
+GAP_MS = 50
+"""A failure that pauses for less has not passed; but whoever hears a servo now and then is not deaf to it."""
+
+LIE_RAD, LIE_RAD_S, LIE_SHARE = 0.1, 0.5, 0.1
+"""A position, a velocity that the program was told may be wrong by so much; the velocity by a share of itself too."""
+
+OBEYED = 0.1
+"""Of the largest goal of the run: how far a servo's goal may be from what was sent."""
+
+ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
+"""From the undisturbed motion a joint may be so far away, and by so much of that motion's range."""
+
+_TICKS_PER_RAD = 4096 / (2 * np.pi)
+_TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
+
+
+@dataclass(frozen=True)
+class Story:
+    """Everything about one run: the servos' record, the bytes, when the program ended, and what its user read."""
+
+    record: NDArray[Any]
+    traffic: Traffic
+    ended: float
+    code: int | None
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """owed: why current had to end, "" where nothing asked for it; late_ms: how long it flowed from then on; beyond: way
+    of each joint beyond its limit (joints,) [rad]; named: whether the user reads the cause, None where nothing stopped;
+    misleading: the user reads causes that it was not, and not the one that it was.
+    """
+
+    owed: str
+    late_ms: float
+    unsafe: bool
+    beyond: NDArray[np.float64]
+    named: bool | None
+    misleading: bool
+
+
+def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
+    """What the run of `story`, to which `drawn` was done, owed and kept."""
+    reasons = _reasons(config, drawn, story, undisturbed)
+    owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
+    driven = story.record["driven"].any(axis=1)
+    time = story.record["time"][:, 0]
+    ends = time[driven]
+    flowed = ends[ends >= since]
+    late_ms = 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
+    bound = BOUND_MS
+    if set(drawn.kinds) & UNHEARD:
+        bound = max(bound, 1e3 * config.safety.watchdog + TRIP_MS)
+    left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
+    named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
+    limits = np.array([joint.position_limit for joint in config.joints])
+    position = story.record["position"]
+    beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
+    return Verdict(owed, late_ms, late_ms > bound or left_on, beyond, named, misleading)
+
+
+def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
+    """Whether a message names the cause among at most three it offers, and whether it offers others only."""
+    offered = causes_in(text)
+    right = frozenset().union(*(CAUSES[kind] for kind in drawn.kinds))
+    if not right:
+        return True, False  # nothing of it had to stop the run: what did is not for words to tell
+    told = offered & right
+    return bool(told) and len(told) * 3 >= len(offered), bool(offered) and not told
+
+
+def causes_in(text: str) -> set[str]:
+    """The causes that a message speaks of; what came before the error, and whether torque is off, are no causes."""
+    said = [line for line in text.splitlines() if not re.match(r"Torque is off|TORQUE OFF", line.strip())]
+    return {cause for cause, words in WORDS.items() if any(re.search(words, line) for line in said)}
+
+
+Reason = tuple[str, float]
+
+
+def _reasons(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> list[Reason]:
+    """Why current had to end, and since when [s]."""
+    record = story.record
+    time = record["time"][:, 0]
+    told = _Told(config, story.traffic, drawn.start)
+    interval = 1.0 / config.experiment.rate
+    joints = range(len(config.joints))
+    found: list[Reason | None] = []
+    for joint in joints:
+        own = record[:, joint]
+        found += [
+            _since(f"joint {joint + 1} {what}", time, wrong, hold, gap)
+            for what, wrong, hold, gap in (
+                ("is not where the program was told", told.lies(joint, time, own, "position", interval), LASTING_MS, GAP_MS),
+                ("is not as fast as told", told.lies(joint, time, own, "velocity", interval), LASTING_MS, GAP_MS),
+                ("was not heard", told.silent(joint, time, interval, story.ended), LASTING_MS, 1),
+                ("does not do as told", told.disobeys(joint, time, own, interval), LASTING_MS, GAP_MS),
+                ("is beyond a limit", _beyond(config, joint, own), 1, GAP_MS),
+                ("is not where it would be", _astray(drawn, joint, own, undisturbed.record[:, joint]), LASTING_MS, GAP_MS),
+            )
+        ]
+    for attack in drawn.attacks:
+        if attack.kind in (Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP) and attack.start < story.ended:
+            found.append(("somebody asked for it", attack.start))
+    for fault in drawn.faults:
+        if fault.kind == FaultKind.CABLE_PULLED and fault.at < story.ended:
+            found.append(("the cable is out", fault.at))
+    return [reason for reason in found if reason is not None]
+
+
+def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int, gap_ms: int) -> Reason | None:
+    """Since when [s] something was wrong for at least `hold_ms`, pauses of at most `gap_ms` included."""
+    at = np.flatnonzero(wrong)
+    if not at.size:
+        return None
+    breaks = np.flatnonzero(np.diff(at) > gap_ms)
+    starts, ends = at[np.r_[0, breaks + 1]], at[np.r_[breaks, at.size - 1]]
+    lasting = np.flatnonzero(ends - starts + 1 >= hold_ms)
+    return (what, float(time[starts[lasting[0]]])) if lasting.size else None
+
+
+class _Told:
+    """What the program was told and what it told the servos, read off the bytes, from the first fault on."""
+
+    def __init__(self, config: Config, traffic: Traffic, start: float) -> None:
+        self._joints = config.joints
+        self._sent: list[list[tuple[float, int]]] = [[] for _ in config.joints]
+        self._heard: list[list[tuple[float, float, float]]] = [[] for _ in config.joints]
+        self._begun = np.inf
+        self._largest = [1] * len(config.joints)
+        index = {joint.id: number for number, joint in enumerate(config.joints)}
+        events = [(time, 0, data) for time, data in traffic.written] + [(time, 1, data) for time, data in traffic.read]
+        request: Request | None = None
+        pending = b""
+        for time, is_read, data in sorted(events, key=lambda event: event[0]):
+            if not is_read:
+                if b"\x83" in data[:16]:
+                    request = request_in(data) or request
+                    self._keep_goals(time, data, index)
+                elif b"\x82" in data[:9] or b"\x8a" in data[:9]:
+                    request = request_in(data)
+                else:
+                    request = None
+                pending = b""
+            elif request is not None and data and time >= start - 0.2:
+                pending += data
+                self._keep_answers(time, pending, request, index)
+
+    def _keep_goals(self, time: float, data: bytes, index: dict[int, int]) -> None:
+        for packet in Framer().feed(data):
+            for servo_id, (_, goal) in goals_in(packet).items():
+                if servo_id in index:
+                    self._begun = min(self._begun, time)
+                    self._sent[index[servo_id]].append((time, goal))
+                    self._largest[index[servo_id]] = max(self._largest[index[servo_id]], abs(goal))
+
+    def _keep_answers(self, time: float, data: bytes, request: Request, index: dict[int, int]) -> None:
+        for servo_id, (error, block) in blocks_in(data, request).items():
+            velocity = field_of(block, request, "velocity")
+            position = field_of(block, request, "position")
+            if servo_id not in index or velocity is None or position is None or error & 0x7F:
+                continue
+            joint = self._joints[index[servo_id]]
+            heard = self._heard[index[servo_id]]
+            told = (
+                time,
+                joint.direction * (position - joint.zero_ticks) / _TICKS_PER_RAD,
+                joint.direction * velocity / _TICKS_PER_RAD_S,
+            )
+            if not heard or heard[-1][1:] != told[1:] or time - heard[-1][0] > 5e-4:
+                heard.append(told)
+
+    def lies(self, joint: int, time: NDArray[Any], own: NDArray[Any], what: str, interval: float) -> NDArray[np.bool_]:
+        wrong = np.zeros(time.size, bool)
+        heard = np.array(self._heard[joint]).reshape(-1, 3)
+        if not heard.size:
+            return wrong
+        at = np.clip(np.searchsorted(time, heard[:, 0]), 0, time.size - 1)
+        if what == "position":
+            false = np.abs(heard[:, 1] - own["position"][at]) > LIE_RAD
+        else:
+            error = np.abs(heard[:, 2] - own["velocity"][at])
+            false = error > LIE_RAD_S + LIE_SHARE * np.abs(own["velocity"][at])
+        steps = round(1.2 * interval / STEP_S) + 1
+        for index in at[false]:
+            wrong[index : index + steps] = True
+        return wrong
+
+    def silent(self, joint: int, time: NDArray[Any], interval: float, ended: float) -> NDArray[np.bool_]:
+        heard = np.array([each[0] for each in self._heard[joint]])
+        if not heard.size or not np.isfinite(self._begun):
+            return np.zeros(time.size, bool)
+        latest = heard[np.clip(np.searchsorted(heard, time, "right") - 1, 0, None)]
+        running = (time > max(self._begun, heard[0])) & (time < ended)
+        return running & (time - latest > interval + 2e-3)
+
+    def disobeys(self, joint: int, time: NDArray[Any], own: NDArray[Any], interval: float) -> NDArray[np.bool_]:
+        if not self._sent[joint]:
+            return np.zeros(time.size, bool)
+        when = np.array([each[0] for each in self._sent[joint]])
+        goals = np.array([each[1] for each in self._sent[joint]])
+        done = np.where(own["torque"], own["goal"], 0)
+        tolerance = OBEYED * self._largest[joint] + 1
+        # On its way, a goal may be this or the one before.
+        latest = np.searchsorted(when, time, "right") - 1
+        off = np.full(time.size, np.inf)
+        for back in (0, 1):
+            index = np.clip(latest - back, 0, None)
+            off = np.minimum(off, np.abs(done - goals[index]))
+        current = (latest >= 0) & (time - when[np.clip(latest, 0, None)] < 2 * interval + 2e-3)
+        return current & (off > tolerance)
+
+
+def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:
+    low, high = config.joints[joint].position_limit
+    fastest = config.joints[joint].velocity_limit
+    outside = (own["position"] < low - 1e-3) | (own["position"] > high + 1e-3)
+    return np.asarray(outside | (np.abs(own["velocity"]) > 1.02 * fastest))
+
+
+def _astray(drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[Any]) -> NDArray[np.bool_]:
+    count = min(own.size, undisturbed.size)
+    wrong = np.zeros(own.size, bool)
+    if set(drawn.kinds) & SHIFTED:
+        return wrong
+    most = ASTRAY_RAD + ASTRAY_SHARE * float(np.ptp(undisturbed["position"]))
+    wrong[:count] = np.abs(own["position"][:count] - undisturbed["position"][:count]) > most
+    return wrong
+
+
+def describe(verdict: Verdict) -> str:
+    """One line."""
+    said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
+    said += ["UNSAFE"] * verdict.unsafe + ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
+    return ", ".join(said)
+
+

@@ -1,0 +1,323 @@
+"""The man in the middle: a serial port between the program and the fake bus that does to the bytes what attacks say.
+
+Outside an attack's time bytes pass as they are, at no cost. Within it every reply is taken apart, changed, and handed
+on when it is due; what the host reads and writes is kept with its time either way.
+"""
+
+import contextlib
+import math
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any
+
+from benchmarks.fault_campaign.attack import (
+    AT_ONCE,
+    ON_INSTRUCTIONS,
+    ON_REPLIES,
+    Attack,
+    Kind,
+    Request,
+    blocks_in,
+    field_of,
+    forged,
+    packets_of,
+    request_in,
+    with_field,
+)
+from hil.drivers.packet import HEADER
+from hil.fakes.protocol_fake import FakeSerial
+
+FORGED = {Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY}
+LOOK_BACK_S = 0.5
+"""How long before a replay replies are kept for it."""
+
+
+@dataclass
+class Traffic:
+    """What went over the port: (time [s], bytes) of every write and every read."""
+
+    written: list[tuple[float, bytes]] = field(default_factory=list)
+    read: list[tuple[float, bytes]] = field(default_factory=list)
+
+
+class Middle(FakeSerial):
+    """A port onto a fake arm with somebody in between."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.traffic = Traffic()
+        self.over = False
+        """The program is done: nothing is done to it any more."""
+        self.dead = False
+        """The program was killed, though its clean-up still runs in this process."""
+        self._attacks: Sequence[Attack] = ()
+        self._random = Random(0)
+        self._wakes = math.inf
+        self._sleeps = -math.inf
+        self._to_come: list[Attack] = []
+        self._queue: deque[tuple[float, bytes]] = deque()
+        self._raw = bytearray()
+        self._request: Request | None = None
+        self._forger = Forger()
+        super().__init__(*args, **kwargs)
+
+    def attack(self, attacks: Sequence[Attack], seed: int) -> None:
+        """Do these, with chance drawn from `seed`."""
+        self._attacks = attacks
+        self._random = Random(seed)
+        self._to_come = sorted((each for each in attacks if each.kind in AT_ONCE), key=lambda each: each.start)
+        on_bytes = [each for each in attacks if each.kind not in AT_ONCE]
+        self._wakes = min((each.start - LOOK_BACK_S * (each.kind == Kind.REPLAY) for each in on_bytes), default=math.inf)
+        self._sleeps = max((each.end for each in on_bytes), default=-math.inf)
+
+    # What the program calls
+
+    def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]
+        now = self.clock.now()
+        self._strike(now)
+        self.traffic.written.append((now, bytes(data)))
+        if not self._wakes <= now <= self._sleeps:
+            return super().write(data)
+        self._request = request_in(bytes(data)) or self._request
+        told = [told for packet in packets_of(bytes(data)) for told in self._instruction(packet, now)]
+        if told:
+            super().write(b"".join(told))
+        if any(self._strikes(each, now) for each in self._lasting(now, {Kind.ECHO})):
+            self._queue.append((now, bytes(data)))
+        return len(data)
+
+    def read(self, size: int = 1) -> bytes:
+        now = self.clock.now()
+        self._strike(now)
+        if self._wakes <= now <= self._sleeps or self._queue or self._raw:
+            taken = self._read_changed(size)
+        else:
+            taken = super().read(size)
+        self.traffic.read.append((self.clock.now(), taken))
+        self._strike(self.clock.now())
+        return taken
+
+    @property
+    def in_waiting(self) -> int:
+        now = self.clock.now()
+        return super().in_waiting + sum(len(data) for due, data in self._queue if due <= now)
+
+    def reset_input_buffer(self) -> None:
+        super().reset_input_buffer()
+        now = self.clock.now()
+        self._raw.clear()
+        self._queue = deque((due, data) for due, data in self._queue if due > now)
+
+    # Replies
+
+    def _read_changed(self, size: int) -> bytes:
+        clock, queue = self.clock, self._queue
+        deadline = clock.now() + (self.timeout or 0.0)
+        taken = b""
+        while len(taken) < size:
+            now = clock.now()
+            if queue and queue[0][0] <= now:
+                due, data = queue.popleft()
+                count = size - len(taken)
+                taken += data[:count]
+                if data[count:]:
+                    queue.appendleft((due, data[count:]))
+                continue
+            until = min(deadline, queue[0][0] if queue else math.inf)
+            if self.bus.on_the_way:
+                self.timeout, kept = max(0.0, until - now), self.timeout
+                try:
+                    byte = super().read(1)
+                finally:
+                    self.timeout = kept
+                if byte:
+                    self._take(byte)
+                    continue
+            else:
+                clock.wait_until(until)
+                if not self.is_open or self.bus.cable_is_out:
+                    super().read(0)
+            if clock.now() >= deadline and not (queue and queue[0][0] <= clock.now()):
+                break
+        return taken
+
+    def _take(self, byte: bytes) -> None:
+        """A byte from the servos: hand on the packet that it completes, changed."""
+        raw = self._raw
+        raw += byte
+        if len(raw) >= 7 and raw.startswith(HEADER):
+            if len(raw) < 7 + (raw[5] | raw[6] << 8):
+                return
+        elif HEADER.startswith(bytes(raw[:4])):
+            return
+        packet = bytes(raw)
+        raw.clear()
+        now = self.clock.now()
+        due = self._queue[-1][0] if self._queue else now
+        for wait, data in self._changed(packet, now):
+            due = max(due, now + wait)
+            self._queue.append((due, data))
+
+    def _changed(self, packet: bytes, now: float) -> Iterator[tuple[float, bytes]]:
+        """What becomes of a reply: seconds that it is held, and bytes."""
+        servo_id = packet[4] if len(packet) > 4 else None
+        packet = self._forger.keep_and_forge(packet, self._request, now, self._forging(now))
+        wait, copies, gap = 0.0, 1, None
+        for each in self._lasting(now, ON_REPLIES - FORGED):
+            if servo_id not in (None, 0xFE) and not each.concerns(servo_id):
+                continue
+            if not self._strikes(each, now):
+                continue
+            match each.kind:
+                case Kind.HOLD:
+                    wait += each.amount
+                case Kind.SPLIT:
+                    gap = each.amount
+                case Kind.DROP:
+                    copies = 0
+                case Kind.CUT:
+                    at = self._random.randrange(len(packet))
+                    packet = packet[:at] + packet[at + self._random.randrange(1, 5) :]
+                case Kind.REPEAT:
+                    copies *= 2
+                case Kind.FLIP:
+                    packet = self._flipped(packet, max(1, round(each.amount)))
+        for _ in range(copies):
+            if gap is None:
+                yield wait, packet
+            else:
+                half = self._random.randrange(1, max(2, len(packet)))
+                yield wait, packet[:half]
+                yield wait + gap, packet[half:]
+
+    def _forging(self, now: float) -> list[Attack]:
+        return [each for each in self._lasting(now, FORGED) if self._strikes(each, now)]
+
+    def _flipped(self, data: bytes, bits: int) -> bytes:
+        changed = bytearray(data)
+        for _ in range(bits if changed else 0):
+            changed[self._random.randrange(len(changed))] ^= 1 << self._random.randrange(8)
+        return bytes(changed)
+
+    # Instructions
+
+    def _instruction(self, packet: bytes, now: float) -> Iterator[bytes]:
+        is_goal = len(packet) > 7 and packet[7] == 0x83
+        copies = 1
+        for each in self._lasting(now, ON_INSTRUCTIONS):
+            if (each.kind == Kind.DEAF_TO_GOALS and not is_goal) or not self._strikes(each, now):
+                continue
+            copies = copies * 2 if each.kind == Kind.TWICE_TOLD else 0
+        for _ in range(copies):
+            yield packet
+
+    # What happens once
+
+    def _strike(self, now: float) -> None:
+        if self.dead:
+            raise Killed
+        while self._to_come and self._to_come[0].start <= now:
+            each = self._to_come.pop(0)
+            if not self.over:
+                _do(each, self)
+
+    def _lasting(self, now: float, kinds: frozenset[Kind] | set[Kind]) -> Iterator[Attack]:
+        if self.over:
+            return
+        for each in self._attacks:
+            if each.kind in kinds and each.start <= now < each.end:
+                yield each
+
+    def _strikes(self, attack: Attack, _now: float) -> bool:
+        return attack.chance >= 1.0 or self._random.random() < attack.chance
+
+
+def _do(attack: Attack, port: Middle) -> None:
+    if attack.kind in (Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP):
+        os.kill(os.getpid(), signal.Signals[attack.kind])
+        return
+    if attack.kind == Kind.KILLED:
+        port.dead = True
+        raise Killed
+    if attack.kind == Kind.STALL:
+        port.clock.wait_until(port.clock.now() + attack.amount)
+        return
+    for servo_id, servo in port.bus.servos.items():
+        if not attack.concerns(servo_id):
+            continue
+        if attack.kind == Kind.TORQUE_TAKEN:
+            servo.write(64, b"\x00")
+        elif attack.kind == Kind.WATCHDOG_TRIPPED and servo.torque_enabled:
+            servo.trip_watchdog()
+        elif attack.kind == Kind.STRANGE_GOAL:
+            with contextlib.suppress(KeyError):
+                goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
+                servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
+
+
+class Forger:
+    """Changes values inside whole answers and seals them again, so that nothing but their content tells."""
+
+    def __init__(self) -> None:
+        self._latest: dict[int, tuple[int, bytes]] = {}
+        self._history: deque[tuple[float, int, bytes]] = deque(maxlen=4000)
+        self._frozen: dict[tuple[int, int, str], int] = {}
+
+    def keep_and_forge(self, packet: bytes, request: Request | None, now: float, attacks: Sequence[Attack]) -> bytes:
+        if request is None:
+            return packet
+        answers = blocks_in(packet, request)
+        if not answers:
+            return packet
+        for servo_id, (_, block) in answers.items():
+            self._history.append((now, servo_id, block))
+        changed = dict(answers)
+        for number, each in enumerate(attacks):
+            for servo_id, (error, block) in changed.items():
+                if each.concerns(servo_id):
+                    changed[servo_id] = error, self._block(each, number, servo_id, block, request, now)
+        self._latest.update(answers)
+        if changed == answers or (request.fast and set(answers) != set(request.ids)):
+            return packet
+        return forged(changed, request)
+
+    def _block(
+        self, attack: Attack, number: int, servo_id: int, block: bytes, request: Request, now: float
+    ) -> bytes:
+        if attack.kind == Kind.SWAP:
+            others = [kept for other, (_, kept) in self._latest.items() if other != servo_id]
+            return others[0] if others and len(others[0]) == len(block) else block
+        names = ("current", "velocity", "position") if attack.field == "state" else (attack.field,)
+        for name in names:
+            value = field_of(block, request, name)
+            if value is None:
+                continue
+            key = (number, servo_id, name)
+            if attack.kind == Kind.REPLAY:
+                value = self._earlier(servo_id, len(block), name, request, now - attack.amount, value)
+            elif attack.kind == Kind.FREEZE:
+                value = self._frozen.setdefault(key, value)
+            elif name == "position":
+                origin = self._frozen.setdefault(key, value)
+                value = origin + round(attack.amount * (value - origin))
+            else:
+                value = round(attack.amount * value)
+            block = with_field(block, request, name, value)
+        return block
+
+    def _earlier(self, servo_id: int, length: int, name: str, request: Request, then: float, value: int) -> int:
+        for when, other, block in self._history:
+            if other == servo_id and when >= then and len(block) == length:
+                earlier = field_of(block, request, name)
+                return value if earlier is None else earlier
+        return value
+
+
+Opened = Callable[[Middle], None]
+
+
+class Killed(BaseException):
+    """The program is gone: whatever it still tries on this port, nothing leaves it any more."""

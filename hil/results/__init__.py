@@ -1,0 +1,1 @@
+"""What an identification found, as frozen dataclasses, and their way to result.json and back."""

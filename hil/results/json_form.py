@@ -1,0 +1,105 @@
+"""Frozen dataclasses to JSON values and back, without loss. Standard library only, so that a model loads quickly.
+
+A field is a key of the same name, or of the name in its metadata under "key". A field that may be None, and is unless
+given, is left out of the JSON while it is None. Keys that no field has are ignored when read: a newer hil wrote them.
+JSON has no infinity and no NaN: they are written as null, which is read as NaN, or as infinity in a `Spread`.
+"""
+
+import math
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+_NULL_IS_INFINITE = "null is infinite"
+
+Spread = Annotated[float, _NULL_IS_INFINITE]
+"""A standard error or a variance; infinite where the recording shows nothing of the parameter."""
+
+T = TypeVar("T")
+
+
+class FormError(ValueError):
+    """A JSON value does not have the form of the dataclass. The message is to be read after "it": has no 'arm'."""
+
+
+def to_json(value: Any) -> Any:
+    """A dataclass as dictionaries, lists, numbers and text."""
+    if is_dataclass(value):
+        return {
+            _key(field): to_json(entry)
+            for field in fields(value)
+            if (entry := getattr(value, field.name)) is not None or field.default is not None
+        }
+    if isinstance(value, Mapping):
+        return {name: to_json(entry) for name, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_json(entry) for entry in value]
+    return value
+
+
+def from_json(kind: type[T], value: Any) -> T:
+    """A `kind` from what `to_json` gave; raises FormError."""
+    read: T = _read(kind, value, "")
+    return read
+
+
+def _read(kind: Any, value: Any, where: str) -> Any:
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return math.inf if value is None and _NULL_IS_INFINITE in arguments else _read(arguments[0], value, where)
+    if origin in (Union, types.UnionType):
+        (wanted,) = (each for each in arguments if each is not type(None))
+        return None if value is None else _read(wanted, value, where)
+    if is_dataclass(kind):
+        return _read_dataclass(kind, value, where)
+    if origin in (tuple, Sequence):
+        entries = _checked(value, list, where)
+        if len(arguments) > 1 and arguments[-1] is not ... and len(entries) != len(arguments):
+            raise FormError(f"has {len(entries)} entries in place of {len(arguments)} as {where!r}")
+        return tuple(_read(arguments[0], entry, f"{where}[{index}]") for index, entry in enumerate(entries))
+    if origin is not None and issubclass(origin, Mapping):
+        table = _checked(value, dict, where)
+        return {name: _read(arguments[1], entry, _below(where, name)) for name, entry in table.items()}
+    if kind is float:
+        return math.nan if value is None else float(_checked(value, (int, float), where))
+    return _checked(value, kind, where)
+
+
+def _read_dataclass(kind: Any, value: Any, where: str) -> Any:
+    table = _checked(value, dict, where)
+    hints = _hints(kind)
+    given = {}
+    for field in fields(kind):
+        key = _key(field)
+        if key in table:
+            given[field.name] = _read(hints[field.name], table[key], _below(where, key))
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise FormError(f"has no {_below(where, key)!r}")
+    return kind(**given)
+
+
+def _checked(value: Any, kind: Any, where: str) -> Any:
+    # To Python, True is an int.
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise FormError(f"has {_shown(value)} as {where!r}" if where else f"is {_shown(value)}")
+    return value
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _key(field: Field[Any]) -> str:
+    return str(field.metadata.get("key", field.name))
+
+
+def _below(where: str, key: str) -> str:
+    return f"{where}.{key}" if where else key

@@ -1,0 +1,144 @@
+"""The hand: it moves limp joints, holds them, and lets go when their torque comes on."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from hil.fakes.bus.clock import VirtualClock
+from hil.fakes.bus.hand import Move, parse_move
+from hil.fakes.description import FakeArm, make_bus
+from hil.fakes.plants.plant import PlantError
+from tests.fakes.conftest import Bench
+
+LINK = {"length": 0.15, "mass": 0.2, "centre": 0.08, "inertia": 5e-4}
+DRIVE = {"mass": 0.08, "rotor_inertia": 8e-8, "gear_ratio": 353.5, "torque_constant": 1.8, "coulomb": 0.05}
+SERVO = {"model": "XM430-W350", "zero_ticks": 2048}
+
+
+def described(drive: dict[str, Any], joints: int = 2, **more: Any) -> FakeArm:
+    start = [-math.pi / 2, 0.0][:joints]
+    return FakeArm.model_validate(
+        {
+            "servos": [{"id": number + 1, **SERVO} for number in range(joints)],
+            "arm": {"start": start, "links": [LINK] * joints, "drives": [drive] * joints},
+            **more,
+        }
+    )
+
+
+def on_bench(description: FakeArm) -> Bench:
+    bench = Bench.__new__(Bench)
+    bench.clock = VirtualClock()
+    bench.bus = make_bus(description, bench.clock)
+    return bench
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+@pytest.mark.parametrize(
+    "drive",
+    [
+        DRIVE,
+        DRIVE | {"presliding_stiffness": 100.0},
+        DRIVE | {"coulomb_width": 0.05, "viscous": 0.1},
+        DRIVE | {"backlash": 0.01, "gear_damping": 5.0},
+        DRIVE | {"rotor_inertia": 0.0},
+    ],
+    ids=["dry", "presliding", "smooth", "play", "no rotor"],
+)
+def test_a_limp_joint_is_moved_and_held(drive: dict[str, Any], joints: int) -> None:
+    bench = on_bench(described(drive, joints))
+    bench.bus.hand.move(*(Move(servo=number + 1, to=0.4 + number, duration=0.5) for number in range(joints)))
+    bench.wait(0.25)
+    assert all(servo.value("Torque Enable") == 0 for servo in bench.bus.servos.values())
+    halfway = bench.read(1, 132, 4, signed=True)
+    assert 1100 < halfway < 2200
+    assert bench.read(1, 128, 4, signed=True) > 10
+    bench.wait(3.0)
+    for number in range(joints):
+        wanted = 2048 + (0.4 + number) * 4096 / math.tau
+        assert bench.read(number + 1, 132, 4, signed=True) == pytest.approx(wanted, abs=12)
+        rocking = 30 if "backlash" in drive else 2  # a link rocks in the play of its gears
+        assert abs(bench.read(number + 1, 128, 4, signed=True)) <= rocking
+
+
+def test_a_move_can_end_at_ticks_and_be_released(make_bench: Callable[..., Any]) -> None:
+    bench = on_bench(described(DRIVE | {"coulomb": 0.0}, 1))
+    bench.bus.hand.move(Move(servo=1, ticks=2500, duration=0.3, hold=0.2))
+    bench.wait(0.45)
+    assert bench.read(1, 132, 4, signed=True) == pytest.approx(2500, abs=4)
+    bench.wait(0.4)
+    assert bench.read(1, 132, 4, signed=True) < 2300  # it falls
+    assert not bench.bus.hand.busy
+
+
+def test_ticks_are_those_of_present_position_whatever_shifts_it() -> None:
+    description = described(DRIVE, 1)
+    servo = description.servos[0].model_copy(
+        update={"registers": {"Homing Offset": 700, "Drive Mode": 1}, "direction": -1}
+    )
+    bench = on_bench(description.model_copy(update={"servos": (servo,)}))
+    bench.bus.hand.move(Move(servo=1, ticks=1500))
+    bench.wait(1.5)
+    assert bench.read(1, 132, 4, signed=True) == pytest.approx(1500, abs=4)
+
+
+def test_the_hand_lets_go_when_torque_comes_on() -> None:
+    bench = on_bench(described(DRIVE))
+    bench.bus.hand.move(Move(servo=1, to=0.0, duration=0.3), Move(servo=2, to=0.0, at=0.6))
+    bench.wait(0.5)
+    assert bench.bus.hand.holds == {0}
+    bench.exchange(b"")
+    assert bench.write(1, 64, 1) == 0
+    assert bench.write(2, 64, 1) == 0
+    bench.wait(1.0)
+    assert bench.bus.servos[1].torque_enabled
+    assert not bench.bus.hand.busy
+    assert bench.write(1, 116, 2300, 4) == 0
+    bench.wait(1.0)
+    assert bench.read(1, 132, 4, signed=True) > 2150  # free to follow its goal
+
+
+def test_release_forgets_what_was_to_come() -> None:
+    bench = on_bench(described(DRIVE))
+    bench.bus.hand.move(Move(servo=1, to=0.0, at=0.5), Move(servo=2, to=1.0, at=0.5))
+    bench.bus.hand.release(1)
+    bench.wait(2.0)
+    assert bench.read(1, 132, 4, signed=True) < 1500
+    assert bench.read(2, 132, 4, signed=True) == pytest.approx(2048 + 652, abs=12)
+    bench.bus.hand.release()
+    assert not bench.bus.hand.busy
+
+
+def test_moves_of_the_description_happen() -> None:
+    bench = on_bench(described(DRIVE, 1, moves=[{"servo": 1, "to": 0.0, "at": 1.0, "duration": 0.5}]))
+    before = bench.read(1, 132, 4, signed=True)
+    bench.wait(0.9)
+    assert bench.read(1, 132, 4, signed=True) == before
+    bench.wait(1.0)
+    assert bench.read(1, 132, 4, signed=True) == pytest.approx(2048, abs=4)
+
+
+def test_what_cannot_be_is_refused(bench: Bench) -> None:
+    with pytest.raises(PlantError, match=r"FreeInertia has no hold"):
+        bench.bus.hand.move(Move(servo=1, to=0.0))
+    with pytest.raises(ValueError, match="no servo has the ID 9"):
+        bench.bus.hand.move(Move(servo=9, to=0.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "move"),
+    [
+        ("2:to=0.5", Move(servo=2, to=0.5)),
+        ("1:ticks=3000,at=2,duration=0.5,hold=1", Move(servo=1, ticks=3000, at=2.0, duration=0.5, hold=1.0)),
+    ],
+)
+def test_moves_as_text(text: str, move: Move) -> None:
+    assert parse_move(text) == move
+
+
+@pytest.mark.parametrize("text", ["", "x:to=1", "1", "1:to=a", "1:to=1,ticks=2", "1:speed=1", "300:to=0", "1:to=inf"])
+def test_moves_that_cannot_be_read(text: str) -> None:
+    with pytest.raises(ValueError, match="move"):
+        parse_move(text)
