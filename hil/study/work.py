@@ -105,9 +105,9 @@ def _identified(arm: Path, folder: Path) -> Any:
     shutil.rmtree(folder / "run", ignore_errors=True)  # of a worker that died on it
     run = RunFolder.create(folder / "run", config)
     if config.experiment.pilot:
-        return identify_in_steps(config, run, arm, lambda _: None, lambda _: None)[1]
+        return identify_in_steps(config, run, arm, lambda _: None, lambda _: None)[1].to_json()
     run_experiment(config, run, arm, lambda _: None)
-    return estimate_run(run)
+    return estimate_run(run).to_json()
 
 
 def _dry_run(arm: Path) -> Any:
@@ -132,4 +132,4 @@ def _estimated(spec: Spec) -> Any:
         for path in source.iterdir():
             if path.is_file() and path.name not in ("result.json", "report.html", "period.npz"):
                 shutil.copy2(path, copy / path.name)
-        return {"recording": str(source), **estimate_run(RunFolder.open(copy))}
+        return {"recording": str(source), **estimate_run(RunFolder.open(copy)).to_json()}
