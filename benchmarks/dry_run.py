@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 
 from hil.config.schema import Config, parse_config
-from hil.dry_run.amplitude import Amplitude, largest_amplitude
+from hil.dry_run.amplitude import Amplitude, largest_amplitude, with_peaks
 from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.prediction import GUARDED, peaks_of
 from hil.dry_run.prior import quantities
-from hil.dry_run.waves import design_problem, plain_wave
+from hil.dry_run.waves import design_problem
 from hil.errors import NotSettled, SafetyStop
 from hil.experiment.run import run_experiment
 from hil.model_file import read_result
@@ -225,7 +225,12 @@ def design_study(seeds: int = 2) -> dict[str, Any]:
     known = base_parameters(config.fake.arm)
     extra = {f"{term}_{joint}": value for joint in (1, 2) for term, value in FRICTION.items()}
     problem = design_problem(config, Physics.of({**known, **extra, "lag": 1e-3}), tuple(known))
-    designs = [design_optimal(plain_wave(config, seed), problem, seed) for seed in range(1, seeds + 1)]
+    seeded = [config.experiment.model_copy(update={"seed": seed}) for seed in range(1, seeds + 1)]
+    plans = [with_peaks(config.model_copy(update={"experiment": each}), problem.limits.torque) for each in seeded]
+    designs = [
+        design_optimal(plan.segments[0].multisine, problem, experiment.seed)
+        for plan, experiment in zip(plans, seeded, strict=True)
+    ]
     return {"worst_std_ratio": max(design.worst / design.plain_worst for design in designs)}
 
 

@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -206,11 +206,11 @@ def study(seeds: list[int], jobs: int, keep: Path | None, tell: Any = None) -> l
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
         folder = keep or Path(temporary)
         outcomes = []
-        for outcome in pool.map(lambda seed: run(seed, folder / str(seed)), seeds):
-            outcomes.append(outcome)
+        for ended in as_completed([pool.submit(run, seed, folder / str(seed)) for seed in seeds]):
+            outcomes.append(ended.result())
             if tell:
-                tell(outcome)
-        return outcomes
+                tell(outcomes[-1])
+        return sorted(outcomes, key=lambda each: each.seed)
 
 
 def _seeds(text: str) -> list[int]:

@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 
 from hil.drivers.servo_model import Mode, ServoModel, servo_model
-from hil.fakes.plants.arm import Drive
 from hil.fakes.servo.registers import load_model
 from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers, arm_toml
 
@@ -70,6 +69,8 @@ def draw(seed: int) -> DrawnArm:
     richer = _richer(random)
     scale = random.uniform(0.88, 1.12, joints)
     drives = [_drive(random, model, factor, richer) for model, factor in zip(models, scale, strict=True)]
+    warming, encoder = _warming(random), _encoder(random)
+    drives = [drive | warming for drive in drives]
     zeros = random.uniform(1, 2, joints) * random.choice((-1, 1), joints) * DEGREE
     start = _start(random, rest, links, drives, weight)
     answers = tuple(
@@ -88,8 +89,9 @@ def draw(seed: int) -> DrawnArm:
     gravity = 0.0 if orientation == "flat" else round(weight, 3)
     text = arm_toml(ArmAnswers("fake://", 1_000_000, answers, gravity, head))
     name = f"{orientation} {joints}x{'+'.join(dict.fromkeys(model.name for model in models))}"
-    name += "".join(f" {term}" for term in richer)
-    fake = _fake(seed, models, links, drives, start, tilt, _imperfect(random))
+    imperfect = [*richer, *("warming",)[: bool(warming)], *dict.fromkeys(key.split("_")[0] for key in encoder)]
+    name += "".join(f" {term}" for term in imperfect)
+    fake = _fake(seed, models, links, drives, start, tilt, encoder)
     return DrawnArm(name, text + fake, float(1 / scale[0]), models[0].default_mode is Mode.CURRENT)
 
 
@@ -169,15 +171,26 @@ def _drive(random: np.random.Generator, model: ServoModel, factor: float, richer
     return drive
 
 
-def _imperfect(random: np.random.Generator) -> dict[str, Any]:
-    """Drift of friction and encoder errors, drawn always and used where the fake arm knows them."""
-    chosen = random.random(3) < 1 / 3
-    return {
-        "drift": random.uniform(0.05, 0.2) if chosen[0] else 0.0,
-        "noise": random.uniform(0.2, 0.6) if chosen[1] else 0.0,
-        "once": random.uniform(0, 4) if chosen[2] else 0.0,
-        "twice": random.uniform(0, 2) if chosen[2] else 0.0,
-    }
+def _warming(random: np.random.Generator) -> dict[str, float]:
+    """Friction of a third of the arms is higher while they are cold."""
+    cold, seconds = random.uniform(0.05, 0.2), random.uniform(30, 120)
+    if random.random() > 1 / 3:
+        return {}
+    return {"cold_coulomb": cold, "cold_viscous": cold, "warm_up_time": seconds}
+
+
+def _encoder(random: np.random.Generator) -> dict[str, float]:
+    """One servo's errors; a third of the arms have noise, a third are not linear."""
+    noisy, bent = random.random(2) < 1 / 3
+    encoder = {"noise_ticks": random.uniform(0.2, 0.6)} if noisy else {}
+    if bent:
+        encoder |= {
+            "once_ticks": random.uniform(0, 4),
+            "once_phase": random.uniform(0, 2 * math.pi),
+            "twice_ticks": random.uniform(0, 2),
+            "twice_phase": random.uniform(0, 2 * math.pi),
+        }
+    return encoder
 
 
 def _start(
@@ -205,20 +218,15 @@ def _fake(
     drives: list[dict[str, Any]],
     start: list[float],
     tilt: float,
-    imperfect: dict[str, Any],
+    encoder: dict[str, float],
 ) -> str:
-    drives = [drive | _known_to_drives(imperfect) for drive in drives]
     lines = ["", "[fake]", f"seed = {seed}", "adapter_latency_us = 60.0"]
     for i, model in enumerate(models, start=1):
         lines += ["", "[[fake.servos]]", f"id = {i}", f'model = "{model.name}"', "zero_ticks = 2048"]
+        if encoder:
+            lines.append(f"encoder = {{ {', '.join(f'{name} = {value!r}' for name, value in encoder.items())} }}")
     lines += ["", "[fake.arm]", f"tilt = {tilt}", f"start = {start}"]
     for table, parts in (("links", links), ("drives", drives)):
         for part in parts:
             lines += ["", f"[[fake.arm.{table}]]", *(f"{name} = {float(value)!r}" for name, value in part.items())]
     return "\n".join(lines) + "\n"
-
-
-def _known_to_drives(imperfect: dict[str, Any]) -> dict[str, float]:
-    """Those of the imperfections that the fake arm's drives have, under the names that it gives them."""
-    names = {"drift": "warm_up", "noise": "encoder_noise", "once": "encoder_once", "twice": "encoder_twice"}
-    return {name: imperfect[kind] for kind, name in names.items() if name in Drive.model_fields and imperfect[kind]}

@@ -1,21 +1,37 @@
 """The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
-from hil.drivers.control_table import load_control_table, model_names
+from hil.drivers.control_table import ControlTable, load_control_table, model_names
 from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongSetting
 from hil.drivers.exchange import Exchange
+from hil.drivers.hold import let_sink, refuse_held
 from hil.drivers.joint import Joint
 from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
 from hil.drivers.port import Port, open_port
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
-from hil.drivers.state import NAN, Converter, State, spans
+from hil.drivers.settings import arms_itself
+from hil.drivers.shield import signals_held_back
+from hil.drivers.state import NAN, Converter, State, spans, status_span
+from hil.drivers.sync_read import Span
+
+TIME_BASED_PROFILE = 0x04
+"""Bit of Drive Mode that changes profiles only, which current and PWM mode do not have."""
 
 _PROBES = 3
 """How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
+
+STATUS_S = 0.035
+"""From one status of the servos to the next [s]."""
+
+_SHARE, _MOST_SHARE = 0.6, 0.9
+"""Of a cycle that a status may take on the wire; adapter and computer need the rest."""
+
+_INTERRUPTS_BORNE = 5
+"""How often confirming that a servo is off is begun again after an interrupt."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +41,8 @@ class BusConfig:
     url: device or pyserial URL. one_write: Sync Write and group read leave in one write; False where `hil check` finds
     that an arm needs two. fast_sync_read: use it where every servo's firmware has it. slow_every: cycles from one
     reading of tick or voltage and temperature to the next. watchdog_required: refuse firmware without Bus Watchdog.
+    take_over: let an arm that somebody holds sink slowly, then cut its torque; else it is refused.
+    interval: s from one exchange to the next, 0 where there is no fixed rate; servos then tell no status.
     """
 
     url: str
@@ -34,6 +52,8 @@ class BusConfig:
     fast_sync_read: bool = True
     slow_every: int = 100
     watchdog_required: bool = True
+    take_over: bool = False
+    interval: float = 0.0
 
     def __post_init__(self) -> None:
         modes = {joint.mode for joint in self.joints}
@@ -42,6 +62,10 @@ class BusConfig:
                 "One Sync Write drives all joints, so all must be in current mode or all in PWM mode: "
                 + ", ".join(f"{joint} is in {joint.mode.name} mode" for joint in self.joints)
             )
+
+    def is_same_arm(self, other: "BusConfig") -> bool:
+        """Whether both are the same servos on the same port."""
+        return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
 
 
 @dataclass(frozen=True)
@@ -93,13 +117,14 @@ class ServoBus:
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check who answers, bring every servo into its mode with torque off.
+        """Open the port, check who answers and that nobody holds the arm, bring every servo into its mode.
 
-        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting; the port is closed then.
+        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting, TorqueHeld; the port is closed then.
         """
         bus = cls.connect(config)
         try:
             bus.check_identity()
+            bus.release_held()
             bus.prepare()
         except BaseException:
             bus.close()
@@ -152,6 +177,17 @@ class ServoBus:
             )
         self._without_watchdog.add(joint)
 
+    def release_held(self, ours: Collection[Joint] = ()) -> None:
+        """See to it that no servo has torque before anything is written: raises TorqueHeld, or with
+        `BusConfig.take_over` lets the arm sink. ours: joints that a program of this user left behind, cut at once.
+        """
+        for joint in ours:
+            if self._servos[joint].read("Torque Enable"):
+                self._servos[joint].write("Torque Enable", 0)
+        if self.config.take_over:
+            let_sink(self._servos, self.port.clock)
+        refuse_held(self._servos)
+
     def prepare(self) -> None:
         """Bring every servo into its mode with torque off, and prepare the exchange.
 
@@ -176,21 +212,45 @@ class ServoBus:
         """Whether every servo's firmware has Fast Sync Read."""
         return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
 
-    def make_exchange(self, *, fast: bool, one_write: bool, slow_every: int | None = None) -> Exchange:
-        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first."""
+    def make_exchange(
+        self, *, fast: bool, one_write: bool, slow_every: int | None = None, status: bool = True
+    ) -> Exchange:
+        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first.
+
+        status: whether the servos tell their status now and then, where there is time for it.
+        """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
         mode = self.joints[0].mode
+        return_delay = max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos)
+        span, status_every = self._status_turns(tables, return_delay) if status else (None, 0)
         return Exchange(
             self.port,
             [servo.id for servo in servos],
             tables[0]["Goal Current" if mode is Mode.CURRENT else "Goal PWM"],
             spans(mode, tables),
-            max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos),
+            return_delay,
             fast=fast,
             one_write=one_write,
             slow_every=slow_every or self.config.slow_every,
+            status=span,
+            status_every=status_every,
+            interval=self.config.interval,
         )
+
+    def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Span | None, int]:
+        """What the servos tell of themselves and the cycles from one time to the next; None where there is no time."""
+        interval, mode, count = self.config.interval, self.joints[0].mode, len(self.joints)
+        if not interval:
+            return None, 0
+        # Without a sensor in the motor lost torque shows in Torque Enable first, so that is worth a late sample.
+        share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
+        for whole in (True, False):
+            span = status_span(mode, tables, whole=whole)
+            taken = self.port.wire_time(28 + 4 * count + count * (11 + span.size))  # goals, request, replies
+            if taken + return_delay * count < share * interval:
+                return span, max(1, round(STATUS_S / interval))
+        return None, 0
 
     @property
     def prepared(self) -> Exchange:
@@ -237,7 +297,13 @@ class ServoBus:
             self._torque_on(watchdog)
             yield
         finally:
-            report = self.torque_off()
+            # Nothing stands between `finally` and `try`: an interrupt that comes before the shield is up is met here.
+            try:
+                report = self.torque_off()
+            except BaseException:
+                if self.torque_off_report is None:
+                    self.torque_off()
+                raise
             if report.unconfirmed:
                 raise TorqueNotOff(str(report))
 
@@ -262,38 +328,64 @@ class ServoBus:
                 raise
 
     def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back. Tries all of them whatever fails; never raises.
+        """Cut torque on every servo and read it back. Tries all of them whatever fails.
 
         After each servo that cannot be confirmed all are told again: it may hear though it cannot answer, and while it
-        was asked the others' watchdogs heard packets and waited.
+        was asked the others' watchdogs heard packets and waited. Signals are held back until it is done; an interrupt
+        that comes all the same is raised when all servos were tried and `torque_off_report` is there.
         """
-        self._broadcast_torque_off()
-        confirmed, unconfirmed = [], []
-        for joint, servo in self._servos.items():
+        interrupts: list[BaseException] = []
+        with signals_held_back():
             try:
-                servo.write("Torque Enable", 0)
-            except Exception as error:  # whatever one servo does, the next must be tried
-                unconfirmed.append((joint, str(error) or type(error).__name__))
-                self._broadcast_torque_off()
-            else:
-                confirmed.append(joint)
-        for joint in confirmed:
-            if joint not in self._without_watchdog:
-                with suppress(DriverError):
-                    self._servos[joint].write("Bus Watchdog", 0)
-        self.torque_off_report = TorqueOff(tuple(confirmed), tuple(unconfirmed), frozenset(self._without_watchdog))
+                self._torque_off_at_once()
+            except BaseException as interrupt:  # the servos must be tried one by one whatever happens
+                interrupts.append(interrupt)
+            confirmed, unconfirmed = self._confirm_torque_off(interrupts)
+            self.torque_off_report = TorqueOff(confirmed, unconfirmed, frozenset(self._without_watchdog))
+        if interrupts:
+            raise interrupts[0]
         return self.torque_off_report
 
-    def _broadcast_torque_off(self) -> None:
-        """To all servos at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s where one is silent.
+    def _confirm_torque_off(
+        self, interrupts: list[BaseException]
+    ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
+        confirmed, unconfirmed = [], []
+        for joint, servo in self._servos.items():
+            why = _write_surely(servo, "Torque Enable", 0, interrupts)
+            if why is None:
+                confirmed.append(joint)
+            else:
+                unconfirmed.append((joint, why))
+                self._torque_off_at_once()
+        for joint in confirmed:
+            if joint not in self._without_watchdog:
+                _write_surely(self._servos[joint], "Bus Watchdog", 0, interrupts)
+        return tuple(confirmed), tuple(unconfirmed)
 
-        Twice, since a packet may be lost.
+    def _torque_off_at_once(self) -> None:
+        """To all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s where one is
+        silent. A Sync Write, since what else is on the bus may be held by somebody. Twice, since a packet may be lost.
         """
         entry = self._servos[self.joints[0]].table["Torque Enable"]
-        body = entry.address.to_bytes(2, "little") + b"\x00"
+        body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
+        body += b"".join(bytes((joint.id, 0)) for joint in self.joints)
         # Where this fails, the confirmed writes will say so.
         with suppress(DriverError):
-            self.port.write(2 * encode(BROADCAST_ID, Instruction.WRITE, body))
+            self.port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
+
+
+def _write_surely(servo: Servo, register: str, value: int, interrupts: list[BaseException]) -> str | None:
+    """Write a register and read it back, again after an interrupt, which is kept; why it failed, or None."""
+    for _ in range(_INTERRUPTS_BORNE):
+        try:
+            servo.write(register, value)
+        except Exception as error:  # whatever one servo does, the next must be tried
+            return str(error) or type(error).__name__
+        except BaseException as interrupt:
+            interrupts.append(interrupt)
+        else:
+            return None
+    return "It was interrupted again and again."
 
 
 def _prepare_servo(joint: Joint, servo: Servo) -> None:
@@ -302,13 +394,23 @@ def _prepare_servo(joint: Joint, servo: Servo) -> None:
     if fault != HardwareError(0):
         raise ServoFault(_fault_text(joint, describe_error(fault)))
     drive_mode = servo.read("Drive Mode")
-    if drive_mode:
+    if drive_mode & ~TIME_BASED_PROFILE:
         raise WrongSetting(
             f"{joint.title}: Drive Mode is {drive_mode}, 0 is needed (no reverse, no torque on by goal). "
             "Set it to 0 with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
         )
+    if arms_itself(servo):
+        raise WrongSetting(
+            f"{joint.title}: Startup Configuration turns its torque on by itself whenever it is switched on or "
+            "reboots. Set that register to 0 with DYNAMIXEL Wizard 2.0."
+        )
     if servo.read("Operating Mode") != joint.mode:
         servo.write("Operating Mode", joint.mode)
+    if servo.read("Bus Watchdog"):
+        servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    # Goal PWM limits the output in current mode too; what another program left there may be nothing.
+    if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
+        servo.write("Goal PWM", servo.read("PWM Limit"))
 
 
 def _fault_text(joint: Joint, cause: str) -> str:

@@ -11,6 +11,7 @@ DriverError
 ├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
 ├── WrongModel          another model, or one whose firmware is too old, answers at this ID
 ├── WrongSetting        a register holds a value with which no experiment may start
+│   └── TorqueHeld      torque is on already: somebody holds or drives the arm
 └── TorqueNotOff        a servo could not be confirmed to be without torque
 """
 
@@ -62,6 +63,10 @@ class WrongModel(DriverError):
 
 class WrongSetting(DriverError):
     """A register forbids the experiment. Example: Drive Mode with Torque On by Goal Update."""
+
+
+class TorqueHeld(WrongSetting):
+    """A servo has torque on before anybody asked for it. Example: another program holds the arm up."""
 
 
 class TorqueNotOff(DriverError):

@@ -4,7 +4,8 @@ A Sync Write has no reply, so the group read that follows it leaves in the same 
 instead of two. All packets are prepared once; a cycle packs the goals and one CRC.
 
 Which registers come back may change from cycle to cycle: `spans[0]` mostly, and every `slow_every`-th time one of the
-others, in turn. All spans should hold what the control needs; the slow ones hold more.
+others, in turn. All spans should hold what the control needs; the slow ones hold more. Every `status_every`-th time
+it is `status`, with the registers that say whether the servos are still driven.
 """
 
 import struct
@@ -21,6 +22,14 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 HOST_S = 0.75e-3
 """Allowed for the computer itself, USB frames included, on top of what wire, servos and adapter take."""
 
+PATIENCE_SHARE = 0.5
+"""Of the time between two cycles: how long an answer is waited for, where that is more than it should take."""
+
+MOST_PATIENCE_S = 0.02
+"""However slow the cycle: a servo that says nothing must not keep the others waiting."""
+
+_NEVER = 1 << 62
+
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
 
@@ -28,6 +37,7 @@ _pack_crc = struct.Struct("<H").pack
 class Reply(NamedTuple):
     """One exchange: times on the port's clock [s], which of the spans was read, and one answer per servo.
 
+    span: index into the exchange's spans; len(spans) is the status.
     See hil.drivers.sync_read for what an answer is; None where none came.
     """
 
@@ -41,7 +51,9 @@ class Exchange:
     """Sync Write of a two-byte goal register and a group read of the servos' state, for a fixed list of servos.
 
     return_delay: the longest Return Delay Time of the servos [s]. fast: read with Fast Sync Read. one_write: both
-    packets leave in one write; else in two. slow_every: cycles from one slow span to the next.
+    packets leave in one write; else in two. slow_every: cycles from one slow span to the next. status: span in which
+    the servos tell their status, every `status_every` cycles; None for never. interval: s from one cycle to the next,
+    where known; a slow cycle can wait longer for an answer than a fast one.
     """
 
     def __init__(
@@ -55,6 +67,9 @@ class Exchange:
         fast: bool = False,
         one_write: bool = True,
         slow_every: int = 100,
+        status: Span | None = None,
+        status_every: int = 20,
+        interval: float = 0.0,
     ) -> None:
         if goal.size != 2:
             raise ValueError(f"{goal.name} has {goal.size} bytes; a goal of 2 bytes is needed.")
@@ -68,8 +83,13 @@ class Exchange:
         self._fields: list[bytes | int] = [_front(goal, len(self.ids))]
         for servo_id in self.ids:
             self._fields += [servo_id, 0]
-        self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in spans]
-        self._timeouts = [self._timeout(read, return_delay) for read in self._reads]
+        every = [*spans] if status is None else [*spans, status]
+        self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
+        self._slow_spans = len(spans) - 1
+        least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
+        self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
+        self._status_every = _NEVER if status is None else status_every
+        self._until_status = self._status_every
         self._slow_every = slow_every
         self._until_slow = slow_every
         self._slow = 0
@@ -95,7 +115,9 @@ class Exchange:
         """
         port = self._port
         self._until_slow -= 1
-        span = 0 if self._until_slow > 0 and not self._late_possible else self._other_span()
+        self._until_status -= 1
+        usual = self._until_slow > 0 and self._until_status > 0 and not self._late_possible
+        span = 0 if usual else self._other_span()
         read = self._reads[span]
         fields = self._fields
         fields[2::2] = goal_ticks
@@ -119,21 +141,24 @@ class Exchange:
         return Reply(before, self._now(), span, servos)
 
     def _other_span(self) -> int:
-        """The span to read where it is not simply the first: after a loss, or in a slow turn."""
-        if not self._late_possible:
+        """The span to read where it is not simply the first: after a loss, in a slow turn, or to learn a status."""
+        if self._late_possible:
+            self._late_possible = False
+            self._port.discard_input()
+            # An answer that comes later still must not be taken for the answer to this request. Nothing in a packet
+            # says which request it answers, but its length does when the spans differ.
+            return self._next_slow() if self._lost == 0 else 0
+        if self._until_slow <= 0:
             self._until_slow = self._slow_every
+            # A status that is due too waits for the next cycle: both at once would be the longest of all.
             return self._next_slow()
-        self._late_possible = False
-        self._port.discard_input()
-        # An answer that comes later still must not be taken for the answer to this request. Nothing in a packet
-        # says which request it answers, but its length does when the spans differ.
-        return self._next_slow() if self._lost == 0 else 0
+        self._until_status = self._status_every
+        return 1 + self._slow_spans
 
     def _next_slow(self) -> int:
-        slow = len(self._reads) - 1
-        if not slow:
+        if not self._slow_spans:
             return 0
-        self._slow = self._slow % slow + 1
+        self._slow = self._slow % self._slow_spans + 1
         return self._slow
 
     def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:

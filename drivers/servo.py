@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
-from hil.drivers.control_table import ControlTable
+from hil.drivers.control_table import ControlTable, Register
 from hil.drivers.errors import NoReply, ServoRefused, WrongReply
 from hil.drivers.packet import ALERT, HardwareError, StatusError
 from hil.drivers.port import Port
@@ -44,13 +44,16 @@ class Servo:
 
     def read(self, register: str) -> int:
         """The value of a register, in ticks; raises NoReply, WrongReply, ServoRefused, PortLost."""
-        entry = self.table[register]
+        return self.read_entry(self.table[register])
+
+    def read_entry(self, entry: Register) -> int:
+        """`read` for a register that the model's table leaves out."""
 
         def ask() -> tuple[list[int], int, int]:
             data, result, error = self._sdk.readTxRx(self._sdk_port, self.id, entry.address, entry.size)
             return data, result, error
 
-        return entry.decode(bytes(self._try(f"reading {register}", ask)))
+        return entry.decode(bytes(self._try(f"reading {entry.name}", ask)))
 
     def write(self, register: str, value: int) -> None:
         """Write a register and read it back; raises as `read`, and ServoRefused when it reads back otherwise."""

@@ -23,12 +23,28 @@ class Slow(NamedTuple):
     temperature: tuple[float, ...]
 
 
+class Status(NamedTuple):
+    """What a servo tells of itself a few times in 0.1 s, beside its state.
+
+    watchdog: Bus Watchdog [20 ms], 255 when it acted. goal: the register of the goal [A, or V under PWM]. tick: the
+    servo's own clock [s], which wraps at 32.768 s. torque: Torque Enable; hardware_error: Hardware Error Status; both
+    None where the cycle has no time for them.
+    """
+
+    watchdog: int
+    goal: float
+    tick: float
+    torque: bool | None = None
+    hardware_error: int | None = None
+
+
 class State(NamedTuple):
     """One sample of the arm; NaN where a servo did not answer.
 
     time_before_write, time_after_read: s on the port's clock. goal_current: what was sent, a whole number of ticks,
     and current: what the servo measured [A] (under PWM both are voltages [V], sent and applied); velocity [rad/s];
-    position [rad]; error: the ERR bytes, 0 where missing; missing: no values from this servo; slow: in turn, else None.
+    position [rad]; error: the ERR bytes, 0 where missing; missing: no values from this servo; slow, status: in
+    turn, else None.
     """
 
     time_before_write: float
@@ -40,6 +56,7 @@ class State(NamedTuple):
     error: tuple[int, ...]
     missing: tuple[bool, ...]
     slow: Slow | None = None
+    status: tuple[Status | None, ...] | None = None
 
 
 _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
@@ -53,6 +70,25 @@ def spans(mode: Mode, tables: Sequence[ControlTable]) -> tuple[Span, Span, Span]
         Span.of(tables, ("Realtime Tick", *always)),
         Span.of(tables, (*always, "Present Input Voltage", "Present Temperature")),
     )
+
+
+SLOW_SPANS = 2
+"""How many of `spans` are read now and then."""
+
+_WHOLE_STATUS = 9
+"""Values of an answer with a whole status: ERR, five registers and the state."""
+
+_DRIVEN = ("Torque Enable", "Hardware Error Status")
+
+
+def status_span(mode: Mode, tables: Sequence[ControlTable], *, whole: bool) -> Span:
+    """What says whether a servo is still driven and watched, and its state.
+
+    whole: from Torque Enable on; else without what stands in front of Bus Watchdog, which takes half of the bytes.
+    """
+    goal = "Goal Current" if mode is Mode.CURRENT else "Goal PWM"
+    more = ("Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position")
+    return Span.of(tables, (*_DRIVEN, *more) if whole else more)
 
 
 class Converter:
@@ -75,8 +111,8 @@ class Converter:
 
     def state(self, ticks: Sequence[int], reply: Reply) -> State:
         sent = tuple([unit * tick for unit, tick in zip(self._drive_units, ticks, strict=True)])
-        # The tick stands in front of the three that are always read, voltage and temperature behind them.
-        at = 2 if reply.span == 1 else 1
+        # What is read beside the three that are always read stands in front of them, voltage and heat behind them.
+        at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
         drive, velocity, position, error, missing = [], [], [], [], []
         for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True):
             if answer is None or len(answer) == 1:
@@ -100,8 +136,24 @@ class Converter:
             tuple(position),
             tuple(error),
             tuple(missing),
-            _slow(reply) if reply.span else None,
+            _slow(reply) if 0 < reply.span <= SLOW_SPANS else None,
+            self._status(reply.servos) if reply.span > SLOW_SPANS else None,
         )
+
+    def _status(self, answers: Sequence[Answer]) -> tuple[Status | None, ...]:
+        told: list[Status | None] = []
+        for answer, unit in zip(answers, self._drive_units, strict=True):
+            if answer is None or len(answer) == 1:
+                told.append(None)
+                continue
+            watchdog, goal, tick = answer[-6:-3]
+            driven = (bool(answer[1]), answer[2]) if len(answer) == _WHOLE_STATUS else (None, None)
+            told.append(Status(watchdog, goal * unit, tick * 1e-3, *driven))
+        return tuple(told)
+
+    @staticmethod
+    def _answer_length(reply: Reply) -> int:
+        return max((len(answer) for answer in reply.servos if answer is not None), default=1)
 
     def _wrong(self, goals: Sequence[float]) -> ValueError:
         if len(goals) != len(self._joints):

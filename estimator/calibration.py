@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ModelError
 from hil.estimator.fit.levenberg_marquardt import Quadratic, minimise
@@ -81,6 +82,7 @@ class Calibration:
     """Weighted sum of squares per sample: 1 is noise alone."""
 
 
+@one_blas_thread
 def calibrate(
     without: SettledPeriod,
     with_mass: SettledPeriod,

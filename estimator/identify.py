@@ -6,15 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError, PeriodicityError, ShapeError
 from hil.estimator.fit.stage1 import fit_lines
-from hil.estimator.fit.stage2 import fit_runs
+from hil.estimator.fit.stage2 import Near, fit_runs
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.options import LikelihoodOptions, SettlingOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
+from hil.estimator.simulation.encoder import measured
 
 LIKELIHOOD = LikelihoodOptions()
 SETTLING = SettlingOptions()
@@ -75,12 +77,14 @@ class Estimate:
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
+@one_blas_thread
 def identify(
     periods: SettledPeriod | Sequence[SettledPeriod],
     model: Model,
     *,
     coarse: bool = False,
     starts: Sequence[Mapping[str, float]] = (),
+    near: Near | None = None,
     options: LikelihoodOptions = LIKELIHOOD,
 ) -> Estimate:
     """Estimate the parameters of `model`: regression on Fourier lines, then maximum likelihood.
@@ -93,6 +97,7 @@ def identify(
         coarse: for trying models: one that leaves much more than the noise is not fitted to its last digits.
         starts: parameters by name [SI], of another experiment or of arms like this one; further initial guesses,
             nothing more.
+        near: where a minimum is known to be close: the only initial guess, for a fraction of the time.
         options: tolerances and limits of the likelihood.
 
     Returns:
@@ -109,7 +114,7 @@ def identify(
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(*used)
-    fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, options=options)
+    fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, near=near, options=options)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
         model,
@@ -166,7 +171,7 @@ def predict(
         position, end = simulate(physics, state, motor, step)
         change = float(np.abs(end - state).max())
         if change < (settling.atol if period < settling.max_periods - 1 else settling.acceptable):
-            return position
+            return measured(physics, position)
         state = end
     raise PeriodicityError(
         f"after {settling.max_periods} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "

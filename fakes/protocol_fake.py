@@ -1,7 +1,8 @@
-"""The pyserial URL `fake://PATH/TO/ARM.toml`: a serial port with a fake arm behind it, in virtual or real time.
+"""The pyserial URL `fake://ARM`: a serial port with a fake arm behind it, in virtual or real time.
 
 After `fakes.register()`, `serial.serial_for_url("fake://configs/fake_two_link.toml")` opens the arm of that file's
-[fake] table; a path without a leading slash is relative to the working directory. `open_fake` does the same from Python
+[fake] table; a path without a leading slash is relative to the working directory, and a bare name that is no file is an
+arm that comes with hil (`fake://koch`; `hil.fakes.names`). `open_fake` does the same from Python
 without a file. pyserial finds this module by its name.
 
 Everything happens on `port.clock`: a program that waits must wait on that clock (or in `read`), because wall-clock time

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.description import FakeArm, make_bus
+from hil.fakes.remote_hand import HandSocket
 
 OVERRUN_S = 1e-3
 """A reply handed over later than this after it was due counts as a real-time overrun [s]."""
@@ -60,7 +61,8 @@ class PtyServer:
     """Serves one fake arm on a pseudo terminal. `serve` runs until `stop` is called, from any thread or a signal.
 
     link: a symbolic link to be made to the terminal; LinkError when there is something already.
-    `bus` may be looked at from another thread while `lock` is held.
+    `bus` may be looked at, and its hand told to move, from another thread while `lock` is held; from another process
+    `hil hand` moves it.
     """
 
     def __init__(self, description: FakeArm, link: Path | None = None) -> None:
@@ -69,6 +71,7 @@ class PtyServer:
         self.path = ""
         self._link = link
         self._master = self._slave = -1
+        self._hand: HandSocket | None = None
         self._wake_read, self._wake_write = os.pipe()
         self._stopped = False
         self._overruns = 0
@@ -104,9 +107,15 @@ class PtyServer:
         while not self._stopped:
             due = self.bus.next_reply_by
             wait = min(due - now(), LONGEST_SLEEP_S)
-            readable = [self._wake_read] if self._master < 0 else [self._master, self._wake_read]
+            readable: list[int | HandSocket] = [self._wake_read]
+            if self._master >= 0:
+                readable.append(self._master)
+            if self._hand is not None:
+                readable.append(self._hand)
             ready, _, _ = select.select(readable, [], [], max(0.0, wait))
             with self.lock:
+                if self._hand is not None and self._hand in ready:
+                    self._hand.answer(self.bus)
                 if self._master in ready:
                     self._take()
                 if now() >= due:
@@ -159,6 +168,7 @@ class PtyServer:
         tty.setraw(self._slave)  # held open, so that the terminal outlives every host that closes it
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
+        self._hand = HandSocket(self.path)
         if self._link is not None:
             self._link.unlink(missing_ok=True)
             try:
@@ -172,6 +182,9 @@ class PtyServer:
             if descriptor >= 0:
                 os.close(descriptor)
         self._master = self._slave = -1
+        if self._hand is not None:
+            self._hand.close()
+            self._hand = None
         if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self.path:
             self._link.unlink()
 

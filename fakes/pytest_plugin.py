@@ -11,8 +11,10 @@
         with arm.lock:
             assert arm.bus.servos[1].hardware_error == 0
 
-Both take the path of a TOML file with a [fake] table, a `hil.fakes.description.FakeArm`, or nothing, and `seed` and
-`faults` to change of it.
+Both take the path of a TOML file with a [fake] table, the name of a ready arm ("koch", "viperx_300",
+"open_manipulator_x"), a `hil.fakes.description.FakeArm`, or nothing, and `seed` and `faults` to change of it.
+
+pytest loads this module in every session of an environment with hil, so it imports nothing that pytest has not.
 """
 
 from collections.abc import Callable, Iterator, Sequence

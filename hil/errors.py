@@ -11,6 +11,7 @@ HilError                    exit code
     ├── SafetyStop          1   the guard saw a limit passed and stopped the arm
     ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
     ├── NotSettled          1   the motion never became periodic
+    ├── DidNotMove          1   friction or something harder holds a joint
     ├── NoSafeTorque        1   a dry run found none that keeps the arm within its limits
     └── RecordingCutShort   1   the recording holds no settled period
 
@@ -33,6 +34,13 @@ class Cause(Enum):
     LATE = "missed deadlines"
     JUMP = "encoder jump"
     NOT_FOLLOWING = "current does not follow"
+    TORQUE_OFF = "torque lost"
+    WATCHDOG = "servo's watchdog"
+    GOALS_LOST = "goals not taken"
+    STALE = "old replies"
+    FROZEN = "position and velocity disagree"
+    UNEXPECTED = "motion unlike the model"
+    UNLIKE_BEFORE = "motion unlike the period before"
     WRONG_SIGN = "wrong sign of response"
     EARLY_MOTION = "motion before the start"
     TEMPERATURE = "temperature"
@@ -112,6 +120,10 @@ class NoSafeTorque(ExperimentError):
 
 class NotSettled(ExperimentError):
     """Successive periods never became alike. Example: a joint that slips, or a cable that drags."""
+
+
+class DidNotMove(ExperimentError):
+    """A joint stood still for a whole period. Example: torque below what friction holds; a jammed gear."""
 
 
 class RecordingCutShort(ExperimentError):

@@ -149,5 +149,3 @@ def forged(answers: dict[int, tuple[int, bytes]], request: Request) -> bytes:
         whole += bytes((error, servo_id)) + block
         whole += crc(whole).to_bytes(2, "little")
     return whole
-
-

@@ -1,4 +1,4 @@
-"""Which faults befall a run: drawn at random in kind, time, length, strength and combination, and the words for them."""
+"""Which faults befall a run, drawn at random in kind, time, length, strength and combination; the words for them."""
 
 import math
 from collections.abc import Sequence
@@ -19,8 +19,9 @@ HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
 
 WORDS = {
-    SILENCE: r"no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response|repl(y|ies).{0,30}(missing|lost)",
-    GARBLED: r"damaged|corrupt|\bCRC|not an answer|not one to the question|garbled|broken packet|unreadable repl|incorrect|echo",
+    SILENCE: r"no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response"
+    r"|repl(y|ies).{0,30}(missing|lost)",
+    GARBLED: r"damaged|corrupt|\bCRC|not an answer|not one to the question|garbled|broken packet|incorrect|echo",
     LATE: r"\blate\b|\blater\b|deadlines?\b|latency|too slow",
     CABLE: r"[Pp]ort .{0,80}(failed|closed|lost)|unplugged|cable (is|was)|Is the cable|adapter",
     TORQUE: r"torque (is|was|seems|has been) (off|lost|cut|switched off|gone)|lost (its )?torque|carries|not follow"
@@ -30,7 +31,8 @@ WORDS = {
     OVERLOAD: r"overload",
     VOLTAGE: r"voltage|\d V\b",
     STUCK: r"stuck|\bheld\b|jammed|not move|stands? still|blocked|not moving|something holds",
-    ENCODER: r"encoder|magnet|seems to have moved|implausible|frozen|velocity and position|position.{0,40}(disagree|contradict)",
+    ENCODER: r"encoder|magnet|seems to have moved|implausible|frozen|velocity and position"
+    r"|position.{0,40}(disagree|contradict)",
     LIMIT: r"(position|velocity)[ _]limit",
     SIGN: r"sign of|against its command|wrong way|turned? round",
     PROGRAM: r"deadlines?\b|the computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
@@ -87,9 +89,15 @@ CAUSES: dict[str, frozenset[str]] = {
 }
 """What each fault may rightly be called. Held fast and a dead encoder cannot be told apart from the host's side."""
 
-UNHEARD = frozenset(
-    {Kind.DEAF, Kind.STALL, Kind.KILLED, FaultKind.CABLE_PULLED, FaultKind.SILENT_SERVO, FaultKind.CORRUPTED_INSTRUCTION}
-) | {FaultKind.LOST_INSTRUCTION, FaultKind.REBOOT}
+_INSTRUCTIONS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
+UNHEARD = _INSTRUCTIONS | {
+    Kind.DEAF,
+    Kind.STALL,
+    Kind.KILLED,
+    FaultKind.CABLE_PULLED,
+    FaultKind.SILENT_SERVO,
+    FaultKind.REBOOT,
+}
 """Where the program cannot reach a servo, the watchdog's time counts."""
 
 SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SPLIT, FaultKind.LATE_REPLY})
@@ -100,7 +108,7 @@ _LAST = frozenset({Kind.KILLED})
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is done to one run: attacks of the man in the middle, faults of the fake bus [their times from its start]."""
+    """What is done to one run: attacks of the man in the middle, faults of the fake bus, timed from its start."""
 
     attacks: tuple[Attack, ...]
     faults: tuple[Fault, ...]
@@ -136,10 +144,9 @@ def draw(seed: object, until: float, ids: Sequence[int]) -> Drawn:
         close = first + random.uniform(0.0, TOGETHER_S)
         times.append(close if random.random() < 0.5 else random.uniform(0.0, until))
     attacks, faults = [], []
-    for at in times:
+    for begun in times:
         kind = random.choice([*Kind, *FaultKind])
-        if kind in _LAST and len(times) > 1:
-            at = max(times)
+        at = max(times) if kind in _LAST else begun
         if isinstance(kind, Kind):
             attacks.append(_attack(kind, at, ids, random))
         else:

@@ -36,6 +36,16 @@ def period_difference(position: Array) -> Settling:
     return Settling(difference, relative)
 
 
+def settling_difference(former: Array, latest: Array) -> float:
+    """How far a period, (joints, samples) [rad], is from the one before: RMS over the motion's RMS, the worst joint.
+
+    Only the later halves are compared. Where they agree the former period ended settled, so all of the latest one is,
+    even though the former began with the transient of the ramp: a whole period of arm time is saved.
+    """
+    half = former.shape[1] // 2
+    return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
+
+
 def _rms(values: Array) -> Array:
     """Over the last axis, NaN left out; infinite where nothing is left."""
     seen = np.isfinite(values)

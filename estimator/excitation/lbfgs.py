@@ -1,7 +1,8 @@
 """Smooth minimisation by limited-memory BFGS (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 7.5).
 
-Small and written out for one reason: a library's own calls a BLAS that spreads over threads, which on a busy
-machine made a third of a second eight.
+Written out for one reason: a seed must give the same wave everywhere. A library's own takes its products from a BLAS
+that adds them up in another order on another processor, and after a few hundred evaluations the torque differs by up
+to 4e-4 of its peak (docs/dependencies.md).
 """
 
 from collections import deque

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.models.parameters import ABSENT, CONSTANTS, Physics
 from hil.estimator.models.terms import extra_names
@@ -170,6 +171,7 @@ class Problem:
         return [*present, "lag"]
 
 
+@one_blas_thread
 def design_optimal(plain: Multisine, problem: Problem, seed: int) -> Design:
     """Improve `plain`, whose lines and period are kept, by the standard errors that `problem` names.
 

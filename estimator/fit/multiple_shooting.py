@@ -18,11 +18,12 @@ from functools import partial
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.recording import Recording
 from hil.estimator.data.segments import Grid, RecordingSegment, cut, grid_torque, grid_torque_slopes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import by_parameters
-from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
 from hil.estimator.fit.segmented_least_squares import Segmented, minimise_segmented
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
@@ -103,7 +104,7 @@ class Shooting:
 
     def coordinates(self, inertia: float) -> Coordinates:
         """The parameters' coordinates; `inertia` [kg m^2] of the arm as a scale."""
-        scales = scales_of(self._model.names, *self._scales, inertia)
+        scales = scales_of(self._model.names, Sizes(*self._scales, inertia))
         return Coordinates(self._model.names, scales, self._options.coordinates)
 
     def position(self, segment: RecordingSegment, physics: Physics, state: Array) -> Array:
@@ -205,6 +206,7 @@ class Shooting:
         return torque[:, part], slopes[:, :, part]
 
 
+@one_blas_thread
 def estimate_by_shooting(
     recordings: Sequence[Recording],
     model: Model,

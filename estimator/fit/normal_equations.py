@@ -1,7 +1,7 @@
-"""The products of least squares, compiled, so that no BLAS spreads them over threads of its own.
+"""The products of least squares, compiled: they need neither BLAS nor a weighted copy of the Jacobian.
 
-Those threads spin: beside ours, or on a busy machine, they make small products ten times slower, and the
-last digits would depend on their number.
+As fast as a BLAS held to one thread; its own threads make products of this size ten times slower on a busy machine, and
+the last digits of a fit would depend on their number (docs/dependencies.md).
 """
 
 from collections.abc import Callable

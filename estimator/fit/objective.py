@@ -9,7 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise, step_limits
 from hil.estimator.fit.normal_equations import normal_equations
-from hil.estimator.fit.reparametrisation import Coordinates
+from hil.estimator.fit.reparametrisation import Coordinates, Prior
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.models.parameters import Physics
@@ -28,6 +28,8 @@ class Objective:
     """Of the state at the first sample (2 joints,) [rad, rad/s]."""
     weights: tuple[Array, ...]
     """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
+    prior: Prior
+    """What is expected of the parameters before."""
     minimiser: MinimiserOptions
     max_relative_decrease: float
     """Of the width of friction's step, in one iteration."""
@@ -57,7 +59,7 @@ class Objective:
     def evaluate(self, x: Array) -> Quadratic:
         """The weighted sum of squares at `x` with its normal equations."""
         physics = self.physics(x)
-        total = Quadratic(0.0, np.zeros((x.size, x.size)), np.zeros(x.size))
+        total = self._expected(x)
         if not np.all(np.isfinite(physics.vector)):
             return replace(total, cost=np.inf)
         for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
@@ -79,6 +81,13 @@ class Objective:
                 total.gradient + transform.T @ b,
             )
         return total
+
+    def _expected(self, x: Array) -> Quadratic:
+        """What the prior alone adds."""
+        normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
+        normal[: self.count, : self.count] = np.diag(self.prior.precision)
+        gradient[: self.count] = self.prior.precision * (x[: self.count] - self.prior.centre)
+        return Quadratic(self.prior.cost(x[: self.count]), normal, gradient)
 
     def minimise(self, x: Array, ftol: float, damping: float | None = None, at: Quadratic | None = None) -> Minimum:
         """Minimise the sum of squares from `x`; see `hil.estimator.fit.levenberg_marquardt.minimise`."""
@@ -113,7 +122,7 @@ class Objective:
     def scatter(self, x: Array, lags: int) -> Array:
         """Sum of products of the scores, in coordinates (coordinates, coordinates); see `covariance`."""
         physics = self.physics(x)
-        total = np.zeros((x.size, x.size))
+        total = self._expected(x).normal
         for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
             transform = self._transform(x, index)
             scatter = Scatter(transform.shape[0], lags)

@@ -15,6 +15,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.terms import Scale, joint_of, term_of
 from hil.estimator.options import CoordinateOptions
 
+TYPICAL_SATURATION = 0.02  # of the RMS torque: much to lose; only a scale
 TYPICAL_BEND = 0.01  # rad: much, for friction that yields before it slides; only a scale
 
 
@@ -105,17 +106,56 @@ class Coordinates:
         return shares
 
 
-def scales_of(names: tuple[str, ...], torque: float, velocity: float, inertia: float) -> Array:
-    """Scale of each parameter (parameters,).
+@dataclass(frozen=True)
+class Prior:
+    """What is expected of the parameters before any measurement: normal distributions of independent coordinates."""
 
-    From RMS torque [N m], RMS velocity [rad/s] and an inertia [kg m^2] of the arm and its motion.
-    """
-    arm: dict[Scale, float] = {
-        "inertia": inertia,
-        "torque": torque,
-        "velocity": velocity,
-        "damping": torque / velocity,
-        "stiffness": torque / TYPICAL_BEND,
-    }
-    scales = [term_of(name).scale for name in names]
-    return np.array([scale if isinstance(scale, float) else arm[scale] for scale in scales])
+    centre: Array
+    """(parameters,) [coordinates]."""
+    precision: Array
+    """Inverse variances (parameters,), 0 where nothing is expected."""
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], scales: Array, sizes: "Sizes") -> "Prior":
+        """As `Term.spread` declares it, of coordinates with these scales."""
+        terms = [term_of(name) for name in names]
+        spread = np.array([np.inf if term.spread is None else sizes.of(term.spread) for term in terms])
+        signed = np.array([term.range == "any" for term in terms])
+        absent = np.array([term.absent for term in terms])
+        # Around its absent value the logarithm of a factor changes as the factor itself does.
+        centre = np.where(signed, absent / scales, np.log(np.where(signed | (absent <= 0.0), 1.0, absent)))
+        return cls(centre, (np.where(signed, scales, absent) / spread) ** 2)
+
+    def cost(self, x: Array) -> float:
+        """What the coordinates `x` (parameters,) add to the sum of squares."""
+        return float(np.sum(self.precision * (x - self.centre) ** 2))
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Scales of an arm and its motion."""
+
+    torque: float
+    """RMS [N m]."""
+    velocity: float
+    """RMS [rad/s]."""
+    inertia: float
+    """[kg m^2]."""
+
+    def of(self, scale: Scale | float) -> float:
+        """The number that a declared scale means here."""
+        if not isinstance(scale, str):
+            return scale
+        return {
+            "inertia": self.inertia,
+            "torque": self.torque,
+            "velocity": self.velocity,
+            "damping": self.torque / self.velocity,
+            "stiffness": self.torque / TYPICAL_BEND,
+            "saturation": TYPICAL_SATURATION / self.torque**2,
+        }[scale]
+
+
+def scales_of(names: tuple[str, ...], sizes: Sizes) -> Array:
+    """Scale of each parameter (parameters,)."""
+    return np.array([sizes.of(term_of(name).scale) for name in names])

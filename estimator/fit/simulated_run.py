@@ -11,6 +11,7 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque, torque_and_slopes
+from hil.estimator.simulation.encoder import by_motion, measured, measured_and_slopes
 from hil.estimator.simulation.presliding_sensitivity import sensitive
 
 PIECE = 8192  # samples; the derivatives of one piece are a few MiB
@@ -30,6 +31,9 @@ class SimulatedRun:
     """Integration steps in a sample."""
     max_substeps: int
     """Into which a step may be cut near standstill."""
+    pulled_to: Array | None = None
+    """Where springs end that draw the arm, held from sample to sample (joints, samples) [rad]; `measured` unless given.
+    """
 
     @classmethod
     def of(cls, period: SettledPeriod, integration: IntegrationOptions) -> "SimulatedRun":
@@ -44,10 +48,10 @@ class SimulatedRun:
         return replace(self, steps=steps, max_substeps=integration.max_substeps)
 
     def position(self, physics: Physics, start: Array) -> Array:
-        """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
         times = {"delay": physics.delay, "lag": physics.lag}
         torque = motor_torque(self.command, self.rate, self.command_to_sample, self.steps, **times)
-        return simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0]
+        return measured(physics, simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0])
 
     def pieces(
         self,
@@ -64,15 +68,14 @@ class SimulatedRun:
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
         motion = sensitive(physics)(
-            *(physics, start, (*names, *state), 1.0 / (self.rate * self.steps), self.max_substeps),
+            *(physics, start, (*by_motion(names), *state), 1.0 / (self.rate * self.steps), self.max_substeps),
             tracking_stiffness,
         )
         times = {"delay": physics.delay, "lag": physics.lag}
         torque, slopes = torque_and_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
         samples = round(horizon * samples)
+        ends = self.measured if self.pulled_to is None else self.pulled_to
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
-            yield (
-                part,
-                *motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], self.measured[:, part]),
-            )
+            true = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part])
+            yield part, *measured_and_slopes(physics, names, *true)

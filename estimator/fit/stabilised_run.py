@@ -1,4 +1,11 @@
-"""One stabilised run as the likelihood simulates it: in closed loop, its derivatives by finite differences."""
+"""One stabilised run as the likelihood simulates it: held to the measured motion by the stabiliser's own springs.
+
+The stabiliser gave k (pose - measured) for a spring of stiffness k; in closed loop the simulated arm would be given
+k (pose - simulated), which is the torque that was commanded and a spring k (measured - simulated) beside it. So the
+simulation has that spring instead of the loop: an arm that falls over by itself stays with the real one, derivatives
+are those of every other run, and where model and arm agree the spring gives nothing. The stabiliser's damper is left
+out: it only says how fast what is left dies away.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -7,71 +14,53 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
-from hil.estimator.models.parameters import CONSTANTS, Physics
+from hil.estimator.fit.simulated_run import SimulatedRun
+from hil.estimator.models.parameters import Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.closed_loop import Stabilised
-
-RTOL, ATOL = 1e-5, 1e-7
-"""A difference is taken over this much of a parameter's value, and this much of its unit."""
 
 
 @dataclass(frozen=True)
 class StabilisedRun:
-    """What a run's simulation in closed loop takes from its recording."""
+    """What a run's simulation takes from its recording."""
 
-    stabiliser: Stabilised
-    measured: Array
-    """Angles (joints, samples) [rad], the missing ones interpolated."""
-    rate: float
-    command_to_sample: float
+    run: SimulatedRun
+    """As it would be without the stabiliser; its `pulled_to` are the springs' other ends."""
+    stiffness: Array
+    """Of the stabiliser's springs (joints,) [N m/rad]."""
 
     @classmethod
-    def of(cls, period: SettledPeriod, stabiliser: Stabilised) -> "StabilisedRun":
+    def of(cls, period: SettledPeriod, stabiliser: Stabilised, integration: IntegrationOptions) -> "StabilisedRun":
         """Of this period, during which `stabiliser` gave part of the torque."""
-        return cls(stabiliser, period.filled(), period.rate, period.command_to_sample)
+        run = SimulatedRun.of(period, integration)
+        # Held from sample to sample, an end must stand where the arm is in between: half a sample late is a torque in
+        # proportion to velocity.
+        between = 0.5 * (run.measured + np.roll(run.measured, -1, axis=1))
+        between[:, -1] = 1.5 * run.measured[:, -1] - 0.5 * run.measured[:, -2]
+        return cls(replace(run, pulled_to=between), stabiliser.feedback.stiffness)
 
-    def integrated(self, _: IntegrationOptions) -> "StabilisedRun":
-        """Itself: it has one step only."""
-        return self
+    @property
+    def measured(self) -> Array:
+        """Angles (joints, samples) [rad], the missing ones interpolated."""
+        return self.run.measured
+
+    def integrated(self, integration: IntegrationOptions) -> "StabilisedRun":
+        """The same in other steps."""
+        return replace(self, run=self.run.integrated(integration))
 
     def position(self, physics: Physics, start: Array) -> Array:
-        """Angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
-        return self.stabiliser.positions(physics, start, self.rate, self.command_to_sample)
+        """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        return np.concatenate([position for _, position, _ in self.pieces(physics, start, ())], axis=1)
 
     def pieces(
         self,
         physics: Physics,
         start: Array,
         names: tuple[str, ...],
-        _tracking_stiffness: Array | None = None,
+        tracking_stiffness: Array | None = None,
         horizon: float = 1.0,
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """The whole run, or the share `horizon` from its beginning, as one piece, as `SimulatedRun.pieces` gives them.
-
-        Its stabiliser keeps it near the measured motion: it needs no springs.
-        """
-        position = self.position(physics, start)
-        derivatives = []
-        for name in names:
-            step = ATOL + RTOL * abs(_value(physics, name))
-            derivatives.append((self.position(_nudged(physics, name, step), start) - position) / step)
-        for index in np.ndindex(*start.shape):
-            nudged = start.copy()
-            nudged[index] += ATOL
-            derivatives.append((self.position(physics, nudged) - position) / ATOL)
-        count = round(horizon * self.measured.shape[1])
-        yield slice(0, count), position[:, :count], np.stack(derivatives, axis=-1)[:, :count]
-
-
-def _value(physics: Physics, name: str) -> float:
-    return float(physics.vector[CONSTANTS.index(name)]) if name in CONSTANTS else float(getattr(physics, name))
-
-
-def _nudged(physics: Physics, name: str, step: float) -> Physics:
-    if name == "delay":
-        return replace(physics, delay=physics.delay + step)
-    if name == "lag":
-        return replace(physics, lag=physics.lag + step)
-    vector = physics.vector.copy()
-    vector[CONSTANTS.index(name)] += step
-    return replace(physics, vector=vector)
+        """Piece after piece, as `SimulatedRun.pieces` gives them; with springs stiffer than the stabiliser's where
+        `tracking_stiffness` is."""
+        stiffness = self.stiffness if tracking_stiffness is None else np.maximum(self.stiffness, tracking_stiffness)
+        return self.run.pieces(physics, start, names, stiffness, horizon)

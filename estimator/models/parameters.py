@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,6 +13,8 @@ CONSTANTS = constants()
 """The order in which the compiled simulation takes them."""
 ABSENT = {name: term_of(name).absent for name in CONSTANTS}
 """What stands for a term that the model lacks; a pendulum's second joint is a wheel that nothing turns."""
+ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
+"""Terms of what an encoder gets wrong at every turn."""
 SLIDING = 0.05  # rad/s: faster than this a joint slides, and its friction's bristles are bent that way
 
 
@@ -31,6 +33,8 @@ class Physics:
     """Pure delay of the torque [s]."""
     lag: float
     """Time constant of the torque's first-order lag [s]; 0 for none."""
+    encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
+    """Errors of the encoders by joint, in the order of ENCODER (2, terms) [rad]."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":
@@ -43,7 +47,8 @@ class Physics:
             f"coulomb_width_{joint}": SLIDING for joint in (1, 2) if parameters.get(f"presliding_stiffness_{joint}")
         }
         vector = np.array([parameters.get(name, ABSENT[name]) for name in CONSTANTS])
-        return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0))
+        encoder = np.array([[parameters.get(f"{name}_{joint}", 0.0) for name in ENCODER] for joint in (1, 2)])
+        return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0), encoder)
 
     def crossing_time(self) -> float:
         """The shortest time in which friction turned round moves a joint, over its step or on its bristles [s]."""

@@ -14,10 +14,19 @@ from hil.estimator.errors import ModelError
 
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]
 Drive = Literal["delay", "lag", "delay_lag"]
-Option = Literal["presliding", "asymmetry", "ripple", "zeros", "torque_scale"]
+Option = Literal[
+    "presliding",
+    "asymmetry",
+    "ripple",
+    "zeros",
+    "torque_scale",
+    "saturation",
+    "cable",
+    "encoder",
+]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
-Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness"]
+Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation"]
 
 FRICTIONS: tuple[Friction, ...] = get_args(Friction)
 """Laws of dry friction; each holds the terms of those before it."""
@@ -29,6 +38,9 @@ OPTIONS: dict[Option, str] = {
     "ripple": "torque ripple over the joint's angle",
     "zeros": "errors of the joints' zeros; the first joint's shows only under gravity",
     "torque_scale": "the ratio of the joints' torque constants; one of them has to be believed",
+    "saturation": "torque that falls behind the command the larger it is",
+    "cable": "a cable or spring that pulls the joint to one angle",
+    "encoder": "errors of the encoders that repeat once and twice a turn",
 }
 """What a model may have besides its laws of friction and drive, each in words: keys of `[model]` too."""
 
@@ -68,7 +80,11 @@ class Term:
     replaced_by: str | None = None
     """The option in whose presence the model does without it."""
     simulated: bool = True
-    """Whether it is one of the constants of the equations of motion, and not of the torque before them."""
+    """Whether it is one of the constants of the equations of motion, and not of the torque before them or of the
+    encoders behind them."""
+    spread: Scale | float | None = None
+    """How far from its `absent` value it lies on a usual arm (standard deviation), as a scale or a number [unit]; None
+    where nothing is expected of it."""
 
     @property
     def of_torque(self) -> bool:
@@ -161,7 +177,7 @@ _DECLARED = (
     Term("ripple_sin", "1", "torque ripple over the angle, sine part", part="ripple", range="any", scale=0.02),
     Term("ripple_cos", "1", "torque ripple over the angle, cosine part", part="ripple", range="any", scale=0.02),
     Term("ripple_cycles", "1", "cycles of that ripple per turn", part="ripple", range="any", scale=0.02),
-    Term("zero", "rad", "true minus measured angle", part="zeros", range="any", scale=0.02),
+    Term("zero", "rad", "true minus measured angle", part="zeros", range="any", scale=0.02, spread=0.04),
     Term(
         "torque_scale",
         "1",
@@ -170,6 +186,39 @@ _DECLARED = (
         first_joint=2,
         initial=1.0,
         absent=1.0,
+        spread=0.15,
+    ),
+    Term(
+        "saturation",
+        "1/(N m)^2",
+        "share of the torque that is lost, per square of the torque",
+        part="saturation",
+        range="any",
+        scale="saturation",
+        spread="saturation",
+    ),
+    Term(
+        "cable_stiffness",
+        "N m/rad",
+        "torque of a cable per angle",
+        part="cable",
+        range="any",
+        scale="torque",
+        spread="torque",
+    ),
+    *(
+        Term(
+            f"encoder_{wave}_{times}",
+            "rad",
+            f"measured minus true angle, {wave} part of what repeats {times} a turn",
+            part="encoder",
+            range="any",
+            scale=1e-3,
+            simulated=False,
+            spread=4e-3,
+        )
+        for times in ("once", "twice")
+        for wave in ("sin", "cos")
     ),
     Term(
         "delay",

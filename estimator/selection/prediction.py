@@ -14,6 +14,7 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.options import SettlingOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
+from hil.estimator.simulation.encoder import measured
 
 LEAST_WIDTH = 1e-3  # rad/s of a Coulomb step, where a method knows none
 SETTLING = SettlingOptions(max_periods=20, atol=1e-6)
@@ -84,7 +85,8 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
     for _ in range(SETTLING.max_periods):
         position, end = simulate(physics, state, motor, step)
         if float(np.abs(end - state).max()) < SETTLING.atol:
-            error: Array = np.sqrt(np.nanmean((period.position - position) ** 2, axis=1)) / filled.std(axis=1)
+            read = measured(physics, position)
+            error: Array = np.sqrt(np.nanmean((period.position - read) ** 2, axis=1)) / filled.std(axis=1)
             return error
         state = end
     raise PeriodicityError(f"under these parameters the arm does not settle within {SETTLING.max_periods} periods")

@@ -110,6 +110,8 @@ def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
 
 
 def _free_run(period: SettledPeriod, estimate: Estimate) -> Array | None:
+    if period.stabiliser is not None:
+        return None  # by itself it would fall over, or wander off
     try:
         predicted = predict(estimate, period.torque, period.rate, period.command_to_sample)
     except PeriodicityError:

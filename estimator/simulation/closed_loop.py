@@ -18,6 +18,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import finer_pieces, pieces_now, step_bent, steps_per_sample
 from hil.estimator.simulation.bristles import first_bend, has_bristles, without_dry_friction
+from hil.estimator.simulation.encoder import measured
 
 SETTLING_PERIODS = 4
 
@@ -78,12 +79,12 @@ class Stabilised:
         return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
 
     def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
-        """The same when nothing of the motion is known: from rest in `pose`, after some periods."""
+        """What encoders read when nothing of the motion is known: from rest in `pose`, after some periods."""
         state = resting(pose)
         for _ in range(SETTLING_PERIODS):
             response = respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback)
             state = response.state
-        return response.position
+        return measured(physics, response.position)
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
@@ -116,7 +117,7 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
     lag = physics.lag + max(physics.delay, 0.0)
     moving = without_dry_friction(physics.vector)
-    _respond(
+    respond_compiled(
         *(physics.vector, has_bristles(physics), moving, full, both, gains),
         *(lag, step, steps, finer_pieces(physics, step), position, velocity, torque),
     )
@@ -175,4 +176,4 @@ def _loop(
     state[3, 0], state[3, 1], state[4, 0], state[4, 1] = s1, s2, w1, w2
 
 
-_respond: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)
+respond_compiled: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)

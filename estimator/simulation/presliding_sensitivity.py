@@ -22,6 +22,7 @@ from hil.estimator.simulation.bristles import (
     LOAD,
     OFFSET,
     RISE,
+    SATURATION,
     SCALE,
     STIFFNESS,
     VISCOUS,
@@ -127,6 +128,8 @@ def _bend(
             coulomb, rise, fading, load = p[COULOMB + joint], p[RISE + joint], p[FADING + joint], p[LOAD + joint]
             scale, damping = p[SCALE + joint], p[DAMPING + joint]
             t = scale * commanded
+            cube, eased = t * t * t, 1.0 - 3.0 * p[SATURATION + joint] * t * t
+            t -= p[SATURATION + joint] * cube
             loaded = load if t > 0.0 else -load
             u = v + ahead * faster[joint]
             bump = math.exp(-((u / fading) ** 2))
@@ -143,9 +146,10 @@ def _bend(
             level_by[r + at[RISE + joint]] = coulomb * bump
             level_by[r + at[FADING + joint]] = 2.0 * coulomb * rise * bump * u * u / fading**3
             level_by[r + at[LOAD + joint]] = abs(t)
-            level_by[r + at[SCALE + joint]] = loaded * commanded
+            level_by[r + at[SCALE + joint]] = loaded * commanded * eased
+            level_by[r + at[SATURATION + joint]] = -loaded * cube
             for cause in range(2):
-                level_by[r + at[DELAY + cause]] = loaded * scale * dt[cause, joint]
+                level_by[r + at[DELAY + cause]] = loaded * scale * eased * dt[cause, joint]
             b[joint] = way * level + away * left
             bent = way * b[joint] / level
             z = (2 + joint) * WIDE

@@ -27,6 +27,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.arm import (
     ASYMMETRY,
+    CABLE,
     COSINE,
     COULOMB,
     CYCLES,
@@ -36,6 +37,7 @@ from hil.estimator.simulation.arm import (
     MAX_SUBSTEPS,
     OFFSET,
     RISE,
+    SATURATION,
     SCALE,
     SINE,
     VISCOUS,
@@ -140,7 +142,7 @@ class Sensitive:
 #   dt             motor torques by delay and lag (causes, joints)
 #   spring         stiffness and other end of the springs (2, joints)
 #   at             the column of each cause
-def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:
+def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:  # noqa: PLR0915 a call costs time
     """Torque that a drive leaves its joint and the slope of its friction, as in the simulation, and what they change
     with."""
     rows, numbers, here, left, slope, dt, _, at = room
@@ -150,6 +152,8 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     ripple_sin, ripple_cos, cycles = p[SINE + joint], p[COSINE + joint], p[CYCLES + joint]
     commanded, scale = t, p[SCALE + joint]
     t *= scale
+    cube, eased = t * t * t, 1.0 - 3.0 * p[SATURATION + joint] * t * t
+    t -= p[SATURATION + joint] * cube
     sine, cosine, shape = 0.0, 1.0, 1.0
     if cycles != 0.0:
         sine, cosine = math.sin(cycles * q), math.cos(cycles * q)
@@ -184,19 +188,24 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
         rows[f + at[COSINE + joint]], rows[s + at[COSINE + joint]] = t * cosine * passed, t * cosine * loaded * bent
         rows[f + at[CYCLES + joint]], rows[s + at[CYCLES + joint]] = q * turn * passed, q * turn * loaded * bent
     if at[SCALE + joint] != NOWHERE:
-        given = commanded * shape
+        given = commanded * eased * shape
         rows[f + at[SCALE + joint]], rows[s + at[SCALE + joint]] = given * passed, given * loaded * bent
+    if at[SATURATION + joint] != NOWHERE:
+        lost = -cube * shape
+        rows[f + at[SATURATION + joint]], rows[s + at[SATURATION + joint]] = lost * passed, lost * loaded * bent
+    if at[CABLE + joint] != NOWHERE:
+        rows[f + at[CABLE + joint]] = -q
     for cause in range(2):
-        rows[f + at[DELAY + cause]] = scale * shape * passed * dt[cause, joint]
-        rows[s + at[DELAY + cause]] = scale * shape * loaded * bent * dt[cause, joint]
-    left[stage, joint], slope[stage, joint] = motor - offset - viscous * v - dry * bend, viscous + level * bent
-    n = now * NUMBERS + stage * BY_STATE
-    numbers[n + 5 * joint] = cycles * turn * passed
-    numbers[n + 5 * joint + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
-    numbers[n + 8 + 2 * joint], numbers[n + 9 + 2 * joint] = (
-        cycles * turn * loaded * bent,
-        level_v * bent + level * bent_v,
-    )
+        given = scale * eased * shape * dt[cause, joint]
+        rows[f + at[DELAY + cause]], rows[s + at[DELAY + cause]] = given * passed, given * loaded * bent
+    cable = p[CABLE + joint]
+    left[stage, joint] = motor - offset - cable * q - viscous * v - dry * bend
+    slope[stage, joint] = viscous + level * bent
+    left_by = now * NUMBERS + stage * BY_STATE + 5 * joint
+    slope_by = left_by + 8 - 3 * joint
+    numbers[left_by], numbers[slope_by] = cycles * turn * passed - cable, cycles * turn * loaded * bent
+    numbers[left_by + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
+    numbers[slope_by + 1] = level_v * bent + level * bent_v
 
 
 def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.pendulum import Pendulum
 from hil.fakes.plants.plant import PlantError
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 
 class _Joints(BaseModel):

@@ -15,6 +15,7 @@ from typing import Protocol, runtime_checkable
 
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.backlash import GearedArm
+from hil.fakes.plants.chain_arm import ChainArm
 from hil.fakes.plants.pendulum import Pendulum
 from hil.fakes.plants.two_link import TwoLink
 
@@ -79,6 +80,13 @@ def make_plant(arm: Arm) -> Plant:
     if any(drive.backlash for drive in arm.drives):
         return GearedArm(arm)
     return Pendulum(arm) if len(arm.links) == 1 else TwoLink(arm)
+
+
+def make_chain(arm: ChainArm) -> Plant:
+    """The plant of this spatial arm, at rest in its starting pose at time 0."""
+    from hil.fakes.plants.chain import SpatialChain  # compiled: only who needs it waits for the compiler
+
+    return SpatialChain(arm)
 
 
 def load_plant(name: str, options: Mapping[str, object]) -> Plant:

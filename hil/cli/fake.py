@@ -6,21 +6,28 @@ from pathlib import Path
 
 from hil.errors import ConfigError
 from hil.fakes.bus.faults import FAULTS, parse_fault
+from hil.fakes.bus.hand import parse_move
 from hil.fakes.description import DescriptionError, FakeArm, load_fake
 from hil.fakes.plants.plant import PlantError
 from hil.fakes.pty_server import Counts, LinkError, PtyServer
+from hil.fakes.remote_hand import NoHand, ask_hand
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def describe_fake(config: Path, faults: list[str], seed: int | None) -> None:
+def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int | None) -> None:
     """Print what the file's [fake] table describes; raises ConfigError when it is wrong."""
-    fake = _load(config, faults, seed)
-    for servo in fake.servos:
-        print(f"ID {servo.id}: {servo.model}, firmware {servo.firmware}, {servo.baud} baud")
-    print(f"plant: {fake.plant or f'arm of {len(fake.servos)} joint(s)'}; seed {fake.seed}")
+    fake = _load(config, faults, moves, seed)
+    count = max(fake.joints) + 1
+    for servo, joint in zip(fake.servos, fake.joints, strict=True):
+        moved = f", joint {joint + 1}" if count < len(fake.servos) else ""
+        print(f"ID {servo.id}: {servo.model}, firmware {servo.firmware}, {servo.baud} baud{moved}")
+    print(f"plant: {fake.plant or f'arm of {count} joint(s)'}; seed {fake.seed}")
     for fault in fake.faults:
         print(f"fault: {fault.kind} at {fault.at:g} s for {fault.duration:g} s, probability {fault.probability:g}")
+    for move in fake.moves:
+        end = f"{move.to:g} rad" if move.to is not None else f"{move.ticks} ticks"
+        print(f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
     print(f"\nServe it to any program: hil fake {config} --pty")
     print(f'From Python with pyserial: fakes.register(), then serial_for_url("fake://{config}")')
 
@@ -32,12 +39,26 @@ def list_faults() -> None:
         print(f"{kind:22s} {facts.does}{amount}")
 
 
-def serve_fake(config: Path, link: Path | None, faults: list[str], seed: int | None, quiet: bool) -> None:
+def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
+    """Move limp joints of the fake arm that is served at `device`, or let go of them; raises ConfigError."""
+    try:
+        for servo in release:
+            ask_hand(device, f"release {servo}")
+        for text in moves:
+            parse_move(text)
+            ask_hand(device, f"move {text}")
+    except (NoHand, ValueError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def serve_fake(
+    config: Path, link: Path | None, faults: list[str], moves: list[str], seed: int | None, quiet: bool
+) -> None:
     """Serve the file's fake arm on a pseudo terminal until Ctrl-C, SIGTERM or SIGHUP; raises ConfigError.
 
     The terminal's path is the only thing on standard output; the status line goes to standard error.
     """
-    fake = _load(config, faults, seed)
+    fake = _load(config, faults, moves, seed)
     try:
         server = PtyServer(fake, link)
     except (LinkError, PlantError) as error:
@@ -83,16 +104,24 @@ def _totals(counts: Counts) -> str:
     )
 
 
-def _load(config: Path, faults: list[str], seed: int | None) -> FakeArm:
+def _load(config: Path, faults: list[str], moves: list[str], seed: int | None) -> FakeArm:
     try:
         fake = load_fake(config)
         added = tuple(parse_fault(text) for text in faults)
+        moved = tuple(parse_move(text) for text in moves)
     except (DescriptionError, ValueError) as error:
         raise ConfigError(str(error)) from error
     ids = [servo.id for servo in fake.servos]
     for text, fault in zip(faults, added, strict=True):
         if fault.servo is not None and fault.servo not in ids:
             raise ConfigError(f'fault "{text}": servo = {fault.servo}: the IDs in {config} are {ids}')
+    for text, move in zip(moves, moved, strict=True):
+        if move.servo not in ids:
+            raise ConfigError(f'move "{text}": servo = {move.servo}: the IDs in {config} are {ids}')
     return fake.model_copy(
-        update={"faults": fake.faults + added, "seed": fake.seed if seed is None else seed},
+        update={
+            "faults": fake.faults + added,
+            "moves": fake.moves + moved,
+            "seed": fake.seed if seed is None else seed,
+        },
     )

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.options import PortOrFile
+
 
 def init(
-    port: Annotated[str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, or a TOML file.")],
+    port: PortOrFile,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")] = Path("my_arm.toml"),
     baud: Annotated[
         list[int] | None, typer.Option("--baud", help="Ask only at this baud; may be given more than once.")

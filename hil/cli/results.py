@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")]
+from hil.cli.options import RunPath
 
 
 def report(
@@ -33,12 +33,27 @@ def export(
     formats: Annotated[
         list[str], typer.Option("--format", metavar="FORMAT", help="urdf, mjcf, toml, json, csv, parquet, mcap or mat.")
     ],
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The file; default within RUN.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="File, with --samples folder; default in RUN."),
+    ] = None,
     link_length: Annotated[
         float | None, typer.Option(min=1e-3, metavar="METRES", help="Of link 1; needed for a horizontal arm only.")
     ] = None,
+    samples: Annotated[
+        int | None,
+        typer.Option("--samples", metavar="N", help="Draw N arms from the error bars, into --out."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the draws.")] = 1,
 ) -> None:
     """Write the identified arm or its recording for other tools; says what a format has no place for."""
+    if samples is not None:
+        from hil.export.posterior import export_samples
+
+        folder = out or run / "arms"
+        drawn = export_samples(run, formats, folder, samples, seed, link_length)
+        print(f"{len(drawn.models)} arms in {folder}")
+        return
     from hil.export.formats import export
 
     if out is not None and len(formats) > 1:

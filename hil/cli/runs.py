@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hil import strict_json
+from hil.cli.options import Json, RunPath
 
 if TYPE_CHECKING:
     from hil.estimation.diff import Difference
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
 
 
 def runs(
@@ -48,7 +47,7 @@ def runs(
 
 
 def note(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")],
+    run: RunPath,
     name: Annotated[str | None, typer.Option("--name", help="A short name, for `hil runs`.")] = None,
     text: Annotated[str | None, typer.Option("--text", help="Anything worth remembering.")] = None,
 ) -> None:

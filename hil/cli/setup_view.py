@@ -61,18 +61,6 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
         console.print("The servos of one arm need the same baud: see hil setup --help.")
 
 
-def found(findings: Sequence[Finding]) -> dict[str, Any]:
-    """A check as plain values."""
-    stops = sum(finding.level is Level.STOP for finding in findings)
-    return {
-        "ready": not stops,
-        "findings": [
-            {"level": str(f.level), "where": f.where, "what": f.what, "found": f.found, "mend": f.mend}
-            for f in findings
-        ],
-    }
-
-
 def print_findings(findings: Sequence[Finding], config: Path) -> None:
     """One line for each finding, how to mend it below it, and whether an experiment can start."""
     console = Console(highlight=False, soft_wrap=True)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hil import strict_json
+from hil.cli.options import Json
+from hil.cli.verbosity import is_quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -13,8 +15,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from hil.study.run import StudyProgress
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the figures, and nothing else.")]
 
 
 def study(
@@ -42,7 +42,7 @@ def study(
         raise MissingExtra(f"hil study needs the extra `study` ({error.name}): pip install 'hil[study]'.") from error
     checked = load_study(study_path)
     folder = out or Path("studies") / study_path.stem
-    console = Console(stderr=True, quiet=json_only, highlight=False)
+    console = Console(stderr=True, quiet=json_only or is_quiet(), highlight=False)
     with _shown(console) as watch:
         dataset = run_study(checked, folder, resume=resume, scheduler=scheduler, worker_count=workers, watch=watch)
     table = dataset.table()

@@ -2,15 +2,12 @@
 
 from pathlib import Path
 
-_PACKAGE = Path(__file__).parents[1]
-_INSTALLED = _PACKAGE / "configs"
-_CHECKOUT = _PACKAGE.parent / "configs"
+from hil.fakes.names import configs_folder
 
 
 def bundled_configs() -> dict[str, Path]:
     """The bundled TOML files by name."""
-    folder = _INSTALLED if _INSTALLED.is_dir() else _CHECKOUT
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return {path.stem: path for path in sorted(configs_folder().glob("*.toml"))}
 
 
 def find_config(path: Path) -> Path:

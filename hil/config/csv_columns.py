@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from hil.config.known_quantities import KnownConfig
 from hil.config.schema import ModelConfig
 from hil.errors import ConfigError
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 Column = Annotated[str, Field(min_length=1)]
 POSITION_UNITS = {"rad": 1.0, "deg": 0.017453292519943295, "turns": 6.283185307179586}

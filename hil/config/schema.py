@@ -19,8 +19,9 @@ from hil.drivers.joint import Joint
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
-from hil.fakes.description import FakeArm
-from hil.fakes.table_errors import describe
+from hil.fakes.description import FakeArm, beside
+from hil.fakes.names import find_arm
+from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
 
@@ -120,7 +121,9 @@ class PriorConfig(_Table):
     """
 
     spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
-    rough_spread: PositiveFloat = Field(0.5, le=1, description="of each value guessed from length and model")
+    rough_spread: PositiveFloat | None = Field(
+        None, le=1, description="of each value guessed; each its own unless given"
+    )
     link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
     link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
     link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
@@ -154,6 +157,9 @@ class ExperimentConfig(_Table):
     ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
     settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
+    drift_within: float = Field(
+        0.05, ge=0, lt=1, description="the same, of a motion that still drifts after max_settling_periods"
+    )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="settled periods used")
     held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")
@@ -195,6 +201,9 @@ class ModelConfig(_Table):
     ripple: bool = Field(False, description=OPTIONS["ripple"])
     zeros: bool = Field(False, description=OPTIONS["zeros"])
     torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
+    saturation: bool = Field(False, description=OPTIONS["saturation"])
+    cable: bool = Field(False, description=OPTIONS["cable"])
+    encoder: bool = Field(False, description=OPTIONS["encoder"])
 
     @property
     def fixed_friction(self) -> Friction:
@@ -216,16 +225,21 @@ class SafetyConfig(_Table):
     watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
     allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
-    max_missing: int = Field(5, ge=1, le=1000, description="replies in a row that a servo may miss")
-    max_late: int = Field(20, ge=1, le=1000, description="deadlines in a row that may be missed")
+    missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may give no reply")
+    late_time: PositiveFloat = Field(0.05, le=2, description="s for which deadlines may be missed")
+    max_missing: int | None = Field(None, ge=1, le=1000, description="replies in a row; in place of missing_time")
+    max_late: int | None = Field(None, ge=1, le=1000, description="deadlines in a row; in place of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
     max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
-    min_voltage: float = Field(0.0, ge=0, description="V; the servos' own limits hold beside it")
+    min_voltage: float = Field(0.0, ge=0, description="V; what the models shut down at from the factory, unless given")
     max_voltage: PositiveFloat = Field(30.0, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
-    follow_share: PositiveFloat = Field(0.3, le=1, description="of current_limit, by how much it may differ for longer")
+    follow_share: PositiveFloat = Field(
+        0.3, le=1, description="of the planned peak, by how much it may differ for longer"
+    )
+    take_over: bool = Field(False, description="let an arm that is held sink slowly and take it over; else refuse it")
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
     damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
     limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
@@ -266,6 +280,19 @@ class Config(_Table):
     known: KnownConfig | None = None
     columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
     fake: FakeArm | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _usual_voltage(cls, values: Any) -> Any:
+        """Where no min_voltage is given: that of the model that takes least. 0 V is no supply for any of them."""
+        if not isinstance(values, dict) or not isinstance(values.get("safety", {}), dict):
+            return values
+        joints = values.get("joints")
+        names = (
+            [str(joint.get("model")) for joint in joints if isinstance(joint, dict)] if isinstance(joints, list) else []
+        )
+        least = min((SERVO_MODELS[name].min_voltage for name in names if name in SERVO_MODELS), default=0.0)
+        return {**values, "safety": {"min_voltage": least, **values.get("safety", {})}}
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -334,6 +361,8 @@ class Config(_Table):
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
             watchdog_required=not self.safety.allow_no_watchdog,
+            take_over=self.safety.take_over,
+            interval=1 / self.experiment.rate,
         )
 
     @property
@@ -360,6 +389,8 @@ def parse_config(text: str, path: Path) -> Config:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
+    if isinstance(values.get("fake"), dict):
+        values["fake"] = beside(values["fake"], path.parent)
     try:
         return Config(path=path, **values)
     except ValidationError as error:
@@ -390,8 +421,19 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 
 
 def port_url(port: str) -> str:
-    """The URL of a port: as given, or what the configuration says where `port` is a TOML file; raises ConfigError."""
-    fakes.register()
-    if port.endswith(".toml") and "://" not in port:
-        return load_config(Path(port)).url
-    return port
+    """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
+    one, or the fake arm of that name; raises ConfigError.
+    """
+    url = _url_of(port)
+    fakes.register_for(url)
+    return url
+
+
+def _url_of(port: str) -> str:
+    if "://" in port:
+        return port
+    config = find_config(Path(port))
+    if config.suffix == ".toml":
+        return load_config(config).url
+    arm = find_arm(port)
+    return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port

@@ -15,13 +15,14 @@ from hil.plan.plan import Plan, make_plan, scaled
 
 Array = NDArray[np.float64]
 
-SEARCH_ARMS = 48
+SEARCH_ARMS = 32
 """Arms during the search; the result is checked on all of them."""
 
 PRIOR_ROOM = 0.9
 """Of the limits, while nothing was identified: a wide prior's tail is longer than the simulated arms show."""
 
-_ROUNDS = 14
+_ROUNDS = 12
+_LAST_ROUNDS = 4
 _CLOSE = 0.94
 """Of the limits, at the wanted chance: where the search is content."""
 
@@ -40,21 +41,28 @@ class Amplitude:
     prediction: Prediction
 
 
-def largest_amplitude(config: Config, ensemble: Ensemble, share: float = 1.0, plan: Plan | None = None) -> Amplitude:
+def largest_amplitude(
+    config: Config,
+    ensemble: Ensemble,
+    share: float = 1.0,
+    plan: Plan | None = None,
+    pose: Array | None = None,
+    cap: Array | None = None,
+) -> Amplitude:
     """Scale each joint's torque until its peaks reach `share` of the limits but for safety.limit_chance of the arms.
 
-    plan: its waves are scaled; by default low-crest multisines. Raises NoSafeTorque when not even a small torque is
-    safe.
+    plan: its waves are scaled; by default low-crest multisines. pose: where the arm starts (joints,) [rad]. cap: the
+    most torque (joints,) [N m], beside what the current limits allow. Raises NoSafeTorque when not even a small torque
+    is safe.
     """
     if ensemble.source == "prior":
         share *= PRIOR_ROOM
-    torque = _most_torque(config) / 8
-    base = with_peaks(config, torque) if plan is None else plan
-    torque = base.segments[0].peak_torque
-    found = _search(config, base, torque, ensemble.first(SEARCH_ARMS), share)
+    base = with_peaks(config, most_torque(config) / 8) if plan is None else plan
+    most = most_torque(config) if cap is None else np.minimum(most_torque(config), cap)
+    found = _search(config, base, ensemble.first(SEARCH_ARMS), share, pose, most)
     for _ in range(_ROUNDS):
         plan = scaled(config, base, found)
-        prediction = predict(config, plan, ensemble)
+        prediction = predict(config, plan, ensemble, pose=pose)
         if _chance(prediction, share) <= config.safety.limit_chance:
             return Amplitude(plan, found, prediction)
         found = found * _BACK_OFF
@@ -70,13 +78,14 @@ def with_peaks(config: Config, peak_torque: Array) -> Plan:
     return make_plan(config.model_copy(update={"experiment": experiment}))
 
 
-def _search(config: Config, base: Plan, torque: Array, ensemble: Ensemble, share: float) -> Array:
+def _search(config: Config, base: Plan, ensemble: Ensemble, share: float, pose: Array | None, most: Array) -> Array:
     """Joint by joint towards the limits; the joints pull at each other, so it takes some rounds."""
-    most = _most_torque(config)
+    torque = base.segments[0].peak_torque
     first = base.first_segment() if ensemble.source == "prior" else base
 
     def reached_with(tried: Array) -> Array:
-        return _reached(config, predict(config, scaled(config, first, tried), ensemble), share)
+        prediction = predict(config, scaled(config, first, tried), ensemble, pose=pose, briefly=True)
+        return _reached(config, prediction, share)
 
     best, used = 0.25 * torque, 0.0
     torque = np.minimum(torque, most)
@@ -97,7 +106,7 @@ def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array
     """Raise the joint that uses least of its limits, a little at a time, while all stay within."""
     reached = reached_with(torque)
     blocked = np.zeros(torque.size, dtype=bool)
-    for _ in range(_ROUNDS):
+    for _ in range(_LAST_ROUNDS):
         blocked |= (reached >= _CLOSE) | (torque >= 0.999 * most)
         if blocked.all():
             break
@@ -126,7 +135,7 @@ def _chance(prediction: Prediction, share: float) -> float:
     return max(counted, prediction.stop_chance)
 
 
-def _most_torque(config: Config) -> Array:
-    """What the current limits and the slew allow (joints,) [N m]."""
+def most_torque(config: Config) -> Array:
+    """What the current limits allow (joints,) [N m]."""
     limits = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
     return np.asarray(_TORQUE_SHARE * limits)

@@ -48,14 +48,16 @@ class Ensemble:
 def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
     """From link lengths and `[arm.prior]`. Raises ConfigError."""
     base = base_draws(config, count, seed)
-    lag = 1e-3
-    physics = tuple(
-        Physics.of({name: float(values[arm]) for name, values in base.items()} | {"lag": lag}) for arm in range(count)
-    )
+    physics = tuple(Physics.of({name: float(values[arm]) for name, values in base.items()}) for arm in range(count))
+    return Ensemble(physics, scale_draws(config, count, seed), "prior")
+
+
+def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
+    """True over supposed torque constants (count, joints)."""
     random = np.random.default_rng((seed, 6))
     spread = np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
-    scale = np.exp(np.sqrt(np.log1p(spread**2)) * random.standard_normal((count, len(config.joints))))
-    return Ensemble(physics, scale, "prior")
+    drawn: Array = np.exp(np.sqrt(np.log1p(spread**2)) * random.standard_normal((count, len(config.joints))))
+    return drawn
 
 
 def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
@@ -100,7 +102,12 @@ def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, flo
             centre = abs(known[name])
             least = _LEAST_WIDTH if term_of(name).range == "floor" else 1e-9
             drawn[name] = max(value, _LEAST_SHARE * centre, least)
-    if "coupling" in drawn:
-        most = _MOST_COUPLING * float(np.sqrt(drawn["inertia_1"] * drawn["inertia_2"]))
-        drawn["coupling"] = min(max(drawn["coupling"], -most), most)
-    return drawn
+    return within_range(drawn)
+
+
+def within_range(parameters: dict[str, float]) -> dict[str, float]:
+    """The same with a coupling that leaves the mass matrix positive."""
+    if "coupling" not in parameters:
+        return parameters
+    most = _MOST_COUPLING * float(np.sqrt(parameters["inertia_1"] * parameters["inertia_2"]))
+    return {**parameters, "coupling": min(max(parameters["coupling"], -most), most)}

@@ -5,8 +5,6 @@ lag and stabiliser, for as many periods as it takes to settle. Peaks are compare
 an arm with any share of 1 or more is one that the guard would have stopped.
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import erfc, sqrt
 
@@ -16,9 +14,9 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.dry_run.ensemble import Ensemble
-from hil.dry_run.rollout import Commands, commands_of, simulate_experiment
-from hil.estimator.models.parameters import Physics
+from hil.dry_run.rollout import commands_of, simulate_experiment
 from hil.estimator.simulation.closed_loop import Feedback
+from hil.estimator.simulation.many_arms import LOWEST, TORQUE, ManyArms, Settling
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import feedback_of
 
@@ -31,19 +29,6 @@ GUARDED = 3
 
 QUANTILE = 0.99
 _LEAST_SPREAD = 2e-3
-_THREADS = 2
-_SHOWN_ARMS = 30
-
-
-@dataclass(frozen=True)
-class Peaks:
-    """What one arm reached: extreme values (quantities, joints), periods until settled (0: not within those
-    simulated), and, where kept, positions over time (joints, samples) [rad].
-    """
-
-    values: Array
-    settled_after: int
-    position: Array | None
 
 
 @dataclass(frozen=True)
@@ -123,27 +108,43 @@ def quantities_of(config: Config) -> tuple[tuple[str, str], ...]:
     return tuple(("voltage", "V") if name == "current" else (name, unit) for name, unit in named)
 
 
-def predict(config: Config, plan: Plan, ensemble: Ensemble) -> Prediction:
-    """Simulate `plan` on every arm of the ensemble."""
+def predict(
+    config: Config, plan: Plan, ensemble: Ensemble, *, pose: Array | None = None, briefly: bool = False, shown: int = 0
+) -> Prediction:
+    """Simulate `plan` on every arm of the ensemble.
+
+    pose: where the arm starts, at rest (joints,) [rad]; the rest pose unless given. briefly: one period of each
+    multisine only, for a search. shown: of how many arms the motion is kept.
+    """
     commands = [commands_of(config, segment) for segment in plan.segments]
-
-    def one(arm: int) -> Peaks:
-        physics, scale = ensemble.physics[arm], ensemble.torque_scale[arm]
-        return _reached(config, plan, commands, physics, scale, keep=arm < _SHOWN_ARMS)
-
-    peaks = _each(one, ensemble.size)
-    values = np.stack([peak.values for peak in peaks])
-    limits = limits_of(config)
-    rest = np.array(config.arm.rest_pose)
+    start = np.array(config.arm.rest_pose) if pose is None else pose
+    poses = np.tile(start, (ensemble.size, 1))
+    feedback = feedback_of(config)
+    arms = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback)
+    if briefly:
+        each = [arms.peaks([command], plan.rate, Settling(0.0, 0, 1))[0] for command in commands]
+        peaks = _extreme(np.stack(each))
+        settled_after = np.zeros(ensemble.size, dtype=np.int64)
+    else:
+        settling = Settling(plan.settle_within, plan.max_settling_periods, plan.periods)
+        peaks, settled_after = arms.peaks(commands, plan.rate, settling)
+    limits, rest = limits_of(config), np.array(config.arm.rest_pose)
+    constant = np.array([joint.torque_per_goal for joint in config.joints])
+    values = np.insert(peaks, TORQUE, peaks[:, TORQUE] / constant, axis=1)
+    motions = [
+        simulate_experiment(plan, commands, physics, scale, scaled_feedback(feedback, scale), start).position
+        for physics, scale in zip(ensemble.physics[:shown], ensemble.torque_scale[:shown], strict=True)
+    ]
     return Prediction(
-        values,
-        _shares(values, limits, rest),
-        limits,
-        np.array([peak.settled_after for peak in peaks]),
-        _side_by_side([peak.position for peak in peaks if peak.position is not None]),
-        rest,
-        plan.rate,
+        values, _shares(values, limits, rest), limits, settled_after, _side_by_side(motions), rest, plan.rate
     )
+
+
+def _extreme(peaks: Array) -> Array:
+    """Of several multisines (multisines, arms, peaks, joints), the most of each peak (arms, peaks, joints)."""
+    most: Array = peaks.max(axis=0)
+    most[:, LOWEST] = peaks[:, :, LOWEST].min(axis=0)
+    return most
 
 
 def limits_of(config: Config) -> Array:
@@ -177,19 +178,10 @@ def scaled_feedback(feedback: Feedback, scale: Array) -> Feedback:
     return Feedback(feedback.stiffness * scale, feedback.damping * scale, feedback.pose, feedback.limit * scale)
 
 
-def _reached(
-    config: Config, plan: Plan, commands: list[Commands], physics: Physics, scale: Array, *, keep: bool
-) -> Peaks:
-    feedback = scaled_feedback(feedback_of(config), scale)
-    motion = simulate_experiment(plan, commands, physics, scale, feedback)
-    constant = np.array([joint.torque_per_goal for joint in config.joints])
-    current = motion.torque / (scale * constant)[:, None]
-    values = peaks_of(config, motion.position, motion.velocity, current)
-    return Peaks(values, motion.settled_after, motion.position.astype(np.float32) if keep else None)
-
-
 def _side_by_side(positions: list[Array]) -> Array:
     """Positions (joints, samples) of arms that took different times, NaN after the end (arms, joints, samples)."""
+    if not positions:
+        return np.empty((0, 0, 0), dtype=np.float32)
     longest = max(position.shape[1] for position in positions)
     together = np.full((len(positions), positions[0].shape[0], longest), np.nan, dtype=np.float32)
     for row, position in zip(together, positions, strict=True):
@@ -202,9 +194,3 @@ def _shares(values: Array, limits: Array, rest: Array) -> Array:
     shares[:, 0] = (rest - values[:, 0]) / (rest - limits[0])
     shares[:, 1] = (values[:, 1] - rest) / (limits[1] - rest)
     return shares
-
-
-def _each(work: Callable[[int], Peaks], count: int) -> list[Peaks]:
-    """`work` for each arm; the compiled simulation lets go of the interpreter, so two threads share it."""
-    with ThreadPoolExecutor(_THREADS) as threads:
-        return list(threads.map(work, range(count)))

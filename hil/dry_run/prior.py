@@ -1,7 +1,7 @@
 """What is known of an arm before anything was identified: masses, lengths and friction, each with its spread.
 
-`[arm.prior]` gives what its author knows. The rest is guessed from link lengths and servo models by rules of thumb
-(marked below); they have no better source than a look at a few arms, hence their wide spread.
+`[arm.prior]` gives what its author knows. The rest is guessed from link lengths by rules of thumb (below), which have
+no better source than a look at a few arms, and from the servo models (hil.drivers.servo_prior): both spread widely.
 """
 
 from dataclasses import dataclass
@@ -10,33 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config, PriorConfig
-from hil.drivers.servo_model import Mode, ServoModel
+from hil.drivers.servo_model import Mode
+from hil.drivers.servo_prior import servo_prior, stall_torque
 from hil.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-_LINK_MASS_PER_LENGTH = 1.1  # kg/m: printed or aluminium brackets
-_CENTRE_SHARE = 0.58  # of the length; a gripper or a weight pulls it outwards
+_LINK_MASS_PER_LENGTH = 1.1  # kg/m of an arm of XM430 servos: printed or aluminium brackets
+_USUAL_STALL = 4.1  # N m, of the servos of that arm; smaller servos carry slighter links
+_STALL_POWER = 0.4
+_CENTRE_SHARE = 0.6  # of the length; a gripper or a weight pulls it outwards
+_CENTRE_SPREAD = 0.3
 _INERTIA_SHARE = 1 / 12  # of mass times length squared: a rod
-_ARMATURE_PER_STALL = 2.5e-3  # kg m^2 per N m of stall torque
-_VISCOUS_PER_STALL = 1.05e-2  # N m s/rad per N m
-_COULOMB_PER_STALL = 1.3e-2  # N m per N m
+_ROUGH_SPREAD = 0.5
 _OFFSET_PER_COULOMB = 0.1  # standard deviation of a torque of either sign
+_ZERO_STD = 0.03  # rad: how well a zero is set by eye
 _GEAR_EFFICIENCY = 0.6
-_STRIBECK_RISE = 0.3
-_STRIBECK_VELOCITY = 0.15  # rad/s
+_GENERATED_SPREAD = 0.25  # of back-EMF
 _COULOMB_WIDTH = 0.01  # rad/s
-
-_SERVO_MASS = {"XM430": 0.082, "XH430": 0.082, "XM540": 0.165, "XL330": 0.018, "XC330": 0.023, "XL430": 0.0572}
-"""kg, by family (e-Manual)."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One physical quantity of every joint or link (joints,) and its relative standard deviation."""
+    """One physical quantity of every joint or link (joints,) and its relative standard deviations (joints,)."""
 
     value: Array
-    spread: float
+    spread: Array
 
     def draw(self, random: np.random.Generator, count: int) -> Array:
         """`count` draws (count, joints), log-normal with median `value`."""
@@ -46,7 +45,7 @@ class Quantity:
 
 
 def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
-    """Base parameters and friction terms by the estimator's names, `count` draws each (count,) [SI].
+    """Base parameters, friction terms, zeros and lag by the estimator's names, `count` draws each (count,) [SI].
 
     Raises ConfigError without link lengths.
     """
@@ -59,40 +58,48 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     random = np.random.default_rng((seed, 5))
     drawn = {name: quantity.draw(random, count) for name, quantity in quantities(config, np.array(lengths)).items()}
     offset = _OFFSET_PER_COULOMB * drawn["coulomb"] * random.standard_normal(drawn["coulomb"].shape)
-    return _base(drawn, np.array(lengths), config.arm.gravity) | {
-        f"offset_{joint + 1}": offset[:, joint] for joint in range(offset.shape[1])
-    }
+    zero = _ZERO_STD * random.standard_normal(offset.shape)
+    base = _base(drawn, np.array(lengths), config.arm.gravity)
+    for joint in range(offset.shape[1]):
+        base |= {f"offset_{joint + 1}": offset[:, joint], f"zero_{joint + 1}": zero[:, joint]}
+    # One loop for all joints: they are alike, and the first one's is as good as another's.
+    return base | {"lag": drawn["lag"][:, 0]}
 
 
 def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
-    """What is drawn, by the names of `[arm.prior]`."""
+    """What is drawn, by the names of `[arm.prior]`, and the friction's shape and lag beside them."""
     given = config.arm.prior or PriorConfig()
     models = [joint.joint.servo for joint in config.joints]
-    stall = np.array([_stall_torque(model) for model in models])
-    rough = {
-        "link_mass": _LINK_MASS_PER_LENGTH * lengths,
-        "link_centre": _CENTRE_SHARE * lengths,
-        "servo_mass": np.array([_SERVO_MASS.get(model.name.split("-")[0], 0.082) for model in models]),
-        "armature": _ARMATURE_PER_STALL * stall,
-        "viscous": _VISCOUS_PER_STALL * stall + _generated(config),
-        "coulomb": _COULOMB_PER_STALL * stall,
+    priors = [servo_prior(model) for model in models]
+    size = np.array([(stall_torque(model) / _USUAL_STALL) ** _STALL_POWER for model in models])
+
+    def quantity(name: str, value: Array, spread: float | Array) -> Quantity:
+        known = getattr(given, name, None)
+        if known is not None:
+            return Quantity(np.array(known), np.full(len(models), given.spread))
+        return Quantity(
+            value, np.broadcast_to(spread if given.rough_spread is None else given.rough_spread, len(models))
+        )
+
+    def of_servo(name: str, more: Array | float = 0.0) -> Quantity:
+        guesses = [getattr(prior, name) for prior in priors]
+        value, spread = np.array([(guess.median, guess.spread) for guess in guesses]).T
+        return quantity(name, value + more, np.hypot(spread * value, _GENERATED_SPREAD * more) / (value + more))
+
+    chosen = {
+        "link_mass": quantity("link_mass", _LINK_MASS_PER_LENGTH * size * lengths, _ROUGH_SPREAD),
+        "link_centre": quantity("link_centre", _CENTRE_SHARE * lengths, _CENTRE_SPREAD),
+        "servo_mass": of_servo("mass"),
+        "armature": of_servo("armature"),
+        "viscous": of_servo("viscous", _generated(config)),
+        "coulomb": of_servo("coulomb"),
+        "stribeck_rise": of_servo("stribeck_rise"),
+        "stribeck_velocity": of_servo("stribeck_velocity"),
+        "lag": of_servo("lag"),
     }
-    chosen = {name: _chosen(given, name, guess) for name, guess in rough.items()}
     rod = _INERTIA_SHARE * chosen["link_mass"].value * lengths**2
-    chosen["link_inertia"] = _chosen(given, "link_inertia", rod)
-    chosen["stribeck_rise"] = Quantity(np.full(len(models), _STRIBECK_RISE), given.rough_spread)
+    chosen["link_inertia"] = quantity("link_inertia", rod, _ROUGH_SPREAD)
     return chosen
-
-
-def _chosen(given: PriorConfig, name: str, guess: Array) -> Quantity:
-    values = getattr(given, name)
-    return Quantity(guess, given.rough_spread) if values is None else Quantity(np.array(values), given.spread)
-
-
-def _stall_torque(model: ServoModel) -> float:
-    """N m at the middle one of the published voltages."""
-    torques = sorted(stall.torque for stall in model.stalls)
-    return torques[len(torques) // 2]
 
 
 def _generated(config: Config) -> Array:
@@ -124,8 +131,7 @@ def _base(drawn: dict[str, Array], lengths: Array, gravity: float) -> dict[str, 
             "gravity_2": mass[:, 1] * centre[:, 1] * gravity,
         }
     for joint in range(mass.shape[1]):
-        for term in ("viscous", "coulomb", "stribeck_rise"):
+        for term in ("viscous", "coulomb", "stribeck_rise", "stribeck_velocity"):
             base[f"{term}_{joint + 1}"] = drawn[term][:, joint]
-        base[f"stribeck_velocity_{joint + 1}"] = np.full(len(mass), _STRIBECK_VELOCITY)
         base[f"coulomb_width_{joint + 1}"] = np.full(len(mass), _COULOMB_WIDTH)
     return base

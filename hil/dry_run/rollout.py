@@ -7,21 +7,13 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
-from hil.estimation.settled_period import settling_difference
+from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
+from hil.estimator.simulation.many_arms import Commands
 from hil.plan.plan import Plan, Segment
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Commands:
-    """Torques of one multisine in whole ticks, without any stabiliser's (joints, samples) [N m]."""
-
-    ramp_in: Array
-    period: Array
-    ramp_out: Array
 
 
 @dataclass(frozen=True)
@@ -50,14 +42,14 @@ def commands_of(config: Config, segment: Segment) -> Commands:
 
 
 def simulate_experiment(
-    plan: Plan, commands: list[Commands], physics: Physics, scale: Array, feedback: Feedback
+    plan: Plan, commands: list[Commands], physics: Physics, scale: Array, feedback: Feedback, pose: Array
 ) -> Motion:
-    """All multisines, from rest in the feedback's pose. scale: true over supposed torque constant (joints,).
+    """All multisines, from rest in `pose` (joints,) [rad]. scale: true over supposed torque constant (joints,).
 
     As on the bus, the periods of a multisine go on until one is like the one before; an arm that has not settled after
     plan.max_settling_periods plays nothing more.
     """
-    arm = _Arm(plan, physics, scale, feedback)
+    arm = _Arm(plan, physics, scale, feedback, pose)
     settled_after = [arm.play_segment(each) for each in commands[:1]]
     for each in commands[1:]:
         if settled_after[-1]:
@@ -72,9 +64,9 @@ def simulate_experiment(
 class _Arm:
     """The arm while it plays; what it did so far in `parts`."""
 
-    def __init__(self, plan: Plan, physics: Physics, scale: Array, feedback: Feedback) -> None:
+    def __init__(self, plan: Plan, physics: Physics, scale: Array, feedback: Feedback, pose: Array) -> None:
         self._plan, self._physics, self._scale, self._feedback = plan, physics, scale[:, None], feedback
-        self._state = resting(feedback.pose)
+        self._state = resting(pose)
         self.parts: list[Response] = []
 
     def play_segment(self, commands: Commands) -> int:

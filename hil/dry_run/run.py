@@ -1,5 +1,6 @@
 """What `hil dry-run` does: an ensemble, the experiment on it, the largest safe torque."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from hil.config.schema import Config
@@ -13,6 +14,8 @@ from hil.plan.plan import make_plan
 from hil.setup.idle_bus import quiet_stream
 
 ARMS = 128
+SHOWN = 30
+"""Arms whose motion is kept for the picture."""
 
 
 def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos: bool = False) -> DryRun:
@@ -23,9 +26,10 @@ def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
     plan = None if config.experiment.peak_torque is None else make_plan(config)
-    asked = None if plan is None else predict(config, plan, ensemble)
+    asked = None if plan is None else predict(config, plan, ensemble, shown=SHOWN)
     largest = largest_amplitude(config, ensemble)
-    shown = largest.prediction if asked is None else asked
+    shown = predict(config, largest.plan, ensemble, shown=SHOWN) if asked is None else asked
+    largest = replace(largest, prediction=shown) if asked is None else largest
     stopping = stopping_distance(config, plan or largest.plan, ensemble, shown.quantile[2].clip(max=shown.limits[2]))
     return DryRun(ensemble.source, ensemble.size, asked, largest, stopping, said)
 

@@ -11,6 +11,7 @@ passed    the motion is not the planned one (a joint held fast, turned round or 
 It knows what a dry run knows: rigid links, friction, current lag, and that the servos do as their manual says.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
 from hil.plan.brake import GETS_FASTER, NOTICED_AFTER, braking_gains
 from hil.plan.plan import Plan
+from hil.plan.silence import missing_limit
 from hil.plan.stabiliser import feedback_of
 
 Array = NDArray[np.float64]
@@ -239,7 +241,7 @@ class _Stops:
         self._off: _Piece = (nothing, self._none, round(LONGEST_S * rate))
         self._braking = round(config.safety.damp_time * rate)
         self._heard_for = round(config.safety.watchdog * rate) + 1
-        self._missed_for = config.safety.max_missing + _REACTION
+        self._missed_for = math.ceil(missing_limit(config).seconds * rate) + _REACTION
 
     def farthest(self, physics: Physics, scale: Array, starts: list[_Start], commands: _Commands) -> Array:
         """The largest way beyond a limit (joints,) [rad]."""

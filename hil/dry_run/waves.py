@@ -1,6 +1,7 @@
 """Which waves a full run plays: low-crest ones that use the room between the limits well, or designed ones."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,22 +14,45 @@ from hil.estimator.models.parameters import Physics
 from hil.plan.plan import Plan, Segment, period_current
 from hil.plan.stabiliser import feedback_of
 
-WAVES = 6
-"""Seeds tried for each multisine: how evenly an arm swings to both sides depends on the phases."""
-
 
 def roomy_plan(config: Config, physics: Physics) -> Plan:
-    """The configuration's plan with those low-crest waves that use most of the position range on the arm `physics`."""
+    """The configuration's plan, each multisine played the way that uses most of the position range on `physics`.
+
+    How evenly an arm swings to both sides depends on the phases. Turned round in sign or in time, a wave is another one
+    with the same lines and peaks, and costs no design.
+    """
     problem = design_problem(config, physics, ())
     plan = with_peaks(config, _torque_limits(config))
-    candidates = []
-    for seed in range(config.experiment.seed, config.experiment.seed + WAVES):
-        segment = _plain_segment(config, seed)
-        wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
-        candidates.append((_range_used(problem, wave), _with_wave(config, segment, wave)))
-    best = sorted(candidates, key=lambda each: -each[0])
-    chosen = tuple(replace(best[place][1], role=segment.role) for place, segment in enumerate(plan.segments))
-    return replace(plan, segments=chosen)
+    segments = []
+    for segment in plan.segments:
+        waves = [problem.scaled(wave, np.ones(len(config.joints))) for wave in _turned(segment.multisine)]
+        segments.append(_with_wave(config, segment, max(waves, key=lambda wave: _range_used(problem, wave))))
+    return replace(plan, segments=tuple(segments))
+
+
+def _turned(wave: Multisine) -> list[Multisine]:
+    """The wave, with each joint's sign turned round against the first's, with all signs, and all of these backwards."""
+    signs = np.array(list(product((1.0, -1.0), repeat=wave.joints)))
+    forward = [_signed(wave, sign) for sign in signs]
+    return forward + [_reversed(each) for each in forward]
+
+
+def _signed(wave: Multisine, sign: NDArray[np.float64]) -> Multisine:
+    phases = tuple(
+        tuple(phase if s > 0 else (phase + np.pi) % (2 * np.pi) for phase in each)
+        for each, s in zip(wave.phases, sign, strict=True)
+    )
+    return replace(wave, phases=phases, torque=wave.torque * sign[:, None])
+
+
+def _reversed(wave: Multisine) -> Multisine:
+    """Played backwards: sample n becomes sample -1 - n, so cos(a n + phase) becomes cos(a n + a - phase)."""
+    turn = 2 * np.pi / wave.samples
+    phases = tuple(
+        tuple(float((turn * line - phase) % (2 * np.pi)) for line, phase in zip(lines, each, strict=True))
+        for lines, each in zip(wave.lines, wave.phases, strict=True)
+    )
+    return replace(wave, phases=phases, torque=np.ascontiguousarray(wave.torque[:, ::-1]))
 
 
 def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
@@ -47,11 +71,6 @@ def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> 
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])
     limits = Limits(low, high, velocity, _torque_limits(config))
     return Problem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
-
-
-def plain_wave(config: Config, seed: int) -> Multisine:
-    """The low-crest multisine of this seed, at the torque limits."""
-    return _plain_segment(config, seed).multisine
 
 
 def _plain_segment(config: Config, seed: int) -> Segment:

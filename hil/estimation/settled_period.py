@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
-from hil.estimator.data.periodicity import period_difference
+from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.simulation.closed_loop import Stabilised
 from hil.plan.stabiliser import feedback_of, feedback_torque
@@ -30,6 +30,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         if whole and not np.isfinite(position[:, index]).any():
             raise RecordingCutShort(f"{joint.name} never said where it is during {role!r}: look at its cable and ID.")
     first = _first_settled(position, experiment.settle_within)
+    if first is None and whole > max(experiment.max_settling_periods, experiment.periods):
+        first = _drifting(position, experiment.drift_within, experiment.periods)
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
         raise RecordingCutShort(
@@ -98,11 +100,6 @@ def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
     return None
 
 
-def settling_difference(former: NDArray[np.float64], latest: NDArray[np.float64]) -> float:
-    """How far a period, (joints, samples) [rad], is from the one before: RMS over the motion's RMS, the worst joint.
-
-    Only the later halves are compared. Where they agree the former period ended settled, so all of the latest one is,
-    even though the former began with the transient of the ramp: a whole period of arm time is saved.
-    """
-    half = former.shape[1] // 2
-    return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
+def _drifting(position: NDArray[np.float64], within: float, wanted: int) -> int | None:
+    """The first of the last `wanted` periods, where all that is left of the settling is slow."""
+    return len(position) - wanted if settling_difference(position[-2], position[-1]) <= within else None

@@ -38,7 +38,7 @@ def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
     return [
         said
         for index, joint in enumerate(config.joints)
-        if joint.drive_mode is Mode.CURRENT
+        if joint.drive_mode is Mode.CURRENT and not joint.joint.servo.senses_supply
         for said in _clipped(joint.name, samples["goal_current"][:, index], samples["current"][:, index])
     ]
 

@@ -1,18 +1,26 @@
 """Looks at every sample and stops the arm when a limit is passed or an answer makes no sense.
 
-Two joints cost 1 to 4 us a sample: plain floats, one pass over the joints, everything known beforehand worked out once.
+Two joints cost a few us a sample: plain floats, one pass over the joints, everything known beforehand worked out once.
+What needs more than one sample is kept by modules of their own: `following` (does the motor carry what it is told),
+`consistency` (do position and velocity tell of the same motion), `status_check` (what servos tell of themselves in
+turn), `silence` (time without replies or commands).
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple, NoReturn
 
-from hil.config.schema import Config
+from hil.config.schema import Config, JointConfig
 from hil.drivers.packet import ALERT
-from hil.drivers.state import Slow, State
+from hil.drivers.servo_model import Mode
+from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
+from hil.experiment.consistency import Consistency
+from hil.experiment.following import Following, Unfollowed
+from hil.experiment.status_check import StatusCheck
+from hil.plan.silence import is_missing_too_long, late_limit, missing_limit
 
 JUMP_FACTOR = 1.5
-"""How much farther than its velocity limit allows a joint may seem to move in one sample."""
+"""How much farther than its velocity limit allows a joint may seem to move from one sample to the next."""
 
 JUMP_ALLOWANCE_RAD = 0.01
 """Rounding and a worn encoder's scatter."""
@@ -20,8 +28,17 @@ JUMP_ALLOWANCE_RAD = 0.01
 EARLY_MOTION_RAD = 0.05
 """How far a joint may creep in the rest before the start."""
 
+LONG_GAP = 3.0
+"""Intervals between two samples from which on what lies between them is not known well enough to be added up."""
+
 WORK_TOLERANCE_RAD = 0.03
 """Work that a joint may seem to give out before its sign is called wrong: this angle at its largest torque."""
+
+
+_WHY_LATE = (
+    "This program was stopped (Ctrl-Z, SIGSTOP, a debugger), the computer was suspended, or other programs kept it "
+    "busy: close them, or lower experiment.rate."
+)
 
 
 class _Limits(NamedTuple):
@@ -32,7 +49,6 @@ class _Limits(NamedTuple):
     velocity: float
     farthest: float
     current: float
-    unfollowed: float
     work_scale: float
     work_least: float
 
@@ -40,11 +56,13 @@ class _Limits(NamedTuple):
 class Guard:
     """Compares each sample with the limits of the configuration. `look` raises SafetyStop.
 
+    planned: largest goal that the plan has for each joint [A, or V under PWM]; from the configuration where not given.
+
     passive: whether the arm can give out no more work than was put in; True for an arm that starts from a stable rest
     without stabiliser. Then motors that take work out of it all the time turn the wrong way.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, planned: Sequence[float] | None = None) -> None:
         rate = config.experiment.rate
         safety = config.safety
         self._names = [str(joint.joint) for joint in config.joints]
@@ -53,9 +71,8 @@ class Guard:
                 joint.position_limit[0],
                 joint.position_limit[1],
                 joint.velocity_limit,
-                JUMP_FACTOR * joint.velocity_limit / rate,
+                JUMP_FACTOR * joint.velocity_limit,
                 joint.goal_limit,
-                safety.follow_share * joint.goal_limit,
                 joint.torque_per_goal / rate,
                 -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
@@ -64,14 +81,20 @@ class Guard:
         count = len(config.joints)
         self._safety = safety
         self._slew = safety.slew / rate
-        self._follow_samples = max(2, round(safety.follow_time * rate))
         self._passive = config.stabiliser is None
-        self._rate = rate
+        self._interval = 1.0 / rate
+        self._missing_limit = missing_limit(config)
+        self._late_limit = late_limit(config)
+        self._following = [
+            None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
+            for joint, peak in zip(config.joints, planned or _planned(config), strict=True)
+        ]
+        self._consistency = [Consistency() for _ in config.joints]
+        self._status = StatusCheck(config)
         self._former_goal = [0.0] * count
         self._position: list[float | None] = [None] * count
-        self._unseen = [0] * count
+        self._seen_at = [0.0] * count
         self._missing = [0] * count
-        self._unfollowed = [0] * count
         self._work = [0.0] * count
         self._late = 0
         self._resting: tuple[float, ...] | None = None
@@ -90,61 +113,74 @@ class Guard:
         self._former_goal = clamped
         return clamped
 
-    def late(self) -> None:
-        """A deadline passed unused. Raises SafetyStop after too many in a row, and before the watchdogs act."""
+    def late(self, seconds: float = 0.0) -> None:
+        """A deadline passed unused, `seconds` after the last command. Raises SafetyStop after too long a time."""
         self._late += 1
-        silence = self._late / self._rate
-        if self._late > self._safety.max_late or silence >= 0.8 * self._safety.watchdog:
-            raise SafetyStop(
-                f"{self._late} deadlines in a row were missed, {1e3 * silence:.0f} ms without a command; "
-                f"safety.max_late allows {self._safety.max_late}. Close other programs, or lower experiment.rate.",
-                Cause.LATE,
-            )
+        seconds = max(seconds, self._late * self._interval)
+        allowed, said = self._late_limit
+        if seconds <= allowed:
+            return
+        missed = max(self._late, int(seconds / self._interval))
+        raise SafetyStop(
+            f"{missed} deadlines in a row were missed, {_told(seconds)} without a command; {said} allows "
+            f"{1e3 * allowed:.0f} ms. {_WHY_LATE}{self._acted(seconds)}",
+            Cause.LATE,
+        )
 
     def look(self, state: State, watchdog_gap: float = 0.0) -> None:
         """Raise SafetyStop when a limit is passed or an answer makes no sense.
 
         watchdog_gap: s since the exchange before this one.
         """
-        if watchdog_gap >= self._safety.watchdog:
+        now = state.time_before_write
+        gap = max(watchdog_gap, state.time_after_read - now)
+        if gap >= self._safety.watchdog:
             raise SafetyStop(
-                f"{1e3 * watchdog_gap:.0f} ms passed between two commands; the servos' watchdogs act after "
-                f"{1e3 * self._safety.watchdog:.0f} ms and then refuse goals. Close other programs on this computer.",
+                f"This program stood still: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
                 Cause.LATE,
             )
         self._late = 0
-        former_goal = state.goal_current
         for index, limits in enumerate(self._limits):
-            if state.missing[index]:
-                self._count_missing(index, state.error[index])
-                continue
-            low, high, fastest, farthest, _, unfollowed, work_scale, work_least = limits
-            position = state.position[index]
-            velocity = state.velocity[index]
             if state.error[index] & ALERT:
                 self._stop(index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, reboot.")
-            former = self._position[index]
-            if former is not None:
-                moved = position - former
-                if not -farthest - JUMP_ALLOWANCE_RAD <= moved <= farthest + JUMP_ALLOWANCE_RAD:
-                    self._jumped(index, moved)
-            if not low <= position <= high:
-                self._outside(index, position)
-            if not -fastest <= velocity <= fastest:
-                self._too_fast(index, velocity)
-            self._position[index] = position
-            self._missing[index] = self._unseen[index] = 0
-            goal = former_goal[index]
-            current = state.current[index]
-            if -unfollowed <= current - goal <= unfollowed:
-                self._unfollowed[index] = 0
+            if state.missing[index]:
+                self._count_missing(index, now)
             else:
-                self._count_unfollowed(index, goal, current)
-            work = self._work[index] = self._work[index] + work_scale * goal * velocity
-            if work < work_least and self._passive:
-                self._judge_work(index)
+                self._look_at_joint(index, limits, state, now)
         if state.slow is not None:
             self._look_slow(state.slow)
+        if state.status is not None:
+            self._look_status(state.status, state)
+
+    def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
+        low, high, fastest, farthest, _, work_scale, work_least = limits
+        position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
+        interval = self._interval
+        # A sample on time after a late one stands for a whole interval all the same.
+        seconds = max(now - self._seen_at[index], interval * (1 + self._missing[index]))
+        former = self._position[index]
+        if former is not None:
+            most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
+            if not -most <= position - former <= most:
+                self._jumped(index, position - former, most)
+        if not low <= position <= high:
+            self._outside(index, position)
+        if not -fastest <= velocity <= fastest:
+            self._too_fast(index, velocity)
+        self._position[index] = position
+        self._seen_at[index] = now
+        self._missing[index] = 0
+        following = self._following[index]
+        if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
+            self._not_followed(index, off)
+        consistency = self._consistency[index]
+        if seconds > LONG_GAP * interval:
+            consistency.lost()
+        if consistency.look(position, velocity, seconds) is not None:
+            self._disagree(index, position, velocity)
+        work = self._work[index] = self._work[index] + work_scale * goal * velocity
+        if work < work_least and self._passive:
+            self._judge_work(index)
 
     def look_at_rest(self, state: State) -> None:
         """Raise SafetyStop when a joint moves although nothing has been commanded yet."""
@@ -161,30 +197,28 @@ class Guard:
                     "allowed. Let the arm hang still; look for a draught, a pulling cable, a hand.",
                 )
 
-    def _count_missing(self, index: int, error: int) -> None:
-        if error & ALERT:
-            self._stop(index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, reboot.")
+    def _count_missing(self, index: int, now: float) -> None:
+        if self._missing[index] == 0 and self._position[index] is None:
+            self._seen_at[index] = now
         self._missing[index] += 1
-        self._unseen[index] += 1
-        allowed = self._safety.max_missing
-        if self._missing[index] > allowed:
+        seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
+        self._consistency[index].lost()
+        allowed, said = self._missing_limit
+        if is_missing_too_long(self._missing[index], seconds, self._missing_limit):
             self._stop(
                 index,
                 Cause.MISSING,
-                f"missed {self._missing[index]} replies in a row; safety.max_missing allows {allowed}. Check its cable "
-                "and its supply.",
+                f"missed {self._missing[index]} replies in a row and was last heard {1e3 * seconds:.0f} ms ago; {said} "
+                f"allows {1e3 * allowed:.0f} ms. Check its cable and its supply.",
             )
 
-    def _jumped(self, index: int, moved: float) -> None:
-        """Farther than one sample allows; after lost replies there were more of them."""
-        most = (1 + self._unseen[index]) * self._limits[index].farthest + JUMP_ALLOWANCE_RAD
-        if not abs(moved) <= most:
-            self._stop(
-                index,
-                Cause.JUMP,
-                f"seems to have moved {moved:+.3f} rad between two samples, at most {most:.3f} is possible within its "
-                "velocity limit. Look at the encoder, its magnet and the supply.",
-            )
+    def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
+        self._stop(
+            index,
+            Cause.JUMP,
+            f"seems to have moved {moved:+.3f} rad between two samples, at most {most:.3f} is possible within its "
+            "velocity limit. Look at the encoder, its magnet and the supply.",
+        )
 
     def _outside(self, index: int, position: float) -> NoReturn:
         low, high = self._limits[index][:2]
@@ -203,16 +237,30 @@ class Guard:
             "experiment.peak_torque; `hil dry-run` finds how far.",
         )
 
-    def _count_unfollowed(self, index: int, goal: float, current: float) -> None:
-        self._unfollowed[index] += 1
-        if self._unfollowed[index] >= self._follow_samples:
-            self._stop(
-                index,
-                Cause.NOT_FOLLOWING,
-                f"carries {current:.3f} where {goal:.3f} is commanded, for {self._unfollowed[index]} samples. Its "
-                "torque is off, it was rebooted, its watchdog acted, or it cannot give this much at its speed and "
-                "supply (safety.follow_share).",
-            )
+    def _not_followed(self, index: int, off: Unfollowed) -> NoReturn:
+        self._stop(
+            index,
+            Cause.NOT_FOLLOWING,
+            f"carries {off.carried:.3f} where {off.goal:.3f} is commanded, for {1e3 * off.seconds:.0f} ms. Its torque "
+            "is off, it was rebooted, its watchdog acted, or it cannot give this much at its speed and supply "
+            "(safety.follow_share).",
+        )
+
+    def _disagree(self, index: int, position: float, velocity: float) -> NoReturn:
+        self._stop(
+            index,
+            Cause.FROZEN,
+            f"reports a velocity of {velocity:+.2f} rad/s that does not fit its position, {position:.3f} rad: one of "
+            "the two readings is frozen or wrong. Look at the encoder and its magnet; replace the servo.",
+        )
+
+    def _look_status(self, told: Sequence[Status | None], state: State) -> None:
+        for index, status in enumerate(told):
+            if status is None:
+                continue
+            wrong = self._status.look(index, status, state.goal_current[index], state.time_before_write)
+            if wrong is not None:
+                self._stop(index, *wrong)
 
     def _judge_work(self, index: int) -> None:
         """Friction takes energy: a joint whose motor has only ever taken energy out turns against its command."""
@@ -243,6 +291,30 @@ class Guard:
                     f"{safety.max_voltage:g}. Look at the supply.",
                 )
 
+    def _acted(self, seconds: float) -> str:
+        """What the servos did meanwhile."""
+        watchdog = self._safety.watchdog
+        if seconds < watchdog:
+            return ""
+        return f" The servos' watchdogs act after {1e3 * watchdog:.0f} ms, so the arm was without current by then."
+
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:
         name = self._names[index]
         raise SafetyStop(f"{name[0].upper()}{name[1:]} {what}", cause)
+
+
+def _told(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds >= 1.0 else f"{1e3 * seconds:.0f} ms"
+
+
+def _measures_supply(joint: JointConfig) -> bool:
+    """Whether the measured current is not the motor's: then the motion and the servo's status must tell."""
+    return joint.drive_mode is Mode.CURRENT and joint.joint.servo.senses_supply
+
+
+def _planned(config: Config) -> list[float]:
+    """Largest goals that the configuration asks for [A or V]; where it leaves them open, the limits."""
+    peaks = config.experiment.peak_torque
+    if peaks is None:
+        return [joint.goal_limit for joint in config.joints]
+    return [peak / joint.torque_per_goal for joint, peak in zip(config.joints, peaks, strict=True)]

@@ -8,20 +8,33 @@ from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import Clock, WallClock
-from hil.drivers.errors import DriverError, TorqueNotOff, WrongSetting
+from hil.drivers.errors import DriverError, ServoFault, TorqueNotOff, WrongSetting
 from hil.drivers.latency import command_to_set, latency_timer
-from hil.errors import ExperimentError, HilError, RunFolderError
+from hil.drivers.state import State
+from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
 from hil.plan.plan import Plan, make_plan
+from hil.runs.background import Background
+from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
+from hil.setup.servo_session import has_moved, servo_session
 
 _LAST_SAMPLES = 100
 """How many samples an error carries with it."""
+
+_MOST_UNSEEN = 20
+"""How much progress may wait for whoever watches; about a second."""
+
+_PATIENCE_S = 0.2
+"""How long the end of a run waits for whoever watches."""
+
+
+_MOVED = 2.0
 
 
 def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch, plan: Plan | None = None) -> str:
@@ -31,45 +44,82 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
     plan = make_plan(config) if plan is None else plan
-    fakes.register()
-    with StopRequest() as stop, ServoBus.open(config.bus) as bus:
+    fakes.register_for(config.url)
+    with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
-        run.event(clock.now(), f"opened {config.port.url} at {config.port.baud} baud")
+
+        def note(what: str) -> None:
+            log.note(clock.now(), what)
+
+        note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
-        with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder:
-            stop.check()
-            with servo_limits(config, bus, lambda what: run.event(clock.now(), what)):
-                _play(config, run, plan, bus, recorder, stop, watch)
-            write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
-        torque = str(bus.torque_off_report)
-        run.event(clock.now(), torque)
-        return torque
+        with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
+            # Signals are only noted from before torque comes on until the servos are as they were.
+            with stop.only_noted(), servo_limits(config, bus, note):
+                _play(config, plan, bus, recorder, stop, shown, note)
+            torque = str(bus.torque_off_report)
+            note(torque)
+            with suppress(RunFolderError):  # the recording holds all of it
+                write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
+        _check_still_wanted(stop, torque)
+    return torque
+
+
+def _check_still_wanted(stop: StopRequest, torque: str) -> None:
+    """A request that came while torque was being cut: what is recorded stays, but nothing follows."""
+    try:
+        stop.check()
+    except StopRequested as request:
+        request.add_note(torque)
+        raise
 
 
 def _play(
-    config: Config, run: RunFolder, plan: Plan, bus: ServoBus, recorder: Recorder, stop: StopRequest, watch: Watch
+    config: Config, plan: Plan, bus: ServoBus, recorder: Recorder, stop: StopRequest, watch: Watch, note: Note
 ) -> None:
     """Torque on, stream, torque off; whatever stops it is kept among the events."""
-    clock = bus.port.clock
-
-    def note(what: str) -> None:
-        run.event(clock.now(), what)
-
+    stream = Stream(bus, plan, config, recorder, stop, watch, note)
     try:
         # In this order: what _on_time does takes longer than the watchdog waits.
-        with _on_time(clock, note), bus.torque(config.safety.watchdog):
+        with _on_time(bus.port.clock, note), bus.torque(config.safety.watchdog):
             note(f"torque on, watchdog {config.safety.watchdog:g} s")
-            Stream(bus, plan, config, recorder, stop, watch, note).run()
+            stream.run()
     except BaseException as error:
+        _explain_alert(bus, stream.state, error)
         if isinstance(error, DriverError | HilError):
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
-        with suppress(RunFolderError):
-            note(f"stopped: {error} {bus.torque_off_report}")
+        note(f"stopped: {error} {bus.torque_off_report}")
         raise
+
+
+def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> None:
+    """Ask the servos for the cause of an alert: now that torque is off, since a silent one takes long to answer."""
+    stop = error if isinstance(error, SafetyStop) else error.__context__
+    if state is None or not isinstance(stop, SafetyStop) or stop.cause is not Cause.ALERT:
+        return
+    try:
+        bus.check_alerts(state)
+    except ServoFault as fault:
+        stop.args = (str(fault),)
+    except DriverError:
+        return
+
+
+@contextmanager
+def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
+    """In real time `watch` is called by a thread of its own, so that a stopped terminal cannot hold up the stream."""
+    if not isinstance(clock, WallClock):
+        yield watch
+        return
+    shown = Background(watch, _MOST_UNSEEN)
+    try:
+        yield shown.put
+    finally:
+        shown.close(_PATIENCE_S)
 
 
 @contextmanager
@@ -100,13 +150,17 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described."""
+    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described.
+
+    Where the run before it has passed that check, friction may hold the arm twice as far away.
+    """
+    tolerance = config.arm.rest_tolerance * (_MOVED if has_moved() else 1.0)
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
-        if abs(position - rest) > config.arm.rest_tolerance:
+        if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
                 f"{joint} is at {position:.3f} rad; arm.rest_pose says {rest:.3f} and arm.rest_tolerance allows "
-                f"{config.arm.rest_tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
+                f"{tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
                 f"Only if it is in its rest pose now, set zero_ticks = {ticks}."
             )
 

@@ -5,7 +5,7 @@ be used, a ramp out; then no current until the arm is at rest. Where a stop allo
 raises; torque is cut by whoever switched it on.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, ServoFault
+from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
-from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop
-from hil.estimation.settled_period import settling_difference
+from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.experiment.guard import Guard
+from hil.experiment.model_watch import ModelWatch
+from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
@@ -47,7 +48,8 @@ Note = Callable[[str], None]
 class Stream:
     """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
 
-    watch: called about 20 times a second with the progress. note: called with each event worth keeping.
+    watch: called about 20 times a second with the progress. note: called with each event worth keeping. Neither may
+    block. Make it before torque is on: it works out all that can be worked out beforehand.
     """
 
     def __init__(
@@ -58,7 +60,9 @@ class Stream:
         self._plan = plan
         self._config = config
         self._safety = config.safety
-        self._guard = Guard(config)
+        planned = _largest_goals(plan)
+        self._guard = Guard(config, planned)
+        self._model = ModelWatch(config, planned)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -71,6 +75,15 @@ class Stream:
         self._goal = [0.0] * len(bus.joints)
         self._segment = 0
         self._state: State | None = None
+        self._sent_at: float | None = None
+        self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
+        longest = max(len(segment.period_current) for segment in plan.segments)
+        self._repetition = Repetition(longest, len(bus.joints))
+
+    @property
+    def state(self) -> State | None:
+        """The latest sample."""
+        return self._state
 
     def run(self) -> None:
         """Play the whole plan; raises ExperimentError, SafetyStop, StopRequested, PortLost."""
@@ -86,10 +99,10 @@ class Stream:
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
             self._note(f"{segment.role}: ramp in")
-            self._play(segment.ramp_in, Phase.RAMP_IN)
+            self._play(self._ramps[number][0], Phase.RAMP_IN)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
-            self._play(segment.ramp_out, Phase.RAMP_OUT)
+            self._play(self._ramps[number][1], Phase.RAMP_OUT)
         self._come_to_rest()
 
     def _rest(self) -> None:
@@ -102,40 +115,44 @@ class Stream:
     def _play_periods(self, segment: Segment) -> None:
         """Periods until one is like the one before it, which then is the first settled one; then the rest of them."""
         samples = len(segment.period_current)
-        former = self._play_period(segment, 0)
-        self._check_motion(former)
+        repetition = self._repetition
+        self._play_period(segment, 0)
+        self._check_motion(repetition.moved)
         for period in range(1, self._plan.max_settling_periods + 1):
-            latest = self._play_period(segment, period)
-            difference = settling_difference(former, latest)
+            self._play_period(segment, period)
+            difference = repetition.difference
             if difference <= self._plan.settle_within:
                 self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                 return
-            former = latest
+        if difference <= self._plan.drift_within:
+            self._note(f"{segment.role}: still changes by {difference:.2%} a period, slowly; the last ones are used")
+            return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}. Look for play, a dragging cable or a slipping joint; or raise "
+            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} of what only "
+            "drifts. Look for play, a dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 
-    def _check_motion(self, position: NDArray[np.float64]) -> None:
+    def _check_motion(self, moved: Sequence[float]) -> None:
         """A joint that friction or something harder holds shows after one period, before minutes are spent on it."""
-        for joint, moved in zip(
-            self._bus.joints, np.nanmax(position, axis=1) - np.nanmin(position, axis=1), strict=True
-        ):
-            if moved <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
-                raise ExperimentError(
-                    f"{joint.title} moved by {moved:.4f} rad in a whole period: it is stuck, or friction holds it. "
+        for joint, way in zip(self._bus.joints, moved, strict=True):
+            if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
+                raise DidNotMove(
+                    f"{joint.title} moved by {way:.4f} rad in a whole period: it is stuck, or friction holds it. "
                     "Move it by hand with torque off; if it is free, raise experiment.peak_torque."
                 )
 
-    def _play_period(self, segment: Segment, period: int) -> NDArray[np.float64]:
-        """Play one period; its positions, (joints, samples) [rad], NaN where missing."""
-        first = self._recorder.count
-        self._play(segment.period_current, Phase.PERIODIC, period)
-        return np.array(self._recorder.samples["position"][first:].T)
+    def _play_period(self, segment: Segment, period: int) -> None:
+        """Play one period; each sample is compared with the same of the period before as it comes."""
+        repetition = self._repetition
+        repetition.begin(len(segment.period_current))
+        for index, row in enumerate(segment.period_current):
+            state = self._sample(row.tolist(), Phase.PERIODIC, period)
+            repetition.add(index, state.position)
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")
@@ -154,8 +171,8 @@ class Stream:
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
         """Send goal currents, (samples, joints) [A], one row a tick; the last state."""
         state = missed(self._goal, self._clock.now())
-        for goal in goals.tolist():
-            state = self._sample(goal, phase, period)
+        for row in goals:  # row by row: all at once would hold up the loop where a period is long
+            state = self._sample(row.tolist(), phase, period)
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
@@ -167,10 +184,11 @@ class Stream:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
             self._goal = self._guard.clamp(wanted)
             state = self._bus.exchange(self._goal)
+            self._sent_at = state.time_before_write
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
         if late:
-            self._guard.late()
+            self._guard.late(now - (deadline if self._sent_at is None else self._sent_at))
         else:
             self._look(state, phase)
         self._stop.check()
@@ -181,13 +199,9 @@ class Stream:
         return state
 
     def _look(self, state: State, phase: Phase) -> None:
-        if any(state.error):
-            try:
-                self._bus.check_alerts(state)
-            except ServoFault as fault:
-                raise SafetyStop(str(fault), Cause.ALERT) from fault
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 
@@ -216,3 +230,9 @@ class Stream:
             for joint, velocity in zip(self._bus.joints, state.velocity, strict=True)
             if abs(velocity) > limit
         )
+
+
+def _largest_goals(plan: Plan) -> list[float]:
+    """Of each joint [A, or V under PWM]; the guard finds what is no number before it is sent."""
+    peaks = [np.nan_to_num(np.abs(segment.period_current)).max(axis=0) for segment in plan.segments]
+    return [float(peak) for peak in np.max(peaks, axis=0)]

@@ -62,6 +62,7 @@ class Plan:
     max_settling_periods: int
     periods: int
     settle_within: float
+    drift_within: float
 
     def first_segment(self) -> "Plan":
         """The plan with its first multisine alone."""
@@ -115,6 +116,7 @@ def make_plan(config: Config) -> Plan:
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
         settle_within=experiment.settle_within,
+        drift_within=experiment.drift_within,
     )
 
 

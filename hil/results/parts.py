@@ -295,7 +295,7 @@ class StabiliserShare:
 @dataclass(frozen=True)
 class PlayedStep:
     """One run on the way from the pilot to full size. Rows are the quantities of hil.dry_run.prediction.QUANTITIES,
-    columns the joints; peak_torque [N m].
+    columns the joints; peak_torque [N m]. ended: why it ended early, None where it did not.
     """
 
     name: str
@@ -304,6 +304,7 @@ class PlayedStep:
     predicted_quantile_99: tuple[PerJoint, ...]
     seen: tuple[PerJoint, ...]
     within_quantile: bool
+    ended: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

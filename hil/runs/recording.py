@@ -8,6 +8,7 @@ import os
 import struct
 from collections.abc import Sequence
 from enum import IntEnum
+from io import BytesIO
 from itertools import chain
 from pathlib import Path
 
@@ -67,7 +68,7 @@ class Recorder:
         dtype = sample_type(joints)
         assert self._row.size == dtype.itemsize
         try:
-            self._samples = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=(capacity,))
+            self._samples: NDArray[np.void] = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=(capacity,))
             _reserve(path)
         except OSError as error:
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
@@ -110,12 +111,40 @@ class Recorder:
         """Cut the file to the rows that were recorded; harmless when closed."""
         if self._bytes.nbytes == 0:
             return
-        rows = np.array(self.samples)
         self._bytes.release()
         self._bytes = memoryview(b"")
-        temporary = self._path.with_suffix(".partial.npy")
-        np.save(temporary, rows, allow_pickle=False)
-        temporary.replace(self._path)
+        self._samples = _cut(self._path, self._samples, self.count)
+
+
+def _cut(path: Path, samples: NDArray[np.void], count: int) -> NDArray[np.void]:
+    """Cut the file to `count` rows where it lies: no second copy, no more room, whatever the disk has left."""
+    header = _header(samples.dtype, count, _header_size(path))
+    with path.open("r+b") as file:
+        # In this order a reader finds a whole recording at any time: rows beyond the header's count are ignored.
+        file.write(header)
+        file.flush()
+        file.truncate(len(header) + count * samples.dtype.itemsize)
+    # What was handed out before must not reach behind the end of the file.
+    return np.lib.format.open_memmap(path, mode="r+") if count else samples[:0].copy()
+
+
+def _header_size(path: Path) -> int:
+    with path.open("rb") as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        read(file)
+        return file.tell()
+
+
+def _header(dtype: np.dtype[np.void], count: int, size: int) -> bytes:
+    """The header of an `.npy` of so many rows, padded to `size` bytes."""
+    written = BytesIO()
+    np.lib.format.write_array_header_1_0(
+        written, {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (count,)}
+    )
+    text = written.getvalue()[10:].rstrip(b" \n")
+    length = size - 10
+    return written.getvalue()[:8] + length.to_bytes(2, "little") + text.ljust(length - 1) + b"\n"
 
 
 def _reserve(path: Path) -> None:

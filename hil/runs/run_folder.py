@@ -2,7 +2,9 @@
 
 config.toml     copied byte for byte
 experiment.json the [experiment] that was really played, where the tool chose it (pilot, torque found by dry runs)
+stabiliser.json the [stabiliser] likewise
 run.json        versions, start time, and the few facts that the samples need to be read again
+servo_settings.json  what the servos were set to before (hil.setup.servo_session)
 events.jsonl    what happened when, one JSON object a line, written as it happens
 samples.npy     every sample (hil.runs.recording)
 lateness.json   how many samples were how late (hil.runs.timing)
@@ -11,6 +13,7 @@ period.npz      the settled periods as measured and as the model has them (hil.r
 """
 
 import json
+import logging
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -22,11 +25,13 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from hil import __version__, strict_json
-from hil.config.schema import Config, ExperimentConfig, parse_config
+from hil.config.schema import Config, ExperimentConfig, StabiliserConfig, parse_config
 from hil.errors import RunFolderError
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
+
+log = logging.getLogger(__name__)
 
 SCHEMA = 1
 _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
@@ -117,16 +122,23 @@ class RunFolder:
     def played_path(self) -> Path:
         return self.path / "experiment.json"
 
+    @property
+    def stabiliser_path(self) -> Path:
+        return self.path / "stabiliser.json"
+
     def load_config(self) -> Config:
         """The configuration, with the experiment that was really played. Raises ConfigError, RunFolderError."""
         config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
         if not self.played_path.is_file():
             return config
+        played: dict[str, Any] = {}
         try:
-            played = ExperimentConfig(**_read_json(self.played_path))
+            played["experiment"] = ExperimentConfig(**_read_json(self.played_path))
+            if self.stabiliser_path.is_file():
+                played["stabiliser"] = StabiliserConfig(**_read_json(self.stabiliser_path))
         except ValidationError as error:
-            raise RunFolderError(f"{self.played_path} is damaged: {error}.") from error
-        return config.model_copy(update={"experiment": played})
+            raise RunFolderError(f"What was played, beside {self.config_path}, is damaged: {error}.") from error
+        return config.model_copy(update=played)
 
     def below(self, name: str, played: Config) -> "RunFolder":
         """A run of its own in a folder of this one, on the way to it; raises RunFolderError."""
@@ -152,8 +164,20 @@ class RunFolder:
         return starts
 
     def write_played(self, played: Config) -> None:
-        """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found."""
+        """Keep an [experiment] that differs from the file's: a pilot's, or one whose torque was found; and gains."""
         write_json(self.played_path, played.experiment.model_dump())
+        if played.stabiliser is not None:
+            write_json(self.stabiliser_path, played.stabiliser.model_dump())
+
+    def set_aside(self, name: str, played: Config) -> None:
+        """Move what a run of `played` recorded into a folder below, so that another can be made in this one."""
+        folder = self.below(name, played)
+        try:
+            for path in (self.samples_path, self.run_path, self.path / "lateness.json"):
+                if path.is_file():
+                    path.replace(folder.path / path.name)
+        except OSError as error:
+            raise RunFolderError(f"{folder.path} cannot be written: {error.strerror}.") from error
 
     def write_facts(self, facts: RunFacts, plan: Plan) -> None:
         """Write run.json: the facts, and what was run on what."""
@@ -195,6 +219,7 @@ class RunFolder:
 
     def event(self, time: float, what: str) -> None:
         """Append one event, with its time on the port's clock [s]; raises RunFolderError."""
+        log.info("%.3f s: %s", time, what)
         line = json.dumps({"time": round(time, 6), "event": what}, ensure_ascii=False)
         path = self.path / "events.jsonl"
         try:
@@ -202,6 +227,25 @@ class RunFolder:
                 file.write(line + "\n")
         except OSError as error:
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+    def load_events(self) -> tuple[tuple[float, str], ...]:
+        """(time on the port's clock [s], what happened); a last line that a crash cut short is left out.
+
+        Raises RunFolderError.
+        """
+        path = self.path / "events.jsonl"
+        if not path.is_file():
+            return ()
+        lines = path.read_text(encoding="utf-8").splitlines()
+        found = []
+        for number, line in enumerate(lines, start=1):
+            try:
+                entry = json.loads(line)
+                found.append((float(entry["time"]), str(entry["event"])))
+            except (ValueError, KeyError, TypeError) as error:
+                if number < len(lines):
+                    raise RunFolderError(f"{path} is damaged in line {number}: {line[:60]!r}.") from error
+        return tuple(found)
 
     def write_result(self, result: Result) -> None:
         """Write result.json. Raises RunFolderError."""

@@ -64,15 +64,16 @@ def scan(
         except PortNotOpened as error:
             yield Heard(baud, (), str(error))
             continue
-        yield _listen(port)
+        yield listen(port)
 
 
-def _listen(port: Port) -> Heard:
+def listen(port: Port, patience: float = _SLOT_S * (MAX_ID + 1)) -> Heard:
+    """Who answers a broadcast ping at the port's present baud within `patience` [s]; raises PortLost."""
     framer = Framer()
     answers = {}
     port.discard_input()
     port.write(encode(BROADCAST_ID, Instruction.PING))
-    deadline = port.clock.now() + _SLOT_S * (MAX_ID + 1) + port.latency + port.wire_time(_STATUS_BYTES)
+    deadline = port.clock.now() + patience + port.latency + port.wire_time(_STATUS_BYTES)
     while (remaining := deadline - port.clock.now()) > 0:
         for packet in framer.feed(port.read(_STATUS_BYTES, min(remaining, 0.05))):
             if packet.is_status and len(packet.data) == 3:

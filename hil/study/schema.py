@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
 from hil.errors import ConfigError
-from hil.fakes.table_errors import describe
+from hil.toml_errors import describe
 
 Task = Literal["identify", "dry_run", "estimate", "empty"]
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]

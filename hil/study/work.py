@@ -95,19 +95,10 @@ def _done(spec: Spec) -> Any:
 
 
 def _identified(arm: Path, folder: Path) -> Any:
-    from hil.config.schema import load_config
-    from hil.estimation.settled_estimate import estimate_run
-    from hil.experiment.run import run_experiment
-    from hil.pilot import identify_in_steps
-    from hil.runs.run_folder import RunFolder
+    from hil.api.experiment import identify
 
-    config = load_config(arm)
     shutil.rmtree(folder / "run", ignore_errors=True)  # of a worker that died on it
-    run = RunFolder.create(folder / "run", config)
-    if config.experiment.pilot:
-        return identify_in_steps(config, run, arm, lambda _: None, lambda _: None)[1].to_json()
-    run_experiment(config, run, arm, lambda _: None)
-    return estimate_run(run).to_json()
+    return identify(arm, out=folder / "run").to_json()
 
 
 def _dry_run(arm: Path) -> Any:

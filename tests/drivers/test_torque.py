@@ -1,5 +1,7 @@
 """Torque on and off, as the emulated servos see it."""
 
+import os
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -105,3 +107,58 @@ def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(
         assert any(fault.kind == FaultKind.LOST_INSTRUCTION for fault in faults.happened)
         off = next(time for address, value, time in seen if (address, value) == (TORQUE, 0))
         assert off - left < 0.002
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 5])
+def test_an_interrupt_while_torque_is_cut_waits_until_it_is_cut(fake_config: Make, after: int) -> None:
+    """Used as a library, without handlers that would only take note of Ctrl-C."""
+    with ServoBus.open(fake_config()) as bus:
+        send = bus.port.write
+        left = [after]
+
+        def interrupted(data: bytes) -> None:
+            send(data)
+            left[0] -= 1
+            if left[0] == -1:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        with pytest.raises(KeyboardInterrupt), bus.torque(watchdog=0.1):
+            bus.port.write = interrupted  # type: ignore[method-assign]
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+        assert bus.torque_off_report is not None and not bus.torque_off_report.unconfirmed
+
+
+@pytest.mark.parametrize("after", [0, 1, 3])
+def test_an_interrupt_that_no_shield_holds_back_leaves_no_servo_untried(fake_config: Make, after: int) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        send = bus.port.write
+        left = [after]
+
+        def interrupted(data: bytes) -> None:
+            left[0] -= 1
+            if left[0] == -1:
+                raise KeyboardInterrupt
+            send(data)
+
+        with pytest.raises(KeyboardInterrupt), bus.torque(watchdog=0.1):
+            bus.port.write = interrupted  # type: ignore[method-assign]
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+        assert bus.torque_off_report is not None and not bus.torque_off_report.unconfirmed
+
+
+def test_an_interrupt_before_the_shield_is_up_is_met_by_a_second_attempt(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        cut, called = bus.torque_off, []
+
+        def first_interrupted() -> Any:
+            called.append(True)
+            if len(called) == 1:
+                raise KeyboardInterrupt
+            return cut()
+
+        monkeypatch.setattr(bus, "torque_off", first_interrupted)
+        with pytest.raises(KeyboardInterrupt), bus.torque(watchdog=0.1):
+            pass
+        assert not any(servo.torque_enabled for servo in servos(bus).values())

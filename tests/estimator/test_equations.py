@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from hil.estimator.data.fourier import cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.periodicity import period_difference
 from hil.estimator.errors import ModelError, ShapeError
-from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.regressor import inverse_dynamics, regressor
@@ -112,7 +112,7 @@ def test_motor_torque_is_the_mean_of_the_late_command(
 @given(arrays(float, (21,), elements=st.floats(-2.0, 2.0)))
 def test_every_coordinate_is_a_physical_arm(x: np.ndarray) -> None:
     names = Model(2, "stribeck_load", "lag").names
-    there = Coordinates(names, scales_of(names, 0.3, 3.0, 0.02), CoordinateOptions(1e-3))
+    there = Coordinates(names, scales_of(names, Sizes(0.3, 3.0, 0.02)), CoordinateOptions(1e-3))
     value = dict(zip(names, there.values(x), strict=True))
     a, b, d, ia = (value[name] for name in ("inertia_1", "coupling", "inertia_2", "armature_2"))
     for c in np.cos(np.linspace(0.0, np.pi, 7)):

@@ -17,6 +17,7 @@ from hil.drivers.packet import BROADCAST_ID, Instruction, encode, encode_status
 from hil.fakes.bus.faults import Fault
 from hil.fakes.description import load_fake
 from hil.fakes.pty_server import LinkError, PtyServer
+from tests.support.command_line import hil
 from tests.support.paths import ROOT
 
 CONFIG = ROOT / "configs" / "fake_two_link.toml"
@@ -194,3 +195,53 @@ def test_it_serves_until_a_signal_and_leaves_nothing(tmp_path: Path, number: sig
     assert process.returncode == 0
     assert err.decode().startswith("1 packets, 0 damaged, 0 collisions, 0 faults")
     assert not link.is_symlink()
+
+
+# The hand, from another process
+
+
+@pytest.mark.parametrize("through", ["path", "link"])
+def test_a_hand_moves_a_joint_while_the_terminal_is_served(serve: Serve, tmp_path: Path, through: str) -> None:
+    link = tmp_path / "arm"
+    server = serve(link=link)
+    device = str(link if through == "link" else server.path)
+    assert hil("hand", device, "1:to=-1.2,duration=0.2", "2:ticks=2500,duration=0.2") == 0
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        with server.lock:
+            ticks = server.bus.servos[2].present.ticks(server.bus.plant.position[1])
+            held = server.bus.hand.holds
+        if abs(ticks - 2500) < 5 and held == {0, 1}:
+            break
+        time.sleep(0.02)
+    assert ticks == pytest.approx(2500, abs=5)
+    assert hil("hand", device, "--release", 1, "--release", 2) == 0
+    with server.lock:
+        assert not server.bus.hand.busy
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("9:to=1",), "no servo has the ID 9"),
+        (("1:to=x",), "must be a number"),
+        (("1",), "give either to"),
+    ],
+)
+def test_a_hand_that_cannot_says_why(
+    serve: Serve, arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert hil("hand", serve().path, *arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_hand_needs_an_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("hand", tmp_path / "arm", "1:to=0") == 2
+    assert "hil fake ARM --pty" in capsys.readouterr().err
+
+
+def test_moves_of_the_command_line_are_described(capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("fake", "koch", "--move", "3:to=0.5,at=2") == 0
+    assert "hand: servo 3 to 0.5 rad at 2 s within 1 s" in capsys.readouterr().out
+    assert hil("fake", "koch", "--move", "7:to=0.5") == 2
+    assert "servo = 7" in capsys.readouterr().err

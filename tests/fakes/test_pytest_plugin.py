@@ -28,6 +28,10 @@ def test_file_seed_and_faults(fake_arm):
     assert port.read(14) == b""
 
 
+def test_an_arm_by_name(fake_arm):
+    assert sorted(fake_arm("koch").bus.servos) == [1, 2, 3, 4, 5, 6]
+
+
 def test_terminal(fake_pty):
     arm = fake_pty()
     with serial.Serial(arm.path, 1_000_000, timeout=1.0) as port:
@@ -49,4 +53,23 @@ def test_fixtures_for_other_peoples_tests(tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    assert "3 passed" in done.stdout, done.stdout + done.stderr
+    assert "4 passed" in done.stdout, done.stdout + done.stderr
+
+
+UNRELATED = """
+import sys
+
+
+def test_nothing_of_ours(request):
+    ours = {name for name in sys.modules if name.partition(".")[0] == "hil"}
+    assert ours <= {"hil", "hil.fakes", "hil.fakes.pytest_plugin"}
+    assert not {"serial", "pydantic", "numpy", "dynamixel_sdk"} & set(sys.modules)
+    assert request.config.pluginmanager.has_plugin("hil")
+"""
+
+
+def test_an_unrelated_session_imports_nothing_but_the_plugin(tmp_path: Path) -> None:
+    (tmp_path / "test_unrelated.py").write_text(UNRELATED, encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:hypothesispytest", "."]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "1 passed" in done.stdout, done.stdout + done.stderr

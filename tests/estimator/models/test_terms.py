@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hil.config.schema import ModelConfig
 from hil.estimation.model_from_config import wanted_model
 from hil.estimator.errors import ModelError
-from hil.estimator.fit.reparametrisation import Coordinates, scales_of
+from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import ABSENT, CONSTANTS, Physics, place_of
 from hil.estimator.models.terms import (
@@ -82,8 +82,8 @@ def test_a_model_has_only_declared_terms_each_once(model: Model) -> None:
 
 @given(models)
 def test_initial_guesses_lie_in_range_and_coordinates_map_back(model: Model) -> None:
-    coordinates = Coordinates(model.names, scales_of(model.names, 0.3, 2.0, 0.02), CoordinateOptions(1e-4))
-    scale = scales_of(model.names, 0.3, 2.0, 0.02)
+    coordinates = Coordinates(model.names, scales_of(model.names, Sizes(0.3, 2.0, 0.02)), CoordinateOptions(1e-4))
+    scale = scales_of(model.names, Sizes(0.3, 2.0, 0.02))
     value = np.array([term_of(name).initial or 0.5 * each for name, each in zip(model.names, scale, strict=True)])
     x = coordinates.coordinates(value)
     assert np.allclose(coordinates.coordinates(coordinates.values(x)), x)

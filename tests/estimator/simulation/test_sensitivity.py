@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hil.estimator.fit.normal_equations import normal_equations
-from hil.estimator.models.parameters import Physics
+from hil.estimator.fit.simulated_run import SimulatedRun
+from hil.estimator.models.parameters import ENCODER, Physics
 from hil.estimator.simulation.arm import simulate
 from hil.estimator.simulation.drive import motor_torque, torque_and_slopes
 from hil.estimator.simulation.presliding_sensitivity import PreslidingSensitive, sensitive
@@ -13,7 +14,7 @@ from hil.estimator.simulation.sensitivity import CAUSES, Sensitive
 EACH = {
     **{"viscous": 0.045, "coulomb": 0.055, "offset": 0.004, "coulomb_width": 0.02, "stribeck_rise": 0.4},
     **{"stribeck_velocity": 0.15, "load": 0.05, "viscous_asymmetry": 0.002, "ripple_sin": 0.02, "ripple_cos": 0.01},
-    **{"ripple_cycles": 7.0, "zero": 0.01, "torque_scale": 1.1},
+    **{"ripple_cycles": 7.0, "zero": 0.01, "torque_scale": 1.1, "saturation": 0.05, "cable_stiffness": 0.02},
 }
 ARM = {
     **{"inertia_1": 0.018, "coupling": 0.0033, "inertia_2": 0.0028, "armature_2": 0.01},
@@ -55,6 +56,26 @@ def test_derivatives_are_those_of_the_simulation(bristles: dict[str, float]) -> 
         up, down = (position({**values, cause: values[cause] + sign * change}) for sign in (1.0, -1.0))
         difference = (up - down) / (2.0 * change)
         assert np.abs(derivative[:, :, index] - difference).max() < 1e-4 * np.abs(difference).max(), cause
+
+
+@pytest.mark.parametrize("joints", [1, 2])
+def test_what_the_encoders_get_wrong_is_differentiated_too(joints: int) -> None:
+    each = dict(zip(ENCODER, (0.01, -0.02, 0.015, 0.005), strict=True))
+    values = {**ARM, **{f"{name}_{joint}": value for name, value in each.items() for joint in range(1, joints + 1)}}
+    start = np.array(list(START.values())).reshape(2, 2)[:, :joints]
+    run = SimulatedRun(torque()[:joints], np.zeros((joints, SAMPLES)), RATE, 3e-4, STEPS, 64)
+    names = ("encoder_cos_twice_1", "inertia_1", "encoder_sin_once_1", "coulomb_1")
+    ((_, read, derivative),) = run.pieces(Physics.of(values), start, names)
+    true = SimulatedRun(torque()[:joints], run.measured, RATE, 3e-4, STEPS, 64).position(Physics.of(ARM), start)
+    q = true[0]
+    wrong = 0.01 * np.sin(q) - 0.02 * np.cos(q) + 0.015 * np.sin(2 * q) + 0.005 * np.cos(2 * q)
+    assert np.allclose(read[0], q + wrong, atol=1e-12)
+    assert derivative.shape == (joints, SAMPLES, len(names) + 2 * joints)
+    for index, name in enumerate(names):
+        change = 1e-6 * max(abs(values[name]), 1e-3)
+        up, down = (run.position(Physics.of({**values, name: values[name] + s * change}), start) for s in (1.0, -1.0))
+        difference = (up - down) / (2.0 * change)
+        assert np.abs(derivative[:, :, index] - difference).max() < 1e-4 * np.abs(difference).max(), name
 
 
 def test_pulled_motion_keeps_to_its_target_and_has_its_own_derivatives() -> None:

@@ -5,21 +5,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from benchmarks.dry_run import is_within, prior_study, run_on
 from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude
 from hil.dry_run.ensemble import prior_ensemble
-from hil.dry_run.nearest_arms import likely_arms
-from hil.dry_run.prediction import GUARDED, predict, scaled_feedback
-from hil.dry_run.rollout import commands_of, simulate_experiment
+from hil.dry_run.prediction import GUARDED, predict
 from hil.errors import ConfigError
-from hil.estimator.models.parameters import CONSTANTS
 from hil.plan.plan import make_plan
-from hil.plan.stabiliser import feedback_of
-from hil.runs.recording import Phase
 from tests.support.command_line import hil
 from tests.support.paths import CONFIGS
 
@@ -75,22 +69,6 @@ def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_
 def test_seen_peaks_stay_within_the_predicted_ones() -> None:
     study = prior_study(12)
     assert study["within_quantile"] >= 11 / 12 and study["limit_touched"] == 0
-
-
-def test_the_arm_that_moved_alike_is_found_among_the_prior_ones(known: Config) -> None:
-    ensemble, plan = prior_ensemble(known, 10), make_plan(known)
-    commands = [commands_of(known, segment) for segment in plan.segments]
-    scale = ensemble.torque_scale[6]
-    motion = simulate_experiment(plan, commands, ensemble.physics[6], scale, scaled_feedback(feedback_of(known), scale))
-    first, count = plan.segments[0].ramp_samples, plan.segments[0].multisine.samples
-    samples = np.zeros(count, dtype=[("phase", "i1"), ("segment", "i1"), ("position", "f8", 2)])
-    samples["phase"], samples["position"] = Phase.PERIODIC, motion.position[:, first : first + count].T
-    samples["position"][::7] = np.nan
-    nearest, other = likely_arms(known, ensemble, plan, samples, 2)
-    truth = dict(zip(CONSTANTS, ensemble.physics[6].vector.tolist(), strict=True))
-    assert nearest["torque_scale_2"] == pytest.approx(scale[1] / scale[0])
-    assert nearest["gravity_2"] * scale[0] == pytest.approx(truth["gravity_2"])
-    assert nearest["stribeck_rise_1"] == truth["stribeck_rise_1"] and other["gravity_2"] != nearest["gravity_2"]
 
 
 def test_without_link_lengths_there_is_no_prior(arm: Arm) -> None:

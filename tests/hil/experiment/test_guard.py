@@ -62,9 +62,13 @@ def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
 
 def test_a_current_that_does_not_follow(arm: Arm) -> None:
     off = STILL._replace(goal_current=(0.5, 0.0))
-    assert look(Guard(arm()), *[off] * 20) is Cause.NOT_FOLLOWING
     guard = Guard(arm())
-    for state in [*[off] * 19, STILL] * 3:
+    for _ in range(11):
+        guard.look(off)
+    assert look(guard, off, off, off) is Cause.NOT_FOLLOWING, "30 ms at full weight"
+    guard = Guard(arm())
+    follows = STILL._replace(goal_current=(0.5, 0.0), current=(0.5, 0.0))
+    for state in [*[off] * 11, *[follows] * 12] * 3:
         guard.look(state)
 
 
@@ -114,7 +118,7 @@ def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:
 def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
     """The figure is benchmarks/guard.py's; here only what slows a look down shows, on a machine of any speed."""
     guard = Guard(arm())
-    moving = STILL._replace(goal_current=(0.1, 0.1), current=(0.1, 0.1), velocity=(0.5, 0.5))
+    moving = STILL._replace(goal_current=(0.1, 0.1), current=(0.1, 0.1), velocity=(0.02, 0.02))
 
     def look() -> None:
         guard.clamp((0.1, 0.1))

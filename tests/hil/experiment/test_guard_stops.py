@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import serial
 
-from benchmarks.faults import SpiedPlant, Spy, call_at
 from hil.config.schema import Config, parse_config
 from hil.drivers.errors import TorqueNotOff, WrongModel
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
@@ -25,6 +24,7 @@ from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
 from tests.support.paths import CONFIGS
+from tests.support.spied_plant import SpiedPlant, Spy, call_at
 
 Arm = Callable[..., Config]
 STIFF_GUARD = ("[experiment]\n", "[safety]\nmax_temperature = 40.0\nmin_voltage = 11.0\n\n[experiment]\n")
@@ -129,8 +129,11 @@ def test_a_computer_that_stalls_beyond_the_watchdogs_time_finds_the_arm_stopped(
 def test_commands_too_far_apart_for_the_watchdogs(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
     config = arm(("rate = 400.0", "rate = 40.0"), ("[experiment]\n", "[safety]\nwatchdog = 0.02\n\n[experiment]\n"))
     stop, samples = run_until_stopped(config, tmp_path / "run", lambda _: None, make_plan(config))
-    assert stop.cause is Cause.LATE and "25 ms passed between two commands" in str(stop)
-    assert len(samples) == 2
+    # Whichever is seen first: the gap, or what the servo says of itself.
+    assert (stop.cause is Cause.LATE and "25 ms passed between two commands" in str(stop)) or (
+        stop.cause is Cause.WATCHDOG and "heard nothing for 20 ms" in str(stop)
+    )
+    assert len(samples) <= 2
     assert_stopped(ports[0])
 
 
@@ -223,7 +226,7 @@ def test_a_missed_deadline_ends_the_braking(arm: Arm, tmp_path: Path, ports: lis
 def test_a_joint_whose_replies_are_missing_is_not_taken_to_be_at_rest(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
 ) -> None:
-    config = arm(("[experiment]\n", "[safety]\nmax_missing = 1000\n\n[experiment]\n"))
+    config = arm(("[experiment]\n", "[safety]\nwatchdog = 2.0\nmax_missing = 1000\n\n[experiment]\n"))
     run = RunFolder.create(tmp_path / "run", config)
     lose = once(lambda: fault(ports, FaultKind.LOST_REPLY, servo=2, duration=1.1), Phase.COMING_TO_REST)
     run_experiment(config, run, config.path, lose, plan)

@@ -133,7 +133,7 @@ def test_what_would_stop_an_experiment_is_found_with_how_to_mend_it(
     finding = next(finding for (where, each), finding in found.items() if each == what and finding.level is level)
     assert mend in finding.mend
     if level is Level.STOP:
-        assert "Mend what stops the servos first" in found["bus", "rate"].mend
+        assert "Fix the servo problems above first" in found["bus", "rate"].mend
 
 
 def test_a_rate_that_the_bus_cannot_hold_is_a_stop_with_the_rate_that_it_can(arm: Arm) -> None:

@@ -1,0 +1,42 @@
+"""Work that no signal may cut short: signals that come while it lasts are delivered when it is over.
+
+A Ctrl-C raises KeyboardInterrupt wherever the program happens to be, also between the two servos whose torque is being
+cut. A program that uses the driver as a library has no handlers that would only take note of it, so the driver itself
+holds signals back for the few milliseconds in which torque is cut.
+"""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Inside the block SIGINT, SIGTERM and SIGHUP are noted; each kind that came is raised again after it, once.
+
+    Only the main thread gets signals; in another one this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if number not in came:
+            came.append(number)
+
+    # None is a handler that was not installed from Python: it could not be put back, so it stays.
+    former = {number: handler for number in _SIGNALS if (handler := signal.getsignal(number)) is not None}
+    try:
+        for number in former:
+            signal.signal(number, note)
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+        for late in came:
+            signal.raise_signal(late)

@@ -1,0 +1,51 @@
+"""What encoders make of the joints' angles: errors that repeat once and twice a turn, and their derivatives."""
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.models.parameters import ENCODER, Physics
+from hil.estimator.models.terms import joint_of, kind_of
+
+
+def measured(physics: Physics, position: Array) -> Array:
+    """What encoders read of joints at `position` (joints, samples), both [rad]."""
+    if not physics.encoder.any():
+        return position
+    joints = position.shape[0]
+    read: Array = position + np.einsum("jc,jsc->js", physics.encoder[:joints], _waves(position))
+    return read
+
+
+def by_motion(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Those of the parameters `names` on which the motion itself depends."""
+    return tuple(name for name in names if kind_of(name) not in ENCODER)
+
+
+def measured_and_slopes(
+    physics: Physics, names: tuple[str, ...], position: Array, derivative: Array
+) -> tuple[Array, Array]:
+    """What encoders read (joints, samples) [rad], and its derivatives by `names` and then the rest.
+
+    `derivative` (joints, samples, causes) is that of the true angles by `by_motion(names)` and then the rest.
+    """
+    wanted = [name for name in names if kind_of(name) in ENCODER]
+    if not wanted:
+        return position, derivative
+    joints = position.shape[0]
+    waves = _waves(position)
+    sin_1, cos_1, sin_2, cos_2 = np.moveaxis(waves, 2, 0)
+    slopes = np.stack((cos_1, -sin_1, 2.0 * cos_2, -2.0 * sin_2), axis=2)
+    steeper = 1.0 + np.einsum("jc,jsc->js", physics.encoder[:joints], slopes)
+    moving = [i for i, name in enumerate(names) if kind_of(name) not in ENCODER]
+    rest = derivative.shape[2] - len(moving)
+    full = np.zeros((*derivative.shape[:2], len(names) + rest))
+    full[:, :, [*moving, *range(len(names), len(names) + rest)]] = derivative * steeper[:, :, None]
+    for name in wanted:
+        joint = (joint_of(name) or 1) - 1
+        full[joint, :, names.index(name)] = waves[joint, :, ENCODER.index(kind_of(name))]
+    return measured(physics, position), full
+
+
+def _waves(position: Array) -> Array:
+    """In the order of ENCODER (joints, samples, terms)."""
+    return np.stack((np.sin(position), np.cos(position), np.sin(2.0 * position), np.cos(2.0 * position)), axis=2)

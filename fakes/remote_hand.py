@@ -1,0 +1,89 @@
+"""The hand of a fake arm that another process serves on a terminal: a socket beside that terminal.
+
+A request is the text `move ID:to=ANGLE,...` or `release ID` (or `release`), the answer "" or what is wrong with it.
+"""
+
+import os
+import socket
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.hand import parse_move
+from hil.fakes.plants.plant import PlantError
+
+_MOST_BYTES = 4096
+_PATIENCE_S = 5.0
+
+
+class NoHand(OSError):
+    """Nobody serves a fake arm at this terminal. The message says which and what to do."""
+
+
+def socket_path(terminal: str) -> Path:
+    """Where the socket of a terminal lies that is served for this user."""
+    name = terminal.strip("/").replace("/", "-")
+    return Path(tempfile.gettempdir()) / f"hil-hand-{os.getuid()}-{name}"
+
+
+class HandSocket:
+    """The server's end. `fileno` becomes readable when something is asked; `answer` then does it."""
+
+    def __init__(self, terminal: str) -> None:
+        self.path = socket_path(terminal)
+        self.path.unlink(missing_ok=True)  # of a server that was killed
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self._socket.bind(str(self.path))
+        self.path.chmod(0o600)
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def answer(self, bus: FakeBus) -> None:
+        """Do what was asked, and say how it went."""
+        with suppress(BlockingIOError):
+            request, asker = self._socket.recvfrom(_MOST_BYTES)
+            said = _do(request.decode("utf-8", "replace"), bus)
+            with suppress(OSError):  # whoever asked may be gone
+                self._socket.sendto(said.encode(), asker)
+
+    def close(self) -> None:
+        """Take it away. May be called twice."""
+        self._socket.close()
+        self.path.unlink(missing_ok=True)
+
+
+def ask_hand(device: Path | str, request: str) -> None:
+    """Have the hand at a terminal, or a link to it, do something.
+
+    Raises NoHand where nobody serves it, ValueError with what is wrong with the request.
+    """
+    served = socket_path(str(Path(device).resolve()))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking,
+    ):
+        asking.settimeout(_PATIENCE_S)
+        asking.bind(str(Path(folder) / "reply"))
+        try:
+            asking.sendto(request.encode(), str(served))
+            said = asking.recv(_MOST_BYTES).decode()
+        except OSError as error:
+            raise NoHand(f"{device}: no fake arm is served here; start one with hil fake ARM --pty") from error
+    if said:
+        raise ValueError(said)
+
+
+def _do(request: str, bus: FakeBus) -> str:
+    verb, _, rest = request.partition(" ")
+    try:
+        if verb == "move":
+            bus.hand.move(*[parse_move(text) for text in rest.split()])
+        elif verb == "release":
+            bus.hand.release(int(rest) if rest else None)
+        else:
+            return f'"{verb}" is neither move nor release'
+    except (ValueError, PlantError) as error:
+        return str(error)
+    return ""

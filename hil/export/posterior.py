@@ -1,0 +1,206 @@
+"""Arms drawn from what an identification leaves open, for domain randomisation: one file an arm, one table for all.
+
+Drawn are the parameters from their covariance (a normal distribution), and one factor common to all torques, since the
+torque constant is known far less well than anything else: the motion shows the ratio of the joints' constants, so one
+factor is left, as uncertain as the best-known joint's. What a goal [A or V] gives is scaled with it, so that every
+drawn arm moves alike under the same goals as far as the recording tells. The draws are matched to the covariance: their
+mean and covariance are those stated, not those of a small sample.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.arm_model import ArmModel
+from hil.errors import ExportError, RunFolderError
+from hil.export.mjcf import export_mjcf
+from hil.export.source import Source
+from hil.export.urdf import export_urdf
+
+Array = NDArray[np.float64]
+
+FORMATS = {"mjcf": (export_mjcf, "xml"), "urdf": (export_urdf, "urdf")}
+TABLE = "arms.parquet"
+MOST_SAMPLES = 100_000
+_TRIES = 20
+"""Rounds of draws in place of arms that no masses have."""
+
+_IN_TORQUE = ("N m", "kg m^2")
+"""Units that begin so scale with the torque constant."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Arms drawn from one result. values: (samples, names) [SI]; torque_factor: (samples,), 1 in the mean.
+
+    redrawn: how many draws had no physical masses and were drawn again.
+    """
+
+    models: tuple[ArmModel, ...]
+    names: tuple[str, ...]
+    values: Array
+    torque_factor: Array
+    redrawn: int
+
+
+def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: bool = True) -> Drawn:
+    """Draw arms whose parameters have the result's mean and covariance; raises ExportError.
+
+    torque_constants: False leaves the torque constants where they are.
+    """
+    if not 2 <= samples <= MOST_SAMPLES:
+        raise ExportError(f"--samples {samples}: from 2 to {MOST_SAMPLES} arms can be drawn.")
+    names, mean, covariance = _posterior(source)
+    rng = np.random.default_rng(seed)
+    values = mean + _matched(rng, samples, len(names)) @ _root(covariance).T
+    values, redrawn = _physical(source, names, mean, covariance, values, rng)
+    spread = _torque_spread(source.model) if torque_constants else 0.0
+    factor = np.exp(spread * _matched(rng, samples, 1)[:, 0])
+    factor /= factor.mean()
+    scaled = np.array([source.result.quantities[name].unit.startswith(_IN_TORQUE) for name in names])
+    values = np.where(scaled, values * factor[:, None], values)
+    models = tuple(_model(source.model, names, row, each) for row, each in zip(values, factor, strict=True))
+    return Drawn(models, names, values, factor, redrawn)
+
+
+def export_samples(
+    run: Path, formats: Sequence[str], out: Path, samples: int, seed: int = 1, link_length: float | None = None
+) -> Drawn:
+    """Draw arms and write them into the folder `out`: arm_0000.xml or .urdf and so on, and arms.parquet.
+
+    Raises ExportError, ResultError, RunFolderError.
+    """
+    unknown = [name for name in formats if name not in (*FORMATS, "parquet")]
+    if unknown:
+        raise ExportError(f"--samples writes mjcf, urdf and parquet, not {unknown[0]!r}.")
+    source = Source.open(run, link_length)
+    drawn = draw_arms(source, samples, seed)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(f"{out} cannot be made: {error.strerror}.") from error
+    for name in formats:
+        if name == "parquet":
+            _write_table(source, drawn, out / TABLE)
+            continue
+        write, ending = FORMATS[name]
+        for number, model in enumerate(drawn.models):
+            write(replace(source, model=model), out / f"arm_{number:04d}.{ending}")
+    return drawn
+
+
+def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:
+    """Names, means (names,) and covariance (names, names) [SI]; raises ExportError for what nothing is known of."""
+    result = source.result
+    covariance = result.covariance.array()
+    unseen = [name for name, row in zip(result.covariance.names, covariance, strict=True) if not np.isfinite(row).all()]
+    if unseen:
+        raise ExportError(
+            f"The recording shows nothing of {', '.join(unseen)}, so there is no distribution to draw it from. "
+            "Identify again with more motion, or export the arm alone."
+        )
+    mean = np.array([result.quantities[name].value for name in result.covariance.names])
+    return result.covariance.names, mean, covariance
+
+
+def _root(covariance: Array) -> Array:
+    """A with A A^T = covariance, which may be singular."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    root: Array = safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
+
+
+def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
+    """Standard normal draws (samples, count), with exactly that mean and covariance where there are enough of them."""
+    z = rng.standard_normal((samples, count))
+    if samples <= count + 1:
+        return z
+    z -= z.mean(axis=0)
+    left, _, right = np.linalg.svd(z, full_matrices=False)
+    matched: Array = left @ right * np.sqrt(samples - 1)
+    return matched
+
+
+def _physical(
+    source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
+) -> tuple[Array, int]:
+    """Draws in which every inertia and friction is positive and masses exist; others are drawn again."""
+    root, redrawn = _root(covariance), 0
+    for _ in range(_TRIES):
+        bad = [index for index, row in enumerate(values) if not _is_physical(_model(source.model, names, row, 1.0))]
+        if not bad:
+            return values, redrawn
+        redrawn += len(bad)
+        values[bad] = mean + rng.standard_normal((len(bad), len(names))) @ root.T
+    raise ExportError(
+        "The error bars are so wide that most draws are no arm of positive masses and friction: identify again with "
+        "more motion."
+    )
+
+
+def _is_physical(model: ArmModel) -> bool:
+    p = model.values
+    positive = [
+        value for name, value in p.items() if name.startswith(("inertia", "armature", "viscous_1", "viscous_2"))
+    ]
+    positive += [value for name, value in p.items() if name.startswith("coulomb")]
+    coupled = p.get("coupling", 0.0) ** 2 < p["inertia_1"] * p.get("inertia_2", np.inf)
+    return min(positive) >= 0.0 and coupled
+
+
+def _torque_spread(model: ArmModel) -> float:
+    """Relative standard deviation of the common factor: the best-known joint's."""
+    return min(joint.torque_per_goal_std / joint.torque_per_goal for joint in model.joints)
+
+
+def _model(model: ArmModel, names: tuple[str, ...], row: Array, factor: float) -> ArmModel:
+    joints = tuple(replace(joint, torque_per_goal=joint.torque_per_goal * factor) for joint in model.joints)
+    values = {**model.values, **dict(zip(names, map(float, row), strict=True))}
+    return replace(model, values=values, joints=joints)
+
+
+def _write_table(source: Source, drawn: Drawn, path: Path) -> None:
+    """One row an arm: parameters, the torque factor, and the actuators' figures under the names of Isaac Lab."""
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ExportError("Parquet needs the package pyarrow: pip install 'hil[export]'.") from error
+    table: dict[str, Array] = {"torque_factor": drawn.torque_factor}
+    units = {"torque_factor": "1"}
+    for index, name in enumerate(drawn.names):
+        table[name], units[name] = drawn.values[:, index], source.result.quantities[name].unit
+    for number, joint in enumerate(source.model.joints, start=1):
+        for key, (values, unit) in _actuator(drawn, number).items():
+            table[f"{joint.name}.{key}"], units[f"{joint.name}.{key}"] = values, unit
+    fields = [pa.field(name, pa.float64(), metadata={"unit": units[name]}) for name in table]
+    try:
+        parquet.write_table(
+            pa.Table.from_arrays([pa.array(each) for each in table.values()], schema=pa.schema(fields)), path
+        )
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error}.") from error
+
+
+def _actuator(drawn: Drawn, joint: int) -> dict[str, tuple[Array, str]]:
+    """armature, friction (dry), viscous_friction, effort_limit and velocity_limit of each drawn arm (samples,)."""
+    facts = drawn.models[0].joints[joint - 1]
+
+    def column(name: str) -> Array:
+        if name not in drawn.names:
+            return np.zeros(len(drawn.models))
+        return np.asarray(drawn.values[:, drawn.names.index(name)])
+
+    effort = np.array([model.joints[joint - 1].torque_per_goal * facts.goal_limit for model in drawn.models])
+    return {
+        "armature": (column(f"armature_{joint}"), "kg m^2"),
+        "friction": (column(f"coulomb_{joint}"), "N m"),
+        "viscous_friction": (column(f"viscous_{joint}"), "N m s/rad"),
+        "effort_limit": (effort, "N m"),
+        "velocity_limit": (np.full(len(drawn.models), facts.velocity_limit), "rad/s"),
+    }

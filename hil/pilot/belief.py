@@ -1,0 +1,186 @@
+"""What is thought of the arm: simulated arms that could be it, drawn from the prior and moved towards what was seen.
+
+Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
+Computers and Geosciences 55 (2013) 3): every arm plays what the real one played, and is moved by the regression, over
+the arms, of parameters on motion, towards the motion that was measured. It needs no derivatives, no starting value and
+no motion that tells all parameters apart: what a motion says nothing of keeps the prior's spread. A joint that did not
+move tells too: arms that would have moved are moved towards more friction.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.dry_run.ensemble import Ensemble, scale_draws, within_range
+from hil.dry_run.prior import base_draws
+from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import term_of
+from hil.estimator.simulation.many_arms import ManyArms
+from hil.pilot.seen import Seen
+from hil.plan.stabiliser import feedback_of
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LINEAR = ("offset", "zero")
+"""Of either sign: not by their logarithms."""
+
+_TIMES = 160
+"""Instants of a motion that are compared, of each joint."""
+_LINEAR_RANGE = 0.02  # rad: smaller displacements count as they are, larger ones by their logarithms
+_ERROR = 0.08
+"""Of a displacement so counted: what models of this kind leave."""
+_LEAST_ERROR_STEPS = 1.5
+MOVED_STEPS = 12
+"""Encoder steps that a joint must swing to count as moved."""
+_STILL = 0.02  # rad: what a simulated joint may swing where the real one stood still
+_MOST_RAISES, _RAISE = 12, (0.05, 0.25)
+"""Of friction's logarithm, one after the other, until a simulated joint stands still too."""
+
+_INFLATIONS = (12.0, 6.0, 4.0, 2.0)
+"""By how much errors are overstated each time; the reciprocals add up to 1, which makes the data count once."""
+_LONGEST_MOVE = 1.0  # of a parameter at a time, in e-folds, or in standard deviations of the prior
+_HOPELESS = 3.0  # times the median misfit: an arm beyond is replaced by a better one
+_LEAST_SPREAD = 0.01  # relative: what models of this kind leave, per doubling of the range
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Arms that could be the real one. coordinates: (arms, parameters), logarithms but for names of either sign, which
+    count in standard deviations of the prior, `scale` (parameters,).
+    """
+
+    names: tuple[str, ...]
+    coordinates: Array
+    scale: Array
+    fixed: dict[str, float]
+    learned: int = 0
+    seed: int = 0
+
+    @property
+    def parameters(self) -> list[dict[str, float]]:
+        """By the estimator's names [SI], torques as one sees them who supposes the first joint's torque constant."""
+        return [
+            within_range({**self.fixed, **dict(zip(self.names, values.tolist(), strict=True))})
+            for values in self._values(self.coordinates)
+        ]
+
+    @property
+    def middle(self) -> dict[str, float]:
+        """The arm in the middle."""
+        values = self._values(np.median(self.coordinates, axis=0)[None])[0]
+        return within_range({**self.fixed, **dict(zip(self.names, values.tolist(), strict=True))})
+
+    def spread(self, name: str) -> float:
+        """Standard deviation of a parameter's logarithm."""
+        return float(self.coordinates[:, self.names.index(name)].std())
+
+    def ensemble(self, farther: float = 1.0) -> Ensemble:
+        """For a dry run; farther: range of motion that will be simulated over the one that was seen."""
+        belief = self if not self.learned else self._widened(_LEAST_SPREAD * (1.0 + np.log2(max(1.0, farther))))
+        physics = tuple(Physics.of(values) for values in belief.parameters)
+        joints = 2 if any(name.endswith("_2") for name in self.names) else 1
+        return Ensemble(physics, np.ones((len(physics), joints)), "belief" if self.learned else "prior")
+
+    def after(self, config: Config, seen: Seen) -> "Belief":
+        """What is thought after `seen`."""
+        step = np.array([joint.joint.servo.position_unit for joint in config.joints])
+        moved = seen.swing > MOVED_STEPS * step
+        random = np.random.default_rng((self.seed, 8, self.learned))
+        belief = self._held(config, seen, ~moved, random)
+        if moved.any():
+            belief = belief._drawn_to(config, seen, moved, random)._held(config, seen, ~moved, random)
+        return replace(belief, learned=self.learned + 1)
+
+    def _held(self, config: Config, seen: Seen, still: Mask, random: np.random.Generator) -> "Belief":
+        """Arms whose joints move where the real ones stood `still` (joints,) get dry friction until they stand too."""
+        belief = self
+        places = [self.names.index(f"coulomb_{joint + 1}") for joint in np.flatnonzero(still)]
+        for _ in range(_MOST_RAISES if places else 0):
+            motions = belief._motions(config, seen)[:, still]
+            moves = np.ptp(motions, axis=2) > _STILL
+            if not moves.any():
+                break
+            x = belief.coordinates.copy()
+            x[:, places] += np.where(moves, random.uniform(*_RAISE, moves.shape), 0.0)
+            belief = replace(belief, coordinates=x)
+        return belief
+
+    def _drawn_to(self, config: Config, seen: Seen, moved: Mask, random: np.random.Generator) -> "Belief":
+        """The smoother, on the motion of the joints that `moved` (joints,)."""
+        index = np.unique(np.linspace(0, seen.command.shape[1] - 1, _TIMES).astype(int))
+        index = index[np.isfinite(seen.position[:, index]).all(axis=0)]
+        step = np.array([joint.joint.servo.position_unit for joint in config.joints])
+        error = np.hypot(_ERROR * _compressed(seen.swing), _LEAST_ERROR_STEPS * step / _LINEAR_RANGE)[moved, None]
+        measured = (_compressed(seen.position[:, index] - seen.pose[:, None])[moved] / error).reshape(-1)
+
+        def foreseen(belief: Belief) -> Array:
+            displaced = (belief._motions(config, seen)[:, :, index] - seen.pose[:, None])[:, moved]
+            return np.nan_to_num(_compressed(np.clip(displaced, -10.0, 10.0)) / error).reshape(len(displaced), -1)
+
+        belief = self
+        for inflation in _INFLATIONS:
+            belief = belief._moved(foreseen(belief), measured, inflation, random)
+        left = np.mean((foreseen(belief) - measured) ** 2, axis=1)
+        return belief._without_strays(left, random)
+
+    def _motions(self, config: Config, seen: Seen) -> Array:
+        """Of every arm under what was commanded (arms, joints, samples) [rad]."""
+        ensemble = replace(self, learned=0).ensemble()
+        poses = np.tile(seen.pose, (ensemble.size, 1))
+        arms = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback_of(config))
+        return arms.positions(seen.command, config.experiment.rate)
+
+    def _moved(self, foreseen: Array, measured: Array, inflation: float, random: np.random.Generator) -> "Belief":
+        """One update: data of so much larger errors."""
+        x = self.coordinates
+        parts, data = x - x.mean(axis=0), foreseen - foreseen.mean(axis=0)
+        goal = measured + np.sqrt(inflation) * random.standard_normal(foreseen.shape)
+        # P'D (D'D + c I)^-1 = P' (DD' + c I)^-1 D: there are fewer arms than data.
+        regularised = data @ data.T + inflation * (len(x) - 1) * np.eye(len(x))
+        change = (goal - foreseen) @ data.T @ np.linalg.solve(regularised, parts)
+        change = np.clip(change, -_LONGEST_MOVE, _LONGEST_MOVE)
+        return replace(self, coordinates=x + change)
+
+    def _without_strays(self, left: Array, random: np.random.Generator) -> "Belief":
+        """Arms that fit far worse than the others are replaced by others, moved a little."""
+        strays = left > _HOPELESS * np.median(left) + 1.0
+        if not strays.any() or strays.all():
+            return self
+        x = self.coordinates.copy()
+        kept = x[~strays]
+        chosen = kept[random.integers(len(kept), size=int(strays.sum()))]
+        x[strays] = chosen + 0.3 * kept.std(axis=0) * random.standard_normal(chosen.shape)
+        return replace(self, coordinates=x)
+
+    def _widened(self, spread: float) -> "Belief":
+        random = np.random.default_rng((self.seed, 9, self.learned))
+        return replace(self, coordinates=self.coordinates + spread * random.standard_normal(self.coordinates.shape))
+
+    def _values(self, coordinates: Array) -> Array:
+        linear = np.array([name.startswith(_LINEAR) for name in self.names])
+        return np.where(linear, coordinates * self.scale, np.exp(np.clip(coordinates, -40.0, 40.0)))
+
+
+def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
+    """From link lengths and `[arm.prior]`. Raises ConfigError."""
+    base, scale = base_draws(config, arms, seed), scale_draws(config, arms, seed)
+    supposed = {name: v / scale[:, 0] if term_of(name).of_torque else v for name, v in base.items()}
+    if scale.shape[1] == 2:
+        supposed["torque_scale_2"] = scale[:, 1] / scale[:, 0]
+    return _of_draws(supposed, seed)
+
+
+def _of_draws(draws: dict[str, Array], seed: int) -> Belief:
+    fixed = {name: float(values[0]) for name, values in draws.items() if np.ptp(values) == 0.0}
+    names = tuple(name for name in draws if name not in fixed)
+    scale = np.array([draws[name].std() for name in names])
+    columns = [draws[name] / draws[name].std() if name.startswith(_LINEAR) else np.log(draws[name]) for name in names]
+    return Belief(names, np.stack(columns, axis=1), scale, fixed, seed=seed)
+
+
+def _compressed(displacement: Array) -> Array:
+    """Linear near zero, a logarithm far from it: how far an arm moved counts by its ratio."""
+    return np.asarray(np.arcsinh(displacement / _LINEAR_RANGE))

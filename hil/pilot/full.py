@@ -1,0 +1,61 @@
+"""The whole way from link lengths to the result: the search, the full run, its estimate."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from hil.config.schema import Config
+from hil.dry_run.amplitude import Amplitude
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.stop_request import StopRequest
+from hil.experiment.stream import Watch
+from hil.pilot.search import Search, with_torque
+from hil.pilot.steps import Played, Player, Say
+from hil.results.result import SettledResult
+from hil.runs.run_folder import RunFolder
+from hil.setup.servo_session import servo_session
+
+MOST_TRIES = 3
+"""Full runs, where one passes a limit or does not settle."""
+
+_BACK_OFF = 0.85
+"""Of the torque of a run that never settled: large motion of little friction need not settle at all."""
+
+
+def identify_in_steps(
+    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
+) -> tuple[str, SettledResult]:
+    """The whole way from link lengths to the result; the sentence about torque and the result.
+
+    Raises what a run raises, and ExperimentError when a joint does not move at its current limit.
+    """
+    # A request to stop that comes in one step, however late, is for all that would follow. What the servos were set to
+    # is kept once for all steps, and put back once: EEPROM wears.
+    with StopRequest(), servo_session(config, run.path, say):
+        search = Search.of(config, run, Player(shown_path, watch, say))
+        played = _full(search, *search.find())
+        run.write_starts([search.belief.middle])
+        result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
+    run.write_result(result)
+    return played.torque, result
+
+
+def _full(search: Search, config: Config, found: Amplitude) -> Played:
+    """Play the full run, with less torque where it passed a limit or did not settle."""
+    run, say = search.run, search.player.say
+    number = 0
+    while True:
+        number += 1
+        chosen = with_torque(config, found.peak_torque)
+        run.write_played(chosen)
+        played = search.player.play(chosen, run, "Full run", found)
+        search.learn(chosen, played)
+        if played.error is None:
+            return played
+        if number == MOST_TRIES:
+            raise played.error
+        say("Once more, with less torque.")
+        run.set_aside(f"stopped-{number}", chosen)
+        if not played.passed_limit:
+            search.cap = _BACK_OFF * found.peak_torque
+        config = search.held
+        found = search.amplitude(config, 1.0, found.plan)

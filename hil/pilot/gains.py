@@ -1,0 +1,79 @@
+"""Gains of a software spring and damper for an arm that does not come back to its rest pose: flat, or upright.
+
+Stiff enough to outweigh gravity in nearly every arm that could be this one and to overcome friction within a radian,
+soft enough to leave most of the torque to the excitation.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config, StabiliserConfig
+from hil.pilot.belief import Belief
+
+Array = NDArray[np.float64]
+
+_FREQUENCY = 0.7  # Hz, of each joint on its spring alone
+_DAMPING_RATIO = 0.35
+_OUTWEIGHS = 1.3  # times gravity's pull away from the pose
+_SURE = 0.95  # of the arms
+_FRICTIONS_PER_RADIAN = 1.5
+_TORQUE_SHARE = 0.35  # of the torque limit at a radian, at most, beyond what gravity needs
+
+
+def needs_stabiliser(config: Config, belief: Belief) -> bool:
+    """Whether gravity does not draw the middle arm back to its rest pose."""
+    return float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min()) <= 0.0
+
+
+def with_stabiliser(config: Config, belief: Belief) -> Config:
+    """The configuration with gains where it has none and needs some."""
+    if config.stabiliser is not None or not needs_stabiliser(config, belief):
+        return config
+    return config.model_copy(update={"stabiliser": proposed(config, belief)})
+
+
+def proposed(config: Config, belief: Belief) -> StabiliserConfig:
+    """Gains for the arms of `belief`."""
+    parameters = belief.parameters
+    away = np.quantile([_pull_away(config, each) for each in parameters], _SURE, axis=0)
+    inertia = np.median([_inertia(config, each) for each in parameters], axis=0)
+    friction, viscous = (np.median(_per_joint(config, parameters, name), axis=0) for name in ("coulomb", "viscous"))
+    limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
+    # With both joints on springs of their own frequency the pair is slower than each; gravity comes on top.
+    spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
+    stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
+    damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)
+    return StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
+
+
+def gravity_stiffness(config: Config, parameters: dict[str, float]) -> Array:
+    """Torque by which gravity draws the arm back per angle from its rest pose (joints, joints) [N m/rad]."""
+    pose = np.array(config.arm.rest_pose)
+    first = -parameters["gravity_1"] * np.sin(pose[0])
+    if len(pose) == 1:
+        return np.array([[first]])
+    second = -parameters["gravity_2"] * np.sin(pose.sum())
+    return np.array([[first + second, second], [second, second]])
+
+
+def _pull_away(config: Config, parameters: dict[str, float]) -> Array:
+    """Stiffness per joint (joints,) [N m/rad] that just outweighs gravity: its rows, coupling included."""
+    away: Array = np.maximum(-gravity_stiffness(config, parameters), 0.0).sum(axis=1)
+    return away
+
+
+def _inertia(config: Config, parameters: dict[str, float]) -> Array:
+    """Of each joint with the others free to follow as they are, in the rest pose (joints,) [kg m^2]."""
+    if len(config.joints) == 1:
+        return np.array([parameters["inertia_1"]])
+    coupling = parameters["coupling"] * np.cos(config.arm.rest_pose[1])
+    first = parameters["inertia_1"] + parameters["inertia_2"] + 2 * coupling
+    return np.array([first, parameters["inertia_2"] + parameters["armature_2"]])
+
+
+def _per_joint(config: Config, parameters: list[dict[str, float]], name: str) -> Array:
+    return np.array([[each[f"{name}_{j + 1}"] for j in range(len(config.joints))] for each in parameters])
+
+
+def _rounded(values: Array) -> list[float]:
+    return [float(f"{value:.3g}") for value in values]

@@ -1,0 +1,245 @@
+"""From the first careful run to a plan at the limits: run, learn, raise, joint by joint, until the arm is known.
+
+A run that moved nothing, passed a limit or never settled is a run to learn from like any other.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
+from hil.dry_run.prediction import GUARDED, predict
+from hil.dry_run.waves import designed_plan, roomy_plan
+from hil.errors import ExperimentError, NoSafeTorque
+from hil.estimator.models.parameters import Physics
+from hil.pilot.belief import MOVED_STEPS, Belief, prior_belief
+from hil.pilot.gains import with_stabiliser
+from hil.pilot.steps import Played, Player, Step
+from hil.plan.plan import Plan, scaled
+from hil.runs.run_folder import RunFolder
+
+Array = NDArray[np.float64]
+
+ARMS = 96
+PILOT_SHARES = (0.45, 0.6, 0.75, 0.9)
+"""Of the limits: how far pilots go, one after the other; the last for all that follow."""
+
+MOST_STEPS, MOST_PILOTS = 12, 10
+"""Runs before the full one; of these, until all joints move."""
+
+CERTAIN = 0.85
+"""A typical arm should come this far on its way to a limit; where it stays below, uncertainty costs too much range."""
+
+_PILOT_PERIOD_SHARE = 0.5
+_PILOT_SETTLING = 1
+_AFTER_LIMIT = 0.85
+"""Of the torque under which a limit was passed: the most of what follows."""
+_MOST_RAISE = 1.6
+_AT_LIMIT = 0.99
+_MORE, _LITTLE_MORE, _FAIR = 1.15, 1.03, 0.7
+"""Times the torque of the run before: where one more would add less, it is not made; the first where a typical arm
+comes fairly far on its way to a limit."""
+
+
+@dataclass
+class Search:
+    """What has been done and what is thought; `steps` and `belief` grow from run to run."""
+
+    config: Config
+    run: RunFolder
+    player: Player
+    belief: Belief
+    steps: list[Step] = field(default_factory=list)
+    cap: Array | None = None
+    """Torque (joints,) [N m] that must not be passed, since a limit was."""
+    pose: Array | None = None
+    """Where the arm was at rest last (joints,) [rad]."""
+    swing: Array | None = None
+    """The largest seen of each joint (joints,) [rad]."""
+
+    @classmethod
+    def of(cls, config: Config, run: RunFolder, player: Player) -> "Search":
+        """At the beginning. Raises ConfigError."""
+        return cls(config, run, player, prior_belief(config, ARMS))
+
+    @property
+    def held(self) -> Config:
+        """The configuration, with a stabiliser for the arm as it is thought to be where it needs one."""
+        return with_stabiliser(self.config, self.belief)
+
+    def find(self) -> tuple[Config, Amplitude]:
+        """The configuration and the amplitude of the full run. Raises what a run raises, and ExperimentError when
+        a joint does not move at its current limit.
+        """
+        self._pilot()
+        return self._raise_to_limits()
+
+    def learn(self, config: Config, played: Played) -> None:
+        """Take in what a run of `config` showed."""
+        self.steps.append(played.step)
+        if played.passed_limit:
+            self.cap = _AFTER_LIMIT * played.step.peak_torque
+        if played.seen is None:
+            return
+        self.belief = self.belief.after(config, played.seen)
+        self.pose = played.seen.pose
+        swing = played.seen.swing
+        self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
+
+    @property
+    def moved(self) -> NDArray[np.bool_]:
+        """Which joints moved in any run so far (joints,)."""
+        step = np.array([joint.joint.servo.position_unit for joint in self.config.joints])
+        swing = np.zeros(len(step)) if self.swing is None else self.swing
+        return np.asarray(swing > MOVED_STEPS * step)
+
+    def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
+        """The largest safe one for the arms that could be this one.
+
+        Where none is, that of the last run, which the real arm has shown to be safe, or less if it was not. Raises
+        NoSafeTorque when there was no run yet.
+        """
+        ensemble = self.belief.ensemble(self._farther)
+        try:
+            return largest_amplitude(config, ensemble, share, plan, self.pose, self.cap)
+        except NoSafeTorque:
+            if not self.steps:
+                raise
+        torque = self.steps[-1].peak_torque
+        torque = torque if self.cap is None else np.minimum(torque, self.cap)
+        plan = with_peaks(config, torque) if plan is None else scaled(config, plan, torque)
+        return Amplitude(plan, torque, predict(config, plan, ensemble, pose=self.pose))
+
+    @property
+    def _farther(self) -> float:
+        """How many times farther the limits allow to go than was seen, the joint with most room."""
+        allowed = np.ptp(np.array([joint.position_limit for joint in self.config.joints]), axis=1)
+        swing = np.zeros(len(allowed)) if self.swing is None else self.swing
+        return float((allowed / np.maximum(swing, 0.02)).max())
+
+    def _pilot(self) -> None:
+        """Small runs until every joint moves."""
+        while len(self.steps) < MOST_PILOTS:
+            number = len(self.steps)
+            config = pilot_config(self.held)
+            found = self._pilot_amplitude(config, PILOT_SHARES[min(number, len(PILOT_SHARES) - 1)])
+            self._play(config, f"pilot-{number + 1}", "Pilot" if number == 0 else f"Pilot {number + 1}", found)
+            moved = self.moved
+            if moved.all():
+                return
+            still = [joint.name for joint, moves in zip(self.config.joints, moved, strict=True) if not moves]
+            if (found.peak_torque[~moved] >= _AT_LIMIT * most_torque(config)[~moved]).all():
+                self._give_up(config, still)
+            self.player.say(f"{_and(still)} did not move: friction is larger than that. Once more, with more torque.")
+        moved = self.moved
+        if not moved.all():
+            self._give_up(config, [j.name for j, m in zip(self.config.joints, moved, strict=True) if not m])
+
+    def _pilot_amplitude(self, config: Config, share: float) -> Amplitude:
+        """As safe as ever, and of a joint that has not moved yet not much more than it was given last: just above what
+        friction holds, motion grows fast, and what held says little of what will move.
+        """
+        found = self.amplitude(config, share)
+        if not self.steps:
+            return found
+        most = np.where(self.moved, np.inf, _MOST_RAISE * self.steps[-1].peak_torque)
+        if (found.peak_torque <= most).all():
+            return found
+        plan = scaled(config, found.plan, np.minimum(found.peak_torque, most))
+        torque = plan.segments[0].peak_torque
+        return Amplitude(plan, torque, predict(config, plan, self.belief.ensemble(self._farther), pose=self.pose))
+
+    def _raise_to_limits(self) -> tuple[Config, Amplitude]:
+        """Runs on the way, until the arm is known well enough to go to its limits at once."""
+        config = self.held
+        plan = self._waves(config)
+        found = self.amplitude(config, 1.0, plan)
+        while not self._certain(config, found) and len(self.steps) < MOST_STEPS:
+            self.player.say(
+                "What is known so far is too uncertain to go to the limits at once: one more run on the way."
+            )
+            number = len(self.steps) + 1
+            self._play(step_config(config), f"step-{number}", f"Step {number}", only_first(found))
+            former, config = found.peak_torque, self.held
+            found = self.amplitude(config, 1.0, self._waves(config) if config.stabiliser is not None else plan)
+            if (found.peak_torque <= (_MORE if self._shares(found).min() > _FAIR else _LITTLE_MORE) * former).all():
+                break  # what was learned lets it go no farther
+        return config, found
+
+    def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
+        played_config = with_torque(config, found.peak_torque)
+        played = self.player.play(played_config, self.run.below(folder, played_config), name, found)
+        self.learn(played_config, played)
+
+    def _waves(self, config: Config) -> Plan:
+        arm = Physics.of(self.belief.middle)
+        if config.experiment.design == "optimal":
+            return designed_plan(config, arm, [name for name in self.belief.names if _is_base(name)])
+        return roomy_plan(config, arm)
+
+    def _certain(self, config: Config, found: Amplitude) -> bool:
+        shares = self._shares(found)
+        full = found.peak_torque >= _AT_LIMIT * most_torque(config)
+        capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= _AT_LIMIT * self.cap
+        return bool(((shares >= CERTAIN) | full | capped).all())
+
+    @staticmethod
+    def _shares(found: Amplitude) -> Array:
+        """How far a typical arm comes on its way to a limit (joints,)."""
+        return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
+
+    def _give_up(self, config: Config, still: list[str]) -> None:
+        tried = "; ".join(
+            f"{step.name} {', '.join(f'{torque:.3g}' for torque in step.peak_torque)} N m" for step in self.steps
+        )
+        most = ", ".join(f"{torque:.3g}" for torque in most_torque(config))
+        raise ExperimentError(
+            f"{_and(still)} did not move by {MOVED_STEPS} encoder steps. Tried: {tried}; the current limits allow "
+            f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
+            "look at the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
+        )
+
+
+def pilot_config(config: Config) -> Config:
+    """Half the period where the band allows it, no held-out multisine, no waiting for a steady motion."""
+    experiment = config.experiment
+    update: dict[str, Any] = {"held_out": False, "peak_torque": None, "periods": 1}
+    update["max_settling_periods"] = min(experiment.max_settling_periods, _PILOT_SETTLING)
+    if experiment.band is not None:
+        samples = round(experiment.samples * _PILOT_PERIOD_SHARE)
+        period = samples / experiment.rate
+        low, high = experiment.band
+        update |= {"period": period, "band": [max(low, 1 / period), high]}
+    return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
+
+
+def only_first(found: Amplitude) -> Amplitude:
+    """The same with its first multisine alone."""
+    plan = replace(found.plan.first_segment(), max_settling_periods=_PILOT_SETTLING, periods=1)
+    return Amplitude(plan, found.peak_torque, found.prediction)
+
+
+def with_torque(config: Config, peak_torque: Array) -> Config:
+    """The configuration with this torque (joints,) [N m] in it."""
+    experiment = config.experiment.model_copy(update={"peak_torque": peak_torque.tolist()})
+    return config.model_copy(update={"experiment": experiment})
+
+
+def step_config(config: Config) -> Config:
+    """The configuration without its second multisine, and without waiting for a steady motion."""
+    settling = min(config.experiment.max_settling_periods, _PILOT_SETTLING)
+    update = {"held_out": False, "max_settling_periods": settling, "periods": 1}
+    return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
+
+
+def _is_base(name: str) -> bool:
+    return name.startswith(
+        ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb_1", "coulomb_2", "offset")
+    )
+
+
+def _and(names: list[str]) -> str:
+    return " and ".join(names).capitalize()

@@ -1,0 +1,55 @@
+"""What a run showed of the arm: commands and motion from the first ramp on, whatever ended it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.plan.stabiliser import feedback_torque
+from hil.runs.recording import Phase
+
+Array = NDArray[np.float64]
+
+_FEWEST = 40  # samples from which anything is learned
+
+
+@dataclass(frozen=True)
+class Seen:
+    """command: torque without the stabiliser's (joints, samples) [N m]; position: (joints, samples) [rad], NaN where a
+    reply was missing; pose: where the arm stood before (joints,) [rad].
+    """
+
+    command: Array
+    position: Array
+    pose: Array
+
+    @property
+    def swing(self) -> Array:
+        """From end to end (joints,) [rad]."""
+        swing: Array = np.nanmax(self.position, axis=1) - np.nanmin(self.position, axis=1)
+        return swing
+
+
+def seen_of(config: Config, samples: NDArray[np.void], periods: int = 1) -> Seen | None:
+    """Ramp and first `periods` of what was recorded (hil.runs.recording); None where that is next to nothing."""
+    before = np.nonzero(samples["phase"] == Phase.REST)[0]
+    played = (samples["phase"] == Phase.RAMP_IN) | (samples["phase"] == Phase.PERIODIC)
+    rows = np.nonzero(played & (samples["segment"] == 0) & (samples["period"] < periods))[0]
+    if rows.size < _FEWEST or not before.size:
+        return None
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    command = samples["goal_current"][rows].T * constants[:, None]
+    if config.stabiliser is not None:
+        with_former = samples[rows[0] - 1 : rows[-1] + 1]
+        command = command - np.nan_to_num(feedback_torque(config, with_former)).T
+    position = samples["position"][rows].T.astype(np.float64)
+    pose = _last_finite(samples["position"][before])
+    if not np.isfinite(pose).all() or not np.isfinite(position).any(axis=1).all():
+        return None
+    return Seen(np.ascontiguousarray(command), position, pose)
+
+
+def _last_finite(position: Array) -> Array:
+    """The median of the last samples of each joint (joints,)."""
+    return np.asarray(np.nanmedian(position[-20:], axis=0), dtype=np.float64)

@@ -1,0 +1,120 @@
+"""One run on the way: played, compared with what was foreseen, and told."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.dry_run.amplitude import Amplitude
+from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.experiment.run import run_experiment
+from hil.experiment.stream import Watch
+from hil.pilot.seen import Seen, seen_of
+from hil.results.parts import PlayedStep
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
+
+Array = NDArray[np.float64]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One run on the way: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
+    (quantities, joints), in hil.dry_run.prediction.QUANTITIES. ended: why it ended early, empty where it did not.
+    """
+
+    name: str
+    peak_torque: Array
+    median: Array
+    quantile: Array
+    seen: Array
+    ended: str = ""
+
+    @property
+    def within(self) -> bool:
+        """Whether all seen peaks that have a limit stayed within the predicted 99 %."""
+        low, high, velocity = self.seen[:GUARDED]
+        bounds = self.quantile
+        return bool((low >= bounds[0]).all() and (high <= bounds[1]).all() and (velocity <= bounds[2]).all())
+
+    def __str__(self) -> str:
+        torque = ", ".join(f"{value:.3g}" for value in self.peak_torque)
+        each = "; ".join(
+            f"{QUANTITIES[row]} {_list(self.median[row])} predicted, at most {_list(self.quantile[row])}, "
+            f"{_list(self.seen[row])} {UNITS[row]} seen"
+            for row in range(GUARDED)
+        )
+        return f"{self.name}, peak torque {torque} N m: {each}."
+
+    def played(self) -> PlayedStep:
+        """As the result keeps it."""
+        median, quantile, seen = (tuple(map(tuple, rows.tolist())) for rows in (self.median, self.quantile, self.seen))
+        torque = tuple(self.peak_torque.tolist())
+        return PlayedStep(self.name, torque, median, quantile, seen, self.within, self.ended or None)
+
+
+@dataclass(frozen=True)
+class Played:
+    """torque: the sentence about torque at the end. seen: what there is to learn from, None where that is too little.
+    error: what ended the run early, if anything did; only such as tells of the arm, never of servos, bus or a person.
+    """
+
+    step: Step
+    seen: Seen | None
+    torque: str
+    error: ExperimentError | None
+
+    @property
+    def passed_limit(self) -> bool:
+        """Whether the guard stopped it at a limit of the motion."""
+        return isinstance(self.error, SafetyStop)
+
+
+@dataclass(frozen=True)
+class Player:
+    """Plays runs: where the file is, who watches, who is told."""
+
+    shown_path: Path
+    watch: Watch
+    say: Say
+
+    def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
+        """Run one step, compare, tell.
+
+        Raises what a run raises, but for what tells of the arm alone: a limit passed, no motion, no steady motion.
+        """
+        torque, error = "", None
+        try:
+            torque = run_experiment(config, folder, self.shown_path, self.watch, found.plan)
+        except ExperimentError as stopped:
+            if not tells_of_the_arm(stopped):
+                raise
+            torque, error = " ".join(getattr(stopped, "__notes__", [])), stopped
+        samples = load_samples(folder.samples_path, len(config.joints))
+        peaks = peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
+        prediction = found.prediction
+        step = Step(name, found.peak_torque, prediction.median, prediction.quantile, peaks, str(error or ""))
+        self.say(str(step))
+        if isinstance(error, SafetyStop):
+            self.say(f"{name} ended early: {error}")
+        if not step.within:
+            self.say(
+                f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed."
+            )
+        return Played(step, seen_of(config, samples), torque, error)
+
+
+def tells_of_the_arm(error: ExperimentError) -> bool:
+    """Whether a run that ended so may be followed by another: a limit of its motion, no motion, no steady motion."""
+    if isinstance(error, SafetyStop):
+        return error.cause in (Cause.POSITION, Cause.VELOCITY)
+    return isinstance(error, NotSettled | DidNotMove)
+
+
+def _list(values: Array) -> str:
+    return ", ".join(f"{value:.2f}" for value in values)

@@ -1,0 +1,52 @@
+"""Time without replies, and time without commands: both in seconds, both within what the servos' watchdogs allow."""
+
+from typing import NamedTuple
+
+from hil.config.schema import Config
+
+WATCHDOG_SHARE = 0.8
+"""Of the watchdog's time: nothing is waited for longer than that."""
+
+_FEWEST_MISSING = 2
+"""Replies that must be missing at least: a single lost packet is no fault, however slow the rate."""
+
+_ROUNDING_S = 1e-6
+
+
+class Limit(NamedTuple):
+    """A time [s] and what it comes from, in words."""
+
+    seconds: float
+    said: str
+
+
+def missing_limit(config: Config) -> Limit:
+    """How long a servo may stay without a reply."""
+    safety = config.safety
+    if safety.max_missing is not None:
+        chosen = Limit((safety.max_missing + 1) / config.experiment.rate, f"safety.max_missing = {safety.max_missing}")
+    else:
+        chosen = Limit(safety.missing_time, f"safety.missing_time = {safety.missing_time:g} s")
+    return _bounded(chosen, safety.watchdog)
+
+
+def late_limit(config: Config) -> Limit:
+    """For how long deadlines may be missed."""
+    safety = config.safety
+    if safety.max_late is not None:
+        chosen = Limit((safety.max_late + 0.5) / config.experiment.rate, f"safety.max_late = {safety.max_late}")
+    else:
+        chosen = Limit(safety.late_time, f"safety.late_time = {safety.late_time:g} s")
+    return _bounded(chosen, safety.watchdog)
+
+
+def is_missing_too_long(count: int, seconds: float, limit: Limit) -> bool:
+    """Whether `count` replies in a row, the last one `seconds` ago, are too many."""
+    return count >= _FEWEST_MISSING and seconds >= limit.seconds - _ROUNDING_S
+
+
+def _bounded(chosen: Limit, watchdog: float) -> Limit:
+    most = WATCHDOG_SHARE * watchdog
+    if chosen.seconds <= most:
+        return chosen
+    return Limit(most, f"{WATCHDOG_SHARE:g} of safety.watchdog = {watchdog:g} s")
