@@ -1,5 +1,6 @@
 """The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -111,7 +112,9 @@ class ServoBus:
             joint: Servo(port, joint.id, load_control_table(joint.servo.name), joint.title) for joint in self.joints
         }
         self._exchange: Exchange | None = None
-        self._converter = Converter(self.joints, [NAN] * len(self.joints))
+        self._zeros = [joint.zero_ticks for joint in self.joints]
+        self._units: Sequence[float] = [NAN] * len(self.joints)
+        self._converter = Converter(self.joints, self._units, self._zeros)
         self._without_watchdog: set[Joint] = set()
         self.torque_off_report: TorqueOff | None = None
 
@@ -199,7 +202,8 @@ class ServoBus:
             _prepare_servo(joint, servo)
         supply = [VOLTAGE_UNIT * servo.read("Present Input Voltage") for servo in self._servos.values()]
         units = [joint.drive_unit(voltage) for joint, voltage in zip(self.joints, supply, strict=True)]
-        self._converter = Converter(self.joints, units)
+        self._units = units
+        self._converter = Converter(self.joints, units, self._zeros)
         one_write = self.config.one_write
         fast = self.config.fast_sync_read and self.knows_fast_sync_read()
         exchange = self.make_exchange(fast=fast, one_write=one_write)
@@ -261,7 +265,21 @@ class ServoBus:
 
     def read_positions(self) -> tuple[float, ...]:
         """Every joint's angle [rad], by set-up reads."""
-        return tuple(joint.angle(servo.read("Present Position")) for joint, servo in self._servos.items())
+        return tuple(
+            (servo.read("Present Position") - zero) * joint.position_unit
+            for (joint, servo), zero in zip(self._servos.items(), self._zeros, strict=True)
+        )
+
+    def count_turns_from(self, pose: Sequence[float]) -> None:
+        """Take every angle for the one within half a turn of `pose` [rad]: a servo that boots counts from 0 to a turn.
+
+        After `prepare`, and while the arm stands still.
+        """
+        angles = self.read_positions()
+        for index, (joint, angle, expected) in enumerate(zip(self.joints, angles, pose, strict=True)):
+            turns = round((angle - expected) / math.tau)
+            self._zeros[index] += round(turns * math.tau / joint.position_unit)
+        self._converter = Converter(self.joints, self._units, self._zeros)
 
     def exchange(self, goals: Sequence[float]) -> State:
         """Send goals, one per joint [A, or V under PWM], and read the arm's state.

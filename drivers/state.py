@@ -92,14 +92,19 @@ def status_span(mode: Mode, tables: Sequence[ControlTable], *, whole: bool) -> S
 
 
 class Converter:
-    """Turns replies into States and goals into ticks. drive_units: A or V per tick, with each joint's sign."""
+    """Turns replies into States and goals into ticks. drive_units: A or V per tick, with each joint's sign. zeros:
+    Present Positions where the joints' angles are zero, where these are not the joints' own.
+    """
 
-    def __init__(self, joints: Sequence[Joint], drive_units: Sequence[float]) -> None:
+    def __init__(
+        self, joints: Sequence[Joint], drive_units: Sequence[float], zeros: Sequence[int] | None = None
+    ) -> None:
         self._joints = tuple(joints)
         self._drive_units = tuple(drive_units)
+        zeros = [joint.zero_ticks for joint in joints] if zeros is None else zeros
         self._scales = [
-            (drive, joint.velocity_unit, joint.position_unit, joint.zero_ticks)
-            for joint, drive in zip(joints, drive_units, strict=True)
+            (drive, joint.velocity_unit, joint.position_unit, zero)
+            for joint, drive, zero in zip(joints, drive_units, zeros, strict=True)
         ]
 
     def ticks(self, goals: Sequence[float]) -> list[int]:

@@ -67,6 +67,7 @@ def run_experiment(
         _check_rate(config, bus)
         if has_moved():
             _wait_for_rest(bus)
+        bus.count_turns_from(config.arm.rest_pose)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:

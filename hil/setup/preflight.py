@@ -1,5 +1,6 @@
 """Everything that would stop an experiment, looked at before one, with how to fix it. Torque stays off."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
@@ -271,6 +272,8 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     ticks = servo.read("Present Position")
     angle = joint.angle(ticks)
     rest = config.arm.rest_pose[[each.id for each in config.joints].index(joint.id)]
+    # As the experiment takes it: within half a turn of the rest pose.
+    angle -= math.tau * round((angle - rest) / math.tau)
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
     mend = (
         f"arm.rest_pose says {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "

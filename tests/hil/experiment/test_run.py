@@ -13,6 +13,7 @@ import pytest
 import serial
 
 from hil.config.schema import Config
+from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, NoReply, PortLost, ServoFault, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import ExperimentError, NotSettled, RunFolderError, SafetyStop, StopRequested
 from hil.experiment.run import run_experiment
@@ -77,6 +78,17 @@ def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: P
     first = load_samples(run(config, tmp_path / "a").samples_path, 2)
     second = load_samples(run(config, tmp_path / "b").samples_path, 2)
     assert first.tobytes() == second.tobytes()
+
+
+def test_a_rest_pose_at_the_encoders_wrap_is_found_on_either_side(arm: Arm) -> None:
+    zeros = (("zero_ticks = 3072  ", "zero_ticks = 1024  "), (SERVO_1, SERVO_1.replace("3072", "1024")))
+    for off in (-0.003, 0.003):
+        start = ("start = [-1.5707963, 0.0]", f"start = [{-1.5707963 + off}, 0.0]")
+        config = arm(*zeros, start)
+        with ServoBus.open(config.bus) as bus:
+            bus.count_turns_from(config.arm.rest_pose)
+            for position in (bus.read_positions(), bus.exchange([0.0, 0.0]).position):
+                assert position == pytest.approx([-1.5707963 + off, 0.0], abs=2e-3)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
