@@ -17,7 +17,8 @@ from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
-from hil.plan.plan import Plan, make_plan
+from hil.plan.chain_plan import plan_of
+from hil.plan.plan import Plan
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
@@ -55,7 +56,7 @@ def run_experiment(
     is known of the arm, by default its prior.
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
-    plan = make_plan(config) if plan is None else plan
+    plan = plan_of(config) if plan is None else plan
     fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
@@ -67,7 +68,6 @@ def run_experiment(
         _check_rate(config, bus)
         if has_moved():
             _wait_for_rest(bus)
-        bus.count_turns_from(config.arm.rest_pose)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
@@ -163,11 +163,19 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms on the wire alone at "
             f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
         )
+    slowest = bus.port.latency + wire
+    if slowest <= 1 / rate:
+        return
     file = latency_timer(bus.port.url)
-    if file is not None and bus.port.latency + wire > 1 / rate:
+    if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which leaves "
-            f"{1 / (bus.port.latency + wire):.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+            f"{1 / slowest:.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+        )
+    if bus.port.latency_measured:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: replies lie {bus.port.latency * 1e3:.0f} ms in this adapter, as measured, which "
+            f"leaves {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short latency, such as a U2D2."
         )
 
 
