@@ -260,7 +260,7 @@ class ExperimentConfig(_Table):
 
     @property
     def drift_within(self) -> float:
-        """As settle_within, of a motion that after max_settling_periods only drifts, as friction does in warm grease."""
+        """As settle_within, of a motion that after max_settling_periods only drifts, as while grease warms."""
         return DRIFT * self.settle_within
 
     @property
