@@ -14,7 +14,8 @@ from hil.fakes.bus.hand import Move
 from hil.fakes.bus.supply import Supply
 from hil.fakes.names import arm_names, find_arm
 from hil.fakes.plants.arm import Arm
-from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_plant
+from hil.fakes.plants.chain_arm import ChainArm
+from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_chain, make_plant
 from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
@@ -107,10 +108,12 @@ class FakeArm(BaseModel):
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="from the wire to the host's read, for every byte [us]")
     ] = 0.0
+    adapter_echoes: Annotated[bool, Field(description="whether the adapter hears what the host sends")] = False
     servos: Annotated[
         tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")
     ]
     arm: Annotated[Arm | None, Field(description="links and drives")] = None
+    chain: Annotated[ChainArm | None, Field(description="an arm in space, from a URDF, instead of arm")] = None
     plant: Annotated[
         str | None,
         Field(description='"module:factory" of another mechanism instead of arm; see hil.fakes.plants.plant'),
@@ -127,15 +130,16 @@ class FakeArm(BaseModel):
         ids = [servo.id for servo in self.servos]
         if len(set(ids)) < len(ids):
             raise ValueError(f"servos: IDs {', '.join(map(str, ids))}: each servo on a bus needs an ID of its own")
-        if (self.arm is None) == (self.plant is None):
-            raise ValueError('give either the table arm or plant = "module:factory"')
+        if sum(each is not None for each in (self.arm, self.chain, self.plant)) != 1:
+            raise ValueError('give one of the table arm, the table chain and plant = "module:factory"')
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
             raise ValueError(f"servos: they move the joints {moved}: each joint from 1 on needs a servo")
-        if self.arm is not None and count != len(self.arm.drives):
+        arm = self.arm or self.chain
+        if arm is not None and count != len(arm.drives):
             servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")
-            raise ValueError(f"{servos} for {len(self.arm.drives)} drives of the arm: one servo per drive")
+            raise ValueError(f"{servos} for {len(arm.drives)} drives of the arm: one servo per drive")
         for fault in self.faults:
             if fault.servo is not None and fault.servo not in ids:
                 raise ValueError(f"faults: {fault.kind} of servo {fault.servo}: the IDs are {', '.join(map(str, ids))}")
@@ -157,6 +161,8 @@ class FakeArm(BaseModel):
         """The mechanism, at its start at time 0; raises PlantError."""
         if self.arm is not None:
             return make_plant(self.arm)
+        if self.chain is not None:
+            return make_chain(self.chain)
         name = self.plant or ""
         plant = load_plant(name, self.plant_options)
         count = max(self.joints) + 1
@@ -164,6 +170,23 @@ class FakeArm(BaseModel):
             servos = f"{len(self.servos)} servos" + (f" on {count}" if count != len(self.servos) else "")
             raise PlantError(f'plant = "{name}" has {plant.joints} joints for {servos}')
         return plant
+
+
+def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The same [fake] table with the path of its chain's URDF made absolute: beside the file it is in.
+
+    A copy of that file, as in a run folder, has the URDF right beside it, whatever folder it named.
+    """
+    chain = values.get("chain")
+    if not isinstance(chain, dict) or not isinstance(chain.get("urdf"), str):
+        return values
+    return {**values, "chain": {**chain, "urdf": str(found_beside(folder, chain["urdf"]))}}
+
+
+def found_beside(folder: Path, name: str) -> Path:
+    """The file that a TOML file in `folder` means by this path."""
+    named = folder / name
+    return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 
 
 def load_fake(path: Path | str) -> FakeArm:
@@ -184,7 +207,7 @@ def load_fake(path: Path | str) -> FakeArm:
     if not isinstance(table, dict):
         raise DescriptionError(f"{path}: has no [fake] table, so there is no fake arm to open")
     try:
-        return FakeArm.model_validate(table)
+        return FakeArm.model_validate(beside(table, Path(path).parent))
     except ValidationError as error:
         raise DescriptionError(describe(error, path, FakeArm, "fake")) from error
 
@@ -223,6 +246,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         clock,
         joints=fake.joints,
         adapter_latency_us=fake.adapter_latency_us,
+        adapter_echoes=fake.adapter_echoes,
         supply=fake.supply,
         seed=fake.seed,
     )

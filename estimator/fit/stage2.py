@@ -49,6 +49,16 @@ class Fit:
     """Simulations with derivatives."""
 
 
+@dataclass(frozen=True)
+class Near:
+    """Where a minimum is known to be close: what a similar model found of the same periods."""
+
+    parameters: Mapping[str, float]
+    """By name [SI]; others start from their usual initial guess."""
+    state: Array
+    """Angles and velocities at the first sample of the first period (2, joints) [rad, rad/s]."""
+
+
 def fit_runs(
     periods: Sequence[SettledPeriod],
     model: Model,
@@ -56,6 +66,7 @@ def fit_runs(
     *,
     coarse: bool = False,
     starts: Sequence[Mapping[str, float]] = (),
+    near: Near | None = None,
     options: LikelihoodOptions = DEFAULTS,
 ) -> Fit:
     """The most likely parameters of `model`.
@@ -66,6 +77,7 @@ def fit_runs(
         linear: stage 1's estimate of the same periods.
         coarse: for trying a model: one that leaves much more than the noise is given up before its last digits.
         starts: parameters by name [SI], further initial guesses that come before all others.
+        near: the only initial guess, where a minimum is known to be close.
         options: tolerances and limits.
 
     Returns:
@@ -80,10 +92,24 @@ def fit_runs(
         runs=tuple(run.integrated(options.coarse_integration) for run in fine.runs),
         max_relative_decrease=options.max_relative_decrease_coarse,
     )
+    if near is not None:
+        x = fine.coordinates.coordinates(_near_values(model, linear, near.parameters, options))
+        states[: fine.state_scale.size] = near.state.reshape(-1) / fine.state_scale
+        return _fit(
+            periods, *Search(periods, fine, rough, options, coarse).nearest(np.concatenate((x, states))), options
+        )
     guesses = [np.concatenate((x, states)) for x in _initial_guesses(fine, periods, model, linear, starts, options)]
     search = Search(periods, fine, rough, options, coarse)
     refined, minimum = search.minimum(guesses, _springs(linear, options))
     return _fit(periods, refined, minimum, options)
+
+
+def _near_values(
+    model: Model, linear: LinearEstimate, parameters: Mapping[str, float], options: LikelihoodOptions
+) -> Array:
+    narrow = _standstill_guesses(linear, options)[0]
+    unnamed = dict(zip(model.names, _guess(model, linear, {}, narrow, options).tolist(), strict=True))
+    return np.array([{**unnamed, **parameters}[name] for name in model.names])
 
 
 def _springs(linear: LinearEstimate, options: LikelihoodOptions) -> Array:
@@ -173,8 +199,14 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
     longest = max(period.samples for period in periods)
     window = max(lags, min(correlation.max_lag, int(correlation.min_window_share * longest)))
     samples = int(sum(period.valid.sum() for period in periods))
-    structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
-    covariance = robust_covariance(minimum.at, objective.scatter(x, window), samples, count, structured)
+    structured = sum(
+        float(np.sum(_model_error(each, weight, period)))
+        for each, weight, period in zip(residuals, objective.weights, periods, strict=True)
+    )
+    precision = np.zeros(x.size)
+    precision[:count] = objective.prior.precision
+    scatter = objective.scatter(x, window)
+    covariance = robust_covariance(minimum.at, scatter, samples, count, structured, precision)
     value = objective.coordinates.values(x[:count])
     return Fit(
         value,
@@ -185,3 +217,14 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
         float(lags),
         minimum.iterations,
     )
+
+
+def _model_error(residual: Array, weight: Array, period: SettledPeriod) -> Array:
+    """Part of each joint's weighted sum of squares that is neither white nor noise (joints,).
+
+    Rounding of a slow joint is not white either: what is no more than the noise is not the model's error.
+    """
+    squares = np.sum(residual**2, axis=1)
+    noise = np.sum((weight * period.noise[:, None]) ** 2, axis=1)
+    error: Array = np.minimum(structured_share(residual) * squares, np.maximum(squares - noise, 0.0))
+    return error

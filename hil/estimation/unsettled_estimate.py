@@ -1,5 +1,6 @@
 """Estimates from recordings that hold no settled period: CSV files, and runs that were cut short."""
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hil.config.chain import only_planar
 from hil.config.csv_columns import load_csv_config
 from hil.config.schema import ModelConfig
 from hil.errors import ConfigError
@@ -24,6 +26,8 @@ from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Zeros
 from hil.results.result import ShootingResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
+
+log = logging.getLogger(__name__)
 
 START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
 START_WIDTH = 0.05  # rad/s
@@ -49,6 +53,7 @@ def estimate_csv(paths: Sequence[Path], config_path: Path) -> ShootingResult:
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
     """The result of all samples of a run whose motion never became periodic, or that was stopped before it did."""
     config, facts = run.load_config(), run.load_facts()
+    only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     recording = Recording(
@@ -84,6 +89,9 @@ def _estimate(
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3))
     result = replace(result, warnings=tuple(any_warnings(recordings, estimate)))
+    log.info("%s: %s", shown_path, result.method)
+    for warning in result.warnings:
+        log.warning("%s: %s", shown_path, warning)
     return result if choice is None else replace(result, model_choice=describe_segment_choice(choice))
 
 

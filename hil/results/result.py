@@ -13,6 +13,7 @@ model_choice with friction = "auto": the models tried, the one chosen, what it g
 timing       how the stream kept its ticks, and how long the estimation took
 arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, mode, limits, torque per
              goal [N m/A, or N m/V in pwm mode]
+chain        only of an arm in space: its geometry, and what each base parameter is made of
 truth        only on a fake arm: the base parameters it was built with
 physical     masses, centres and inertias, where [known] says something
 stabiliser   what it gave of the torque, where there was one
@@ -24,9 +25,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from hil.results.display import as_html, as_text
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.parts import (
     ArmFacts,
+    ChainFacts,
     Covariance,
     Fit,
     ModelChoice,
@@ -48,7 +51,7 @@ __all__ = ["SCHEMA", "Result", "SettledResult", "ShootingResult", "result_from_j
 SCHEMA = 1
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Result:
     """What an identification found, whatever it was estimated from. Fields in the order of result.json.
 
@@ -69,6 +72,7 @@ class Result:
     model_choice: ModelChoice | None = None
     timing: Timing
     arm: ArmFacts | None = None
+    chain: ChainFacts | None = None
     truth: Mapping[str, float] | None = None
     physical: Physical | None = None
 
@@ -87,8 +91,25 @@ class Result:
         described: dict[str, Any] = to_json(self)
         return described
 
+    def __repr__(self) -> str:
+        return as_text(self._title, self.quantities, self._sentences)
 
-@dataclass(frozen=True, kw_only=True)
+    def _repr_html_(self) -> str:
+        return as_html(self._title, self.quantities, self.truth or {}, self._sentences)
+
+    @property
+    def _title(self) -> str:
+        trust = "" if self.verdict is None else f", trust it: {self.verdict.trust}"
+        residual = ", ".join(f"{value:.3f}" for value in self.fit.residual_rms_ticks)
+        return f"{self.joints}-joint arm of {self.config}{trust}; residual {residual} encoder steps RMS"
+
+    @property
+    def _sentences(self) -> list[str]:
+        judged = [] if self.verdict is None else list(self.verdict.sentences)
+        return [*judged, *(f"Warning: {warning}" for warning in self.warnings)]
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class SettledResult(Result):
     """From the settled periods of a run."""
 
@@ -101,7 +122,7 @@ class SettledResult(Result):
     steps: tuple[PlayedStep, ...] | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class ShootingResult(Result):
     """From any motion, by multiple shooting: recordings made elsewhere, and runs without a settled period."""
 

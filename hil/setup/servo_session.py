@@ -6,7 +6,7 @@ behind is taken for the servos' own settings, and put back at the end.
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -33,6 +33,10 @@ SETTINGS_NAME = "servo_settings.json"
 """In the run folder: a copy of what was kept."""
 
 
+REBOOT_S = 0.6
+"""A servo that does not answer at the end may be booting: this long until it is asked once more [s]."""
+
+
 def to_stderr(text: str) -> None:
     """Tell the user, who may be reading results from standard output."""
     with suppress(OSError, ValueError):
@@ -46,6 +50,8 @@ class ServoSession:
     bus: ServoBus
     _say: Say
     _kept: dict[Joint, Kept] = field(default_factory=dict)
+    shared: int = 0
+    """How many blocks inside this one have used the bus."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
         """Check who answers and that nobody holds the arm; keep the settings; raises as `ServoBus.open`.
@@ -54,12 +60,14 @@ class ServoSession:
         """
         bus = self.bus
         bus.check_identity()
-        left = {joint: kept for joint in bus.joints if (kept := left_behind(bus.port.url, joint)) is not None}
+        left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
         bus.release_held(ours=left)
         if others := others_on_the_bus(bus):
             self._say(f"Also on this bus, and left alone: {'; '.join(others)}.")
-        for joint, described in zip(bus.joints, config.joints, strict=True):
-            servo = bus.servo(joint)
+        described = {
+            drive: each for joint, each in zip(bus.joints, config.joints, strict=True) for drive in joint.drives
+        }
+        for joint, servo in bus.drives.items():
             settings = read_settings(servo)
             if joint in left:
                 settings = _before(left[joint], settings)
@@ -69,7 +77,8 @@ class ServoSession:
                 )
             changed = {"Operating Mode": int(joint.mode)}
             if joint.mode is Mode.CURRENT:
-                changed["Current Limit"] = current_limit_ticks(joint, described.goal_limit)
+                share = described[joint].goal_limit / len(described[joint].ids)
+                changed["Current Limit"] = current_limit_ticks(joint, share)
             self._keep(joint, settings, changed)
         if folder is not None:
             copies = {str(joint.id): kept.settings for joint, kept in self._kept.items()}
@@ -88,16 +97,28 @@ class ServoSession:
 
     def end(self) -> None:
         """Put back what every servo was set to; each that cannot be is named. Never raises DriverError."""
-        for joint, kept in self._kept.items():
+        failed = self._put_back(self._kept)
+        if failed:
+            clock = self.bus.port.clock
+            clock.wait_until(clock.now() + REBOOT_S)
+            failed = self._put_back(failed)
+        for joint, error in failed.items():
+            self._say(
+                f"{joint.title}: what it was set to could not be put back ({error}) The next hil identify, record, "
+                f"check or setup on this port does it, from {self._kept[joint].path}."
+            )
+
+    def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
+        """Why it did not work, for each of these joints with which it did not."""
+        failed: dict[Joint, DriverError] = {}
+        for joint in joints:
             try:
-                put_back(self.bus.servo(joint), kept.settings)
+                put_back(self.bus.drives[joint], self._kept[joint].settings)
             except DriverError as error:
-                self._say(
-                    f"{joint.title}: what it was set to could not be put back ({error}) The next hil identify, record, "
-                    f"check or setup on this port does it, from {kept.path}."
-                )
+                failed[joint] = error
             else:
-                settings_file.forget(kept)
+                settings_file.forget(self._kept[joint])
+        return failed
 
 
 _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=None)
@@ -113,6 +134,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     outer = _outermost.get()
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
         outer.bus.config = config.bus
+        outer.shared += 1
         outer.bus.prepare()
         yield outer.bus
         return
@@ -128,6 +150,12 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             _outermost.reset(token)
             with signals_held_back():
                 session.end()
+
+
+def has_moved() -> bool:
+    """Whether the arm may hang where an earlier run of the same session has left it, held by friction."""
+    outer = _outermost.get()
+    return outer is not None and outer.shared > 1
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:

@@ -1,0 +1,1 @@
+"""Serial arms of any number of joints in space, from a description of their geometry."""

@@ -1,0 +1,114 @@
+"""What torque and motion of a chain can tell apart: base parameters, and what each of them is made of.
+
+Columns of the regressor of random motions are taken one after the other, from the base outwards and within a link
+first moments, inertias, rotor and mass. A column that those before it can make up says nothing new: its parameter is
+added to theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay short, `moment_x_3 +
+0.124 mass_4`, since a link's mass is felt as a moment of the link before.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.dynamics import TERMS, Columns, regressor
+from hil.estimator.chain.geometry import Chain, parameter_names, unit_of
+
+ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, inertias, armature, mass
+SAMPLES = 150
+INDEPENDENT = 1e-7  # part of a column that the former ones leave of it
+NOTHING = 1e-9
+
+
+@dataclass(frozen=True)
+class BaseParameters:
+    """The base parameters of a chain.
+
+    Each bears the name of the one parameter that it is when all that is grouped with it is zero.
+    """
+
+    chain: Chain
+    columns: Columns
+    """Which of `parameter_names` (base parameters,)."""
+    grouping: Array
+    """Base parameters of all parameters: grouping @ all (base parameters, all)."""
+
+    @classmethod
+    def of(cls, chain: Chain, seed: int = 1) -> "BaseParameters":
+        """Those of this chain."""
+        Y = _random_regressor(chain, seed)
+        norm = np.linalg.norm(Y, axis=0)
+        kept: list[int] = []
+        basis = np.zeros((Y.shape[0], 0))
+        for link in range(chain.joints):
+            for term in ORDER:
+                column = TERMS * link + term
+                if norm[column] < NOTHING * norm.max():
+                    continue
+                left = Y[:, column] / norm[column]
+                for _ in range(2):  # the second pass removes what rounding left of the first
+                    left = left - basis @ (basis.T @ left)
+                size = float(np.linalg.norm(left))
+                if size > INDEPENDENT:
+                    kept.append(column)
+                    basis = np.column_stack((basis, left / size))
+        columns = np.array(sorted(kept))
+        grouping = np.linalg.lstsq(Y[:, columns] / norm[columns], Y, rcond=None)[0] / norm[columns][:, None]
+        grouping[np.abs(grouping) < INDEPENDENT] = 0.0
+        return cls(chain, columns, np.round(grouping, 13))
+
+    @property
+    def count(self) -> int:
+        """How many."""
+        return int(self.columns.size)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Their names."""
+        every = parameter_names(self.chain.joints)
+        return tuple(every[column] for column in self.columns)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of each."""
+        return tuple(map(unit_of, self.names))
+
+    @cached_property
+    def groups(self) -> tuple[str, ...]:
+        """What each is made of, as `moment_x_3 + 0.124 mass_4`."""
+        every = parameter_names(self.chain.joints)
+        return tuple(_sum(name, every, row) for name, row in zip(self.names, self.grouping, strict=True))
+
+    def of_all(self, parameters: Array) -> Array:
+        """Base parameters (base parameters,) of all parameters (11 joints,)."""
+        base: Array = self.grouping @ parameters
+        return base
+
+    def as_all(self, base: Array) -> Array:
+        """All parameters (11 joints,) that move like these base parameters: the others are zero."""
+        every = np.zeros(TERMS * self.chain.joints)
+        every[self.columns] = base
+        return every
+
+    def regressor(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """Y of the base parameters (joints, samples, base parameters); see `dynamics.regressor`."""
+        return regressor(self.chain, position, velocity, acceleration, self.columns)
+
+
+def _random_regressor(chain: Chain, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    shape = chain.joints, SAMPLES
+    position = rng.uniform(-np.pi, np.pi, shape)
+    velocity, acceleration = 3.0 * rng.standard_normal(shape), 10.0 * rng.standard_normal(shape)
+    Y = regressor(chain, position, velocity, acceleration)
+    return Y.reshape(-1, Y.shape[2])
+
+
+def _sum(name: str, every: tuple[str, ...], row: Array) -> str:
+    words = [name]
+    for other, factor in zip(every, row.tolist(), strict=True):
+        if other != name and factor != 0.0:
+            size = "" if abs(abs(factor) - 1.0) < NOTHING else f"{abs(factor):.6g} "
+            words.append(f"{'+' if factor > 0.0 else '-'} {size}{other}")
+    return " ".join(words)

@@ -1,0 +1,114 @@
+"""Unconstrained coordinates of a chain's parameters: positive ones are exponentials, base parameters and offsets plain.
+
+A base parameter is a sum that may have either sign; that the mass matrix stays positive is for the fit to look after.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.estimator.arrays import Array
+
+POSITIVE = {
+    "viscous": 1e-3,
+    "coulomb": 1e-3,
+    "coulomb_width": 0.0,
+    "stribeck_rise": 1e-3,
+    "stribeck_velocity": 1e-3,
+    "load": 1e-4,
+    "torque_scale": 1e-3,
+    "lag": 1e-5,
+}
+"""Kinds of positive parameters and the least that each starts with [its unit]."""
+SMALL = {"offset": 0.01, "zero": 0.02, "delay": 1e-3}
+"""Scales of the others that are no base parameters [their unit]."""
+SHAPES = {
+    "coulomb_width": (0.01, 2.5),
+    "stribeck_rise": (0.3, 1.0),
+    "stribeck_velocity": (0.15, 0.7),
+    "load": (0.03, 1.5),
+}
+"""Shape of friction near standstill: what is likely [its unit] and the standard deviation of its logarithm. A joint
+that is never slow says nothing of it, and without that would let it go anywhere."""
+RESHAPING = 1.0  # of their logarithms, in one step
+LONGEST = 2.0  # of any coordinate, in one step
+NEAREST = 1e-3  # of the floor: what a width always stays above it
+
+
+@dataclass(frozen=True)
+class ChainCoordinates:
+    """The map between parameters and coordinates of about the size of 1."""
+
+    names: tuple[str, ...]
+    scales: Array
+    """Of base parameters, in their place; ignored for others (parameters,)."""
+    width_floor: float
+    """What every Coulomb step's width stays above [rad/s]."""
+
+    def values(self, x: Array) -> Array:
+        """Parameters (parameters,) at the coordinates `x`."""
+        positive = np.exp(np.where(self._positive, x, 0.0)) + self._floors
+        value: Array = np.where(self._positive, positive, x * self._scales)
+        return value
+
+    def coordinates(self, value: Array) -> Array:
+        """Coordinates of `value` (parameters,), moved into the physical range."""
+        above = np.maximum(value - self._floors, np.maximum(self._least, NEAREST * self._floors))
+        x: Array = np.where(self._positive, np.log(np.where(self._positive, above, 1.0)), value / self._scales)
+        return x
+
+    def slopes(self, x: Array) -> Array:
+        """Derivative of each parameter by its coordinate (parameters,)."""
+        slope: Array = np.where(self._positive, self.values(x) - self._floors, self._scales)
+        return slope
+
+    def limit(self, least: Array, most: Array) -> None:
+        """Lower in place what coordinates may change by in one step."""
+        count = len(self.names)
+        bound = np.where([kind in SHAPES for kind in self._kinds], RESHAPING, LONGEST)
+        least[:count], most[:count] = -bound, bound
+
+    def moved(self, x: Array, step: Array) -> Array:
+        """Where `step` leads from `x`, both with coordinates of something else at their end."""
+        y: Array = x + step
+        widths = np.flatnonzero(self._floors)
+        # Far above its floor a width follows its logarithm, near it itself: else it would never arrive.
+        y[widths] = np.maximum(y[widths], np.log(NEAREST * self.width_floor))
+        return y
+
+    @cached_property
+    def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
+        """Indices of the shapes of friction, their likely coordinates and the standard deviations of these."""
+        index = np.array([i for i, kind in enumerate(self._kinds) if kind in SHAPES], dtype=np.int64)
+        pairs = np.array([SHAPES[self._kinds[i]] for i in index]).reshape(-1, 2)
+        return index, np.log(pairs[:, 0]), pairs[:, 1]
+
+    @cached_property
+    def _kinds(self) -> tuple[str, ...]:
+        return tuple(kind_of(name) for name in self.names)
+
+    @cached_property
+    def _positive(self) -> Array:
+        return np.array([kind in POSITIVE for kind in self._kinds])
+
+    @cached_property
+    def _floors(self) -> Array:
+        return np.array([self.width_floor if kind == "coulomb_width" else 0.0 for kind in self._kinds])
+
+    @cached_property
+    def _least(self) -> Array:
+        return np.array([POSITIVE.get(kind, 0.0) for kind in self._kinds])
+
+    @cached_property
+    def _scales(self) -> Array:
+        small: Mapping[str, float] = SMALL
+        return np.array([small.get(kind, scale) for kind, scale in zip(self._kinds, self.scales, strict=True)])
+
+
+def kind_of(name: str) -> str:
+    """A parameter's name without its joint's number."""
+    kind, _, number = name.rpartition("_")
+    return kind if number.isdigit() else name

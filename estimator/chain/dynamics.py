@@ -1,0 +1,141 @@
+"""Rigid-body dynamics of a serial chain for whole motions: arrays in, arrays out."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.geometry import LINK_TERMS, Chain
+from hil.estimator.chain.kernels import accelerate, differentiate, move, place, regress, room
+from hil.estimator.errors import ShapeError
+
+TERMS = len(LINK_TERMS) + 1
+Columns = npt.NDArray[np.int64]
+
+
+def inverse_dynamics(chain: Chain, parameters: Array, position: Array, velocity: Array, acceleration: Array) -> Array:
+    """Joint torques (joints, samples) [N m] of a motion, friction not included.
+
+    `parameters`: in the order of `parameter_names` (11 joints,) [SI]; the motion (joints, samples) [rad, rad/s,
+    rad/s^2]. Raises ShapeError.
+    """
+    link, armature = split(chain, parameters)
+    q, v, a = _motion(chain, position, velocity, acceleration)
+    torque = np.empty_like(q)
+    _inverse(*chain.arrays, link, armature, q, v, a, room(chain.joints), torque)
+    return np.ascontiguousarray(torque.T)
+
+
+def mass_matrix(chain: Chain, parameters: Array, position: Array) -> Array:
+    """Mass matrix (joints, joints) [kg m^2] in one pose (joints,) [rad]."""
+    link, armature = split(chain, parameters)
+    work = room(chain.joints)
+    rotation, translation, axis, _ = chain.arrays
+    place(rotation, translation, axis, np.asarray(position, dtype=np.float64), work[0], work[1])
+    move(link, armature, np.zeros(chain.joints), work)
+    mass: Array = work[4]
+    return mass
+
+
+def torque_derivatives(
+    chain: Chain, parameters: Array, position: Array, velocity: Array, acceleration: Array
+) -> tuple[Array, Array]:
+    """Derivatives of the torques at one instant by angles and by velocities (joints, joints) [N m/rad, N m s/rad]."""
+    link, armature = split(chain, parameters)
+    work = room(chain.joints)
+    rotation, translation, axis, gravity = chain.arrays
+    q, v, a = (np.asarray(each, dtype=np.float64) for each in (position, velocity, acceleration))
+    place(rotation, translation, axis, q, work[0], work[1])
+    move(link, armature, v, work)
+    accelerate(armature, gravity, v, a, work)
+    differentiate(gravity, work)
+    return work[6], work[7]
+
+
+def regressor(
+    chain: Chain, position: Array, velocity: Array, acceleration: Array, columns: Columns | None = None
+) -> Array:
+    """Y of the inertial parameters: torque = Y parameters (joints, samples, parameters).
+
+    Arguments as of `inverse_dynamics`; `columns`: which of `parameter_names`, all unless given.
+    """
+    q, v, a = _motion(chain, position, velocity, acceleration)
+    chosen = np.arange(TERMS * chain.joints) if columns is None else columns
+    Y = np.zeros((q.shape[0], chain.joints, chosen.size + 1))
+    _regressors(*chain.arrays, places(chain.joints, chosen), q, v, a, room(chain.joints), Y)
+    return np.ascontiguousarray(np.swapaxes(Y[:, :, :-1], 0, 1))
+
+
+def places(joints: int, chosen: Columns) -> Columns:
+    """Where each link's parameters stand among the chosen ones (joints, 11); the others behind all of these."""
+    column = np.full(TERMS * joints, chosen.size)
+    column[chosen] = np.arange(chosen.size)
+    return column.reshape(joints, TERMS)
+
+
+def split(chain: Chain, parameters: Array) -> tuple[Array, Array]:
+    """Links (joints, 10) and armatures (joints,) of a vector of all parameters."""
+    if parameters.shape != (TERMS * chain.joints,):
+        raise ShapeError(f"parameters are {parameters.shape}, they must be ({TERMS * chain.joints},)")
+    table = np.asarray(parameters, dtype=np.float64).reshape(chain.joints, TERMS)
+    return np.ascontiguousarray(table[:, :-1]), np.ascontiguousarray(table[:, -1])
+
+
+def _motion(chain: Chain, *motion: Array) -> tuple[Array, ...]:
+    """Samples first, contiguous."""
+    shapes = {each.shape for each in motion}
+    if len(shapes) != 1 or motion[0].ndim != 2 or motion[0].shape[0] != chain.joints:
+        raise ShapeError(
+            f"position, velocity and acceleration are {', '.join(str(each.shape) for each in motion)}: all must be "
+            f"({chain.joints}, samples)"
+        )
+    return tuple(np.ascontiguousarray(each.T, dtype=np.float64) for each in motion)
+
+
+def _inverse_loop(
+    rotation: Any,
+    translation: Any,
+    axis: Any,
+    gravity: Any,
+    link: Any,
+    armature: Any,
+    q: Any,
+    v: Any,
+    a: Any,
+    work: Any,
+    torque: Any,
+) -> None:
+    for k in range(q.shape[0]):
+        place(rotation, translation, axis, q[k], work[0], work[1])
+        move(link, armature, v[k], work)
+        accelerate(armature, gravity, v[k], a[k], work)
+        for i in range(q.shape[1]):
+            torque[k, i] = work[5][i]
+
+
+def _regressor_loop(
+    rotation: Any,
+    translation: Any,
+    axis: Any,
+    gravity: Any,
+    column: Any,
+    q: Any,
+    v: Any,
+    a: Any,
+    work: Any,
+    Y: Any,
+) -> None:
+    n = q.shape[1]
+    link, armature = np.zeros((n, 10)), np.zeros(n)
+    for k in range(q.shape[0]):
+        place(rotation, translation, axis, q[k], work[0], work[1])
+        move(link, armature, v[k], work)
+        accelerate(armature, gravity, v[k], a[k], work)
+        regress(column, a[k], work, Y[k])
+
+
+_inverse: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_inverse_loop)
+_regressors: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_regressor_loop)

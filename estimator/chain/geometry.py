@@ -1,0 +1,77 @@
+"""The geometry of a serial arm: where its joints are. Everything else about it is to be identified."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.errors import ModelError, ShapeError
+
+MOST_JOINTS = 7
+LINK_TERMS = (
+    *("mass", "moment_x", "moment_y", "moment_z"),
+    *("inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz"),
+)
+"""Inertial parameters of a link in its own frame: mass [kg], mass times centre of mass [kg m], inertia about the
+frame's origin [kg m^2]."""
+UNITS = {"mass": "kg", "moment": "kg m", "inertia": "kg m^2", "armature": "kg m^2"}
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Revolute joints one after the other.
+
+    Link i's frame is that of joint i, which turns with it. At angle zero it stands at `translation[i]`, turned by
+    `rotation[i]`, in the frame of the link before, the first in the base's.
+
+    Raises ShapeError for arrays that do not fit together, ModelError for too many joints and for rotations and axes
+    that are none.
+    """
+
+    rotation: Array
+    """(joints, 3, 3)."""
+    translation: Array
+    """(joints, 3) [m]."""
+    axis: Array
+    """Of each joint, in its own frame, of length 1 (joints, 3)."""
+    gravity: Array
+    """In the base's frame (3,) [m/s^2]; (0, 0, -9.81) for a base that stands upright."""
+
+    def __post_init__(self) -> None:
+        joints = len(self.axis)
+        shapes = self.rotation.shape, self.translation.shape, self.axis.shape, self.gravity.shape
+        if shapes != ((joints, 3, 3), (joints, 3), (joints, 3), (3,)):
+            raise ShapeError(
+                f"rotation, translation, axis and gravity are {', '.join(map(str, shapes))}: they must be "
+                "(joints, 3, 3), (joints, 3), (joints, 3) and (3,)"
+            )
+        if not 1 <= joints <= MOST_JOINTS:
+            raise ModelError(f"a chain of {joints} joints: one to {MOST_JOINTS} can be identified")
+        if np.abs(np.linalg.norm(self.axis, axis=1) - 1.0).max() > 1e-6:
+            raise ModelError("the joints' axes must have length 1")
+        turned = self.rotation @ np.swapaxes(self.rotation, 1, 2)
+        if np.abs(turned - np.eye(3)).max() > 1e-6 or np.any(np.linalg.det(self.rotation) < 0.0):
+            raise ModelError("rotation must hold proper rotation matrices")
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.axis)
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Rotation, translation, axis and gravity as the compiled code takes them."""
+        given = self.rotation, self.translation, self.axis, self.gravity
+        rotation, translation, axis, gravity = (np.ascontiguousarray(each, dtype=np.float64) for each in given)
+        return rotation, translation, axis, gravity
+
+
+def parameter_names(joints: int) -> tuple[str, ...]:
+    """Names of all inertial parameters: link by link the terms of LINK_TERMS, and `armature`, the rotor's inertia times
+    gear ratio squared."""
+    return tuple(f"{term}_{joint + 1}" for joint in range(joints) for term in (*LINK_TERMS, "armature"))
+
+
+def unit_of(name: str) -> str:
+    """Unit of the parameter of this name."""
+    return UNITS[name.partition("_")[0]]

@@ -1,0 +1,102 @@
+"""The chain estimator's front door: settled periods in, parameters with standard errors out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
+from hil.estimator.chain.model import ChainModel
+from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.stage1 import fit_lines
+from hil.estimator.chain.stage2 import fit_periods
+from hil.estimator.data.settled_period import SettledPeriod, without_spikes
+from hil.estimator.errors import ModelError
+
+BELIEVED = 0.5  # of the prior's standard deviation: what data leave wider than that comes from the prior
+
+
+@dataclass(frozen=True)
+class ChainEstimate:
+    """What settled periods say of a spatial arm; members as of `hil.estimator.identify.Estimate`."""
+
+    model: ChainModel
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    value: Array
+    """(parameters,) [SI]."""
+    covariance: Array
+    """(parameters, parameters), robust against correlated errors."""
+    linear_value: Array
+    """Stage 1's, in the order of `ChainModel.linear_names`."""
+    start: Array
+    """Angles and velocities at the first sample (2, joints)."""
+    position: Array
+    """As foreseen from the past samples (joints, samples) [rad]."""
+    residual: Array
+    """Measured minus foreseen position (joints, samples) [rad]; NaN where a sample is missing."""
+    position_step: Array
+    """The encoders' steps (joints,) [rad]."""
+    iterations: int
+    outliers: int
+    white_std: Array
+    correlation_time: float
+    softness: float
+    """Natural frequency of the observer that the simulation was drawn to the measurements by [Hz]."""
+    from_prior: tuple[str, ...]
+    """Base parameters of which the data say little: their values are the description's."""
+
+    @property
+    def std(self) -> Array:
+        """Standard errors (parameters,)."""
+        std: Array = np.sqrt(np.diag(self.covariance))
+        return std
+
+    @property
+    def residual_steps(self) -> Array:
+        """RMS of the residual in encoder steps (joints,); rounding alone leaves 0.2887."""
+        rms: Array = np.sqrt(np.nanmean(self.residual**2, axis=1)) / self.position_step
+        return rms
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values by name [SI]."""
+        return dict(zip(self.names, self.value.tolist(), strict=True))
+
+
+@one_blas_thread
+def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate:
+    """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
+
+    `prior` decides what the data leave open, and `ChainEstimate.from_prior` names it. Raises ModelError when `model`
+    has another number of joints than a period, ConvergenceError.
+    """
+    given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
+    for period in given:
+        if model.joints != period.joints:
+            raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
+    used = [without_spikes(period) for period in given]
+    linear = fit_lines(used, model, prior)
+    fit = fit_periods(used, model, linear, prior)
+    spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
+    count = model.base.count
+    wide = np.sqrt(np.diag(fit.covariance))[:count] > BELIEVED * prior.std
+    return ChainEstimate(
+        model,
+        model.names,
+        model.units,
+        fit.value,
+        fit.covariance,
+        linear.value,
+        fit.starts[0],
+        fit.positions[0],
+        np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
+        used[0].position_step,
+        fit.iterations,
+        fit.outliers + spikes,
+        np.sqrt(np.diag(fit.white_covariance)),
+        fit.correlation_time,
+        fit.softness,
+        tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
+    )

@@ -1,0 +1,82 @@
+"""Which friction and drive the likelihood fits to a chain, and the names of all parameters."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.errors import ModelError
+
+Friction = Literal["coulomb", "stribeck", "stribeck_load"]
+Drive = Literal["delay", "lag", "delay_lag"]
+
+LINEAR = {"viscous": "N m s/rad", "coulomb": "N m", "offset": "N m"}
+FRICTION: dict[str, dict[str, str]] = {
+    "coulomb": {"coulomb_width": "rad/s"},
+    "stribeck": {"coulomb_width": "rad/s", "stribeck_rise": "1", "stribeck_velocity": "rad/s"},
+    "stribeck_load": {"coulomb_width": "rad/s", "stribeck_rise": "1", "stribeck_velocity": "rad/s", "load": "1"},
+}
+DRIVE = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
+
+
+@dataclass(frozen=True)
+class ChainModel:
+    """The chain's equations with these terms, which are those of `hil.estimator.models.model.Model`.
+
+    `zeros`: errors of the encoders' zeros, of all joints but the first, which shows under gravity only;
+    `torque_scale`: of all joints but the first, whose torque constant is believed. Raises ModelError.
+    """
+
+    base: BaseParameters
+    friction: Friction = "stribeck"
+    drive: Drive = "lag"
+    zeros: bool = False
+    torque_scale: bool = False
+
+    def __post_init__(self) -> None:
+        if self.friction not in FRICTION:
+            raise ModelError(f"friction model {self.friction!r}: a chain has {', '.join(FRICTION)}")
+        if self.drive not in DRIVE:
+            raise ModelError(f"drive model {self.drive!r}: choose one of {', '.join(DRIVE)}")
+        if self.torque_scale and self.joints == 1:
+            raise ModelError("torque_scale compares joints' torque constants: it needs two joints")
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self.base.chain.joints
+
+    @property
+    def linear_names(self) -> tuple[str, ...]:
+        """What a regression finds: base parameters, viscous and Coulomb friction, offsets."""
+        return (*self.base.names, *(f"{term}_{joint}" for term in LINEAR for joint in self._numbers))
+
+    @property
+    def _terms(self) -> list[tuple[str, str]]:
+        """Names and units of what comes after `linear_names`."""
+        terms = [(f"{term}_{joint}", unit) for term, unit in FRICTION[self.friction].items() for joint in self._numbers]
+        if self.zeros:
+            terms += [(f"zero_{joint}", "rad") for joint in self._numbers[1:]]
+        if self.torque_scale:
+            terms += [(f"torque_scale_{joint}", "1") for joint in self._numbers[1:]]
+        return terms + [(name, "s") for name in DRIVE[self.drive]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All parameters."""
+        return (*self.linear_names, *(name for name, _ in self._terms))
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of `names`."""
+        linear = (unit for unit in LINEAR.values() for _ in self._numbers)
+        return (*self.base.units, *linear, *(unit for _, unit in self._terms))
+
+    @property
+    def description(self) -> str:
+        """In words, for a person."""
+        words = {"zeros": self.zeros, "torque scales": self.torque_scale}
+        return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
+
+    @property
+    def _numbers(self) -> range:
+        return range(1, self.joints + 1)

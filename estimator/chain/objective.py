@@ -1,0 +1,174 @@
+"""What stage 2 minimises for a chain: squares of measured minus foreseen positions, and of base parameters minus prior.
+
+The simulation is drawn to the measured angles by an observer, so that it stays with an arm that falls without feedback:
+each position is foreseen from the past measurements and the model (the prediction error method; Ljung, System
+Identification, 2nd ed. 1999, chapter 7). Its gains are the estimator's own, whatever feedback the robot had. Stiff, it
+stays with any motion and says little; soft, it says nearly all that a free simulation would.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.coordinates import LONGEST, ChainCoordinates
+from hil.estimator.chain.model import ChainModel
+from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.simulation import ChainRun, Simulation, pieces
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.covariance import Scatter
+from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise
+from hil.estimator.fit.normal_equations import normal_equations
+from hil.estimator.simulation.drive import torque_and_slopes
+
+
+@dataclass(frozen=True)
+class ChainProblem:
+    """Residuals of several periods under one model, by coordinates: the parameters', then each period's first state."""
+
+    periods: tuple[SettledPeriod, ...]
+    model: ChainModel
+    coordinates: ChainCoordinates
+    prior: Prior
+    state_scale: Array
+    """Of the state at the first sample (2 joints,) [rad, rad/s]."""
+    weights: tuple[Array, ...]
+    """Inverse standard deviation of each sample (samples, joints) [1/rad], 0 for a missing one, period by period."""
+    steps: int
+    """Integration steps in a sample."""
+    softness: float
+    """Natural frequency of the observer [Hz]."""
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return len(self.coordinates.names)
+
+    def parameters(self, x: Array) -> dict[str, float]:
+        """By name [SI]."""
+        return dict(zip(self.coordinates.names, self.coordinates.values(x[: self.count]).tolist(), strict=True))
+
+    def start(self, x: Array, period: int) -> Array:
+        """The state at the first sample of a period (2, joints)."""
+        size = self.state_scale.size
+        first = self.count + period * size
+        return (x[first : first + size] * self.state_scale).reshape(2, -1)
+
+    def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
+        """What the simulation takes, with this delay and lag."""
+        delay, lag = parameters.get("delay", 0.0), parameters.get("lag", 0.0)
+        torque, slopes = torque_and_slopes(
+            period.torque, period.rate, period.command_to_sample, self.steps, delay=delay, lag=lag
+        )
+        return ChainRun(
+            np.ascontiguousarray(np.moveaxis(torque, 0, 2)),
+            np.ascontiguousarray(np.transpose(slopes, (2, 3, 0, 1))),
+            np.ascontiguousarray(period.position.T),
+            1.0 / (period.rate * self.steps),
+        )
+
+    def gain(self, period: SettledPeriod) -> Array:
+        """Of the observer, critically damped (2, joints) [1, 1/s] per sample."""
+        turn = 2.0 * np.pi * self.softness
+        gains = np.array([2.0 * turn, turn * turn]) / period.rate
+        return np.repeat(gains[:, None], period.joints, axis=1)
+
+    def evaluate(self, x: Array) -> Quadratic:
+        """The sum of squares at `x` with its normal equations."""
+        parameters = self.parameters(x)
+        normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
+        if not all(map(np.isfinite, parameters.values())):
+            return Quadratic(np.inf, normal, gradient)
+        cost = self._add_prior(x, normal, gradient)
+        for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):
+            where, slopes = self._where(x, index)
+            J_J, J_r = np.zeros((slopes.size, slopes.size)), np.zeros(slopes.size)
+            for part, r, J in self._pieces(x, index, period, parameters):
+                if r is None:
+                    return Quadratic(np.inf, normal, gradient)
+                square = np.square(weight[part]).reshape(-1)
+                found = normal_equations(J.reshape(-1, slopes.size), r.reshape(-1), square)
+                J_J, J_r = J_J + found[0], J_r + found[1]
+                cost += float(square @ r.reshape(-1) ** 2)
+            normal[np.ix_(where, where)] += J_J * np.outer(slopes, slopes)
+            gradient[where] += J_r * slopes
+        if not (np.isfinite(cost) and np.all(np.isfinite(normal))):
+            return Quadratic(np.inf, np.zeros_like(normal), np.zeros_like(gradient))
+        return Quadratic(cost, normal, gradient)
+
+    def minimise(self, x: Array, ftol: float, damping: float | None = None) -> Minimum:
+        """Minimise the sum of squares from `x`, until it falls by less than `ftol` of it."""
+
+        def limits(point: Array) -> tuple[Array, Array]:
+            least, most = np.full(point.size, -LONGEST), np.full(point.size, LONGEST)
+            self.coordinates.limit(least, most)
+            return least, most
+
+        return minimise(self.evaluate, x, ftol, damping, move=self.coordinates.moved, limits=limits)
+
+    def positions(self, x: Array) -> tuple[Array, ...] | None:
+        """Foreseen positions of each period (joints, samples) [rad]; None where a motion runs away."""
+        parameters = self.parameters(x)
+        found = []
+        for index, period in enumerate(self.periods):
+            run = self.run_of(period, parameters)
+            simulation = Simulation(self.model.base, parameters, self.start(x, index), self.gain(period))
+            position, _ = simulation.go_on(run, slice(0, period.samples))
+            if position is None:
+                return None
+            found.append(position.T)
+        return tuple(found)
+
+    def scatter(self, x: Array, lags: int) -> Array:
+        """Sum of products of the scores, in coordinates; see `hil.estimator.fit.covariance`."""
+        total = np.zeros((x.size, x.size))
+        parameters = self.parameters(x)
+        for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):
+            where, slopes = self._where(x, index)
+            scatter = Scatter(slopes.size, lags)
+            for part, r, J in self._pieces(x, index, period, parameters):
+                assert r is not None  # the minimum's motion is finite
+                scatter.add(np.einsum("sj,sjc->sc", weight[part] ** 2 * r, J))
+            total[np.ix_(where, where)] += scatter.sum() * np.outer(slopes, slopes)
+        return total
+
+    def softer(self, softness: float) -> "ChainProblem":
+        """The same with another observer."""
+        return replace(self, softness=softness)
+
+    def _pieces(
+        self, x: Array, index: int, period: SettledPeriod, parameters: dict[str, float]
+    ) -> Iterator[tuple[slice, Array | None, Array]]:
+        """Piece after piece of a period: which samples, foreseen minus measured (samples, joints), 0 where missing,
+        None where the motion runs away, and derivatives by parameters and first state."""
+        run = self.run_of(period, parameters)
+        names = self.coordinates.names
+        simulation = Simulation(self.model.base, parameters, self.start(x, index), self.gain(period), names)
+        for part in pieces(period.samples):
+            position, derivative = simulation.go_on(run, part)
+            if position is None:
+                yield part, None, derivative
+                return
+            yield part, np.where(period.valid.T[part], position - run.measured[part], 0.0), derivative
+
+    def _where(self, x: Array, index: int) -> tuple[list[int], Array]:
+        """Which coordinates a period's motion depends on, and the slopes of parameters and state by them."""
+        size = self.state_scale.size
+        first = self.count + index * size
+        where = [*range(self.count), *range(first, first + size)]
+        return where, np.concatenate((self.coordinates.slopes(x[: self.count]), self.state_scale))
+
+    def _add_prior(self, x: Array, normal: Array, gradient: Array) -> float:
+        """Add the prior's part in place; its sum of squares."""
+        base, count = self.model.base.count, self.count
+        value, slope = self.coordinates.values(x[:count]), self.coordinates.slopes(x[:count])
+        at = np.arange(base)
+        miss, by = (value[:base] - self.prior.value) / self.prior.std, slope[:base] / self.prior.std
+        normal[at, at] += by * by
+        gradient[at] += by * miss
+        shapes, likely, spread = self.coordinates.likely_shapes
+        away = (x[shapes] - likely) / spread
+        normal[shapes, shapes] += 1.0 / spread**2
+        gradient[shapes] += away / spread
+        return float(miss @ miss) + float(away @ away)

@@ -1,0 +1,68 @@
+"""The motion that given parameters foretell, no measurement entering: the arm under its own feedback."""
+
+import math
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.model import ChainModel
+from hil.estimator.chain.simulation import ChainRun, Simulation
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import PeriodicityError
+from hil.estimator.simulation.arm import steps_per_sample
+from hil.estimator.simulation.closed_loop import Feedback
+
+PERIODS = 3  # simulated; the last is taken
+NEVER = 1e6  # N m
+
+
+def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeriod) -> Array:
+    """Angles (joints, samples) [rad] of this settled period: started where it starts, at rest, simulated until the
+    start is forgotten, under its commands and its feedback.
+
+    Raises PeriodicityError where the motion runs away.
+    """
+    joints, samples = period.joints, period.samples
+    excitation, feedback = _commands(period)
+    steps = steps_per_sample(period.rate)
+    step = 1.0 / (period.rate * steps)
+    # Commands take effect `command_to_sample` before the sample of the same index, and `delay` later: so much less lag.
+    lag = max(parameters.get("lag", 0.0) + parameters.get("delay", 0.0) - period.command_to_sample, 1e-5)
+    fallen = 1.0 - math.exp(-step / lag)
+    share = fallen * lag / step
+    start = np.stack((period.filled()[:, 0], np.zeros(joints)))
+    simulation = Simulation(model.base, parameters, start, np.zeros((2, joints)))
+    missing, slopes = np.full((1, joints), np.nan), np.zeros((1, steps, 2, joints))
+    torque = np.empty((1, steps, joints))
+    former = start.copy()
+    motor = np.clip(excitation[:, -1], -feedback.limit, feedback.limit)
+    positions = np.empty((joints, samples))
+    for k in range(PERIODS * samples):
+        wanted = excitation[:, k % samples] + feedback.stiffness * (feedback.pose - former[0])
+        command = np.clip(wanted - feedback.damping * former[1], -feedback.limit, feedback.limit)
+        former = simulation.state.copy()
+        for s in range(steps):
+            torque[0, s] = command + (motor - command) * share
+            motor = motor + (command - motor) * fallen
+        position, _ = simulation.go_on(ChainRun(torque, slopes, missing, step), slice(0, 1))
+        if position is None:
+            raise PeriodicityError("under these parameters the simulated arm runs away from the motion")
+        positions[:, k % samples] = position[0]
+    return positions
+
+
+def _commands(period: SettledPeriod) -> tuple[Array, Feedback]:
+    """Commanded torque without the feedback's part (joints, samples) [N m], and the feedback."""
+    if period.stabiliser is None:
+        feedback = Feedback.none(period.joints)
+        return period.torque, Feedback(
+            feedback.stiffness, feedback.damping, feedback.pose, np.full(period.joints, NEVER)
+        )
+    return period.stabiliser.excitation, period.stabiliser.feedback
+
+
+def relative_error(period: SettledPeriod, predicted: Array) -> Array:
+    """RMS of measured minus predicted position over the RMS of the motion (joints,)."""
+    error = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1))
+    moved: Array = error / period.filled().std(axis=1)
+    return moved

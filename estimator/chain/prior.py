@@ -1,0 +1,37 @@
+"""What a description of the arm says of its base parameters: a weak prior, for what the data say nothing about."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.dynamics import TERMS
+
+SPREAD = 1.0  # of every described parameter: no description is better than its mass, and many are copied
+LEAST_OFFSET = 0.02  # m: a centre of mass may be this far from where the description has it
+LEAST_GYRATION = 0.05  # m
+ARMATURE = 0.02  # kg m^2: standard deviation of a rotor's inertia that nobody knows
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Base parameters that are likely before any data."""
+
+    value: Array
+    """(base parameters,) [SI]."""
+    std: Array
+    """(base parameters,)."""
+
+    @classmethod
+    def of(cls, base: BaseParameters, links: Array, armature: Array | None = None) -> "Prior":
+        """From the links' described parameters (joints, 10) and, where they are known, armatures (joints,)."""
+        joints = base.chain.joints
+        rotor = np.full(joints, 0.5 * ARMATURE) if armature is None else armature
+        every = np.column_stack((links, rotor)).reshape(-1)
+        mass = np.maximum(links[:, 0], 1e-3)[:, None]
+        least = mass * np.array([0.0, *(LEAST_OFFSET,) * 3, *(LEAST_GYRATION**2,) * 6])
+        spread = np.column_stack((np.maximum(SPREAD * np.abs(links), least), np.maximum(rotor, ARMATURE)))
+        std = np.sqrt(base.grouping**2 @ spread.reshape(-1) ** 2)
+        assert spread.shape == (joints, TERMS)
+        return cls(base.of_all(every), std)

@@ -1,0 +1,55 @@
+"""Filtered inverse dynamics for chains: linear least squares on any recording, the classic of the field.
+
+Positions and torques are filtered alike, differentiated, and put into the regressor (Gautier, Janot, Vandanjon, IEEE
+Transactions on Control Systems Technology 21 (2013) 428). It needs no simulation, so it is also the way for a torque
+that was measured and not commanded; where the position is quantised it is biased, and far less exact than stage 2.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from hil.estimator.arrays import Array
+from hil.estimator.baselines.idim import ORDER, PER_CYCLE, TRIM, uniform
+from hil.estimator.chain.model import ChainModel
+from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.stage1 import PASSES, columns_of, solve
+from hil.estimator.data.fourier import PeriodicMotion
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import RecordingError
+
+
+def fit_filtered(
+    recordings: Sequence[Recording], model: ChainModel, prior: Prior, cutoff: float, delay: float = 0.0
+) -> tuple[Array, Array]:
+    """Values and standard errors, if the residual were white, of `ChainModel.linear_names` [SI].
+
+    `cutoff` [Hz] of the filter, `delay` [s] of the torque. Raises RecordingError for what cannot be filtered so.
+    """
+    rows = [_rows(recording, model, cutoff, delay) for recording in recordings]
+    Y = np.concatenate([columns for columns, _ in rows], axis=1)
+    tau = np.concatenate([torque for _, torque in rows], axis=1)
+    left = np.maximum(np.sqrt(np.mean(tau**2, axis=1)), 1e-9)
+    for _ in range(PASSES):
+        theta, std = solve(Y, tau, 1.0 / left, prior)
+        left = np.maximum(np.sqrt(np.mean((tau - Y @ theta) ** 2, axis=1)), 1e-9)
+    return theta, std
+
+
+def _rows(recording: Recording, model: ChainModel, cutoff: float, delay: float) -> tuple[Array, Array]:
+    position, torque, dt = uniform(recording, delay)
+    trim = int(np.ceil(TRIM / (cutoff * dt)))
+    keep = max(1, int(1.0 / (PER_CYCLE * cutoff * dt)))
+    if cutoff >= 0.45 / dt or position.shape[1] < 3 * trim:
+        raise RecordingError(
+            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {cutoff:g} Hz: record longer "
+            "or faster"
+        )
+    sos = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
+    smooth = sosfiltfilt(sos, position, axis=1)
+    velocity = np.gradient(smooth, dt, axis=1)
+    motion = PeriodicMotion(smooth, velocity, np.gradient(velocity, dt, axis=1))
+    Y = sosfiltfilt(sos, columns_of(model, motion), axis=1)
+    tau = sosfiltfilt(sos, torque, axis=1)
+    return Y[:, trim:-trim:keep], tau[:, trim:-trim:keep]

@@ -1,0 +1,101 @@
+"""The motion of a chain and how it changes with every parameter: what the likelihood asks for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.dynamics import places, split
+from hil.estimator.chain.kernels import room
+from hil.estimator.chain.stepping import JOINT_TERMS, run
+
+ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
+"""What stands for a term that a model lacks; zero for the others."""
+AT_ONCE = 8
+
+
+@dataclass(frozen=True)
+class ChainRun:
+    """What a simulation takes from a recording: one sample after another, each with its steps."""
+
+    torque: Array
+    """Mean motor torque over each step after each sample, without the scale (samples, steps, joints) [N m]."""
+    slopes: Array
+    """Its derivatives by delay and by lag (samples, steps, 2, joints) [N m/s]."""
+    measured: Array
+    """Angles (samples, joints) [rad]; NaN where a sample is missing."""
+    step: float
+    """Length of a step [s]."""
+
+
+PIECE = 256  # samples whose derivatives stay in the processor's cache
+
+
+class Simulation:
+    """A simulation that goes on piece by piece, with derivatives by the parameters `names` and then by the angles and
+    velocities at the first sample, unless there are no names.
+
+    `parameters` by name [SI]; `start` (2, joints) [rad, rad/s] at the first sample; `gain` (2, joints): of the
+    observer, per sample [1, 1/s].
+    """
+
+    def __init__(
+        self,
+        base: BaseParameters,
+        parameters: Mapping[str, float],
+        start: Array,
+        gain: Array,
+        names: tuple[str, ...] = (),
+    ) -> None:
+        n = base.chain.joints
+        self._causes = len(names) + 2 * n if names else 0
+        width = AT_ONCE * -(-self._causes // AT_ONCE)
+        at = {name: index for index, name in enumerate(names)}
+        self._arm = (
+            base.chain.arrays,
+            split(base.chain, base.as_all(np.array([parameters[name] for name in base.names]))),
+            np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
+            np.array(start, dtype=np.float64, order="C"),
+        )
+        # What nobody asks for is written behind all columns.
+        where = np.array([at.get(name, width) for name in base.names] + [width])
+        self._columns = (
+            where[places(n, base.columns)],
+            np.array([[at.get(f"{term}_{joint + 1}", width) for joint in range(n)] for term in JOINT_TERMS]),
+            np.array([at.get("delay", width), at.get("lag", width)]),
+        )
+        self._gain = np.ascontiguousarray(gain, dtype=np.float64)
+        zq, zv = np.zeros((n, width)), np.zeros((n, width))
+        if names:
+            zq[np.arange(n), len(names) + np.arange(n)] = 1.0
+            zv[np.arange(n), len(names) + n + np.arange(n)] = 1.0
+        solve = (np.zeros((2, n)), *np.zeros((3, n, n)), *np.zeros((3, n)))
+        self._room = (
+            *(room(n), solve, tuple(np.zeros((6, n))), np.zeros(n), zq, zv),
+            *(*np.zeros((3, n, width)), np.zeros((n, width + 1)), np.zeros((3, n, n))),
+        )
+
+    @property
+    def state(self) -> Array:
+        """Angles and velocities at the next sample (2, joints) [rad, rad/s]; before the observer looks at it."""
+        state: Array = self._arm[3]
+        return state
+
+    def go_on(self, run_: ChainRun, piece: slice) -> tuple[Array | None, Array]:
+        """Angles (samples, joints) [rad] of the next `piece` of the samples, None where the motion runs away, and their
+        derivatives (samples, joints, causes)."""
+        torque, measured = run_.torque[piece], run_.measured[piece]
+        position = np.empty(measured.shape)
+        derivative = np.empty((*measured.shape, self._causes))
+        stayed = run(
+            *(*self._arm, torque, run_.slopes[piece], measured),
+            *(self._gain, run_.step, self._columns, self._room, position, derivative),
+        )
+        return (position if stayed and np.all(np.isfinite(position)) else None), derivative
+
+
+def pieces(samples: int) -> list[slice]:
+    """Consecutive pieces of so many samples."""
+    return [slice(first, min(first + PIECE, samples)) for first in range(0, samples, PIECE)]

@@ -1,0 +1,96 @@
+"""Stage 1 for chains: linear least squares on the Fourier lines of settled periods, with a weak prior.
+
+As `hil.estimator.fit.stage1`, with the chain's regressor. Where the motion says nothing of a base parameter, the prior
+decides.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.model import ChainModel
+from hil.estimator.chain.prior import Prior
+from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
+from hil.estimator.data.settled_period import SettledPeriod
+
+COULOMB_WIDTH = 0.05  # rad/s: about the velocity that the dropped lines leave in a sticking joint
+PASSES = 3
+
+
+@dataclass(frozen=True)
+class ChainLinear:
+    """What the regression found."""
+
+    value: Array
+    """In the order of `ChainModel.linear_names` [SI]."""
+    std: Array
+    """Standard errors if the residual were white."""
+    delay: float
+    """Of the motors' torque [s]."""
+    motions: tuple[PeriodicMotion, ...]
+    """Each period's motion from its lines."""
+    relative_residual: Array
+    """RMS of the torque left over that of the torque (joints,)."""
+
+
+def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainLinear:
+    """Estimate what torque is linear in from settled periods."""
+    lines = [lines_of(period.filled()) for period in periods]
+    highest = list(map(cut_off, lines))
+    motions = tuple(
+        motion_of(line, most, period.fundamental, period.samples)
+        for line, most, period in zip(lines, highest, periods, strict=True)
+    )
+    equations = [_equations(*each, model) for each in zip(periods, motions, highest, strict=True)]
+    A = np.concatenate([columns for columns, _ in equations], axis=1)
+    torque = np.concatenate([goal for _, goal in equations], axis=1)
+    level = np.sqrt(np.mean(np.abs(torque) ** 2, axis=1))
+    left = np.maximum(level, 1e-12)
+    for _ in range(PASSES):
+        theta, std = solve(A, torque, 1.0 / left, prior)
+        left = np.maximum(np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1)), 1e-6 * level)
+    return ChainLinear(theta[:-1], std[:-1], float(theta[-1]), motions, left / np.maximum(level, 1e-12))
+
+
+def columns_of(model: ChainModel, motion: PeriodicMotion) -> Array:
+    """The regressor of `ChainModel.linear_names` (joints, samples, names)."""
+    rigid = model.base.regressor(motion.position, motion.velocity, motion.acceleration)
+    joints, samples, count = rigid.shape
+    Y = np.zeros((joints, samples, count + 3 * joints))
+    Y[:, :, :count] = rigid
+    for joint in range(joints):
+        Y[joint, :, count + joint] = motion.velocity[joint]
+        Y[joint, :, count + joints + joint] = np.tanh(motion.velocity[joint] / COULOMB_WIDTH)
+        Y[joint, :, count + 2 * joints + joint] = 1.0
+    return Y
+
+
+def solve(columns: Array | Lines, torque: Array | Lines, weight: Array, prior: Prior) -> tuple[Array, Array]:
+    """Weighted least squares of `torque` (joints, rows) on `columns` (joints, rows, unknowns), the first of which are
+    base parameters with a `prior`; `weight` (joints,): inverse standard deviation of a row [1/(N m)]."""
+    weighted = (columns * weight[:, None, None]).reshape(-1, columns.shape[2])
+    goal = (torque * weight[:, None]).reshape(-1)
+    A = np.concatenate((weighted.real, weighted.imag)) if np.iscomplexobj(weighted) else weighted
+    b = np.concatenate((goal.real, goal.imag)) if np.iscomplexobj(goal) else goal
+    count = prior.value.size
+    believed = np.zeros((count, A.shape[1]))
+    believed[:, :count] = np.diag(1.0 / prior.std)
+    A = np.concatenate((np.asarray(A, dtype=np.float64), believed))
+    b = np.concatenate((np.asarray(b, dtype=np.float64), prior.value / prior.std))
+    norm = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+    theta = np.linalg.lstsq(A / norm, b, rcond=1e-12)[0]
+    left = b - A @ (theta / norm)
+    variance = float(left @ left) / max(1, b.size - theta.size)
+    spread = np.sqrt(variance * np.diag(np.linalg.pinv((A / norm).T @ (A / norm), hermitian=True)))
+    return theta / norm, spread / norm
+
+
+def _equations(period: SettledPeriod, motion: PeriodicMotion, highest: int, model: ChainModel) -> tuple[Lines, Lines]:
+    """One period's columns (joints, lines, unknowns) and torques (joints, lines), line by line."""
+    Y = columns_of(model, motion)
+    columns = np.stack([np.fft.rfft(rows, axis=0)[: highest + 1] for rows in Y]) / period.samples
+    torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : highest + 1]
+    slope = 1j * period.fundamental * np.arange(highest + 1) * torque
+    return np.concatenate((columns, slope[:, :, None]), axis=2), torque

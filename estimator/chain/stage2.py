@@ -1,0 +1,221 @@
+"""Stage 2 for chains: maximum likelihood of every position as foreseen from the past, from stage 1.
+
+The observer starts stiff, where stage 1's parameters are good enough to stay with the motion, and is softened while the
+fit follows. Most iterations use coarse integration steps; the last ones use fine steps. How large the errors are is
+itself estimated, joint by joint, before the last digits, and samples far outside are downweighted there (Huber).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.coordinates import ChainCoordinates, kind_of
+from hil.estimator.chain.model import ChainModel
+from hil.estimator.chain.objective import ChainProblem
+from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.stage1 import ChainLinear
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import ConvergenceError
+from hil.estimator.fit.covariance import (
+    by_parameters,
+    correlation_time,
+    robust_covariance,
+    structured_share,
+)
+from hil.estimator.fit.levenberg_marquardt import Minimum
+from hil.estimator.options import CovarianceOptions, MinimiserOptions
+from hil.estimator.simulation.arm import steps_per_sample
+
+START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
+
+
+@dataclass(frozen=True)
+class ChainOptions:
+    """Of the likelihood of chains; names as in `hil.estimator.options`."""
+
+    softness: tuple[float, ...] = (3.0, 1.5, 1.0)
+    """Natural frequency of the observer, one after the other [Hz]. Softer shows more of the arm; much softer never
+    stays with it."""
+    lost: float = 1.5
+    """Where a softer observer leaves so many times more than its softness explains, the one before is kept."""
+    coarse_step: float = 2.6e-3
+    """Of integration [s]."""
+    fine_step: float = 0.85e-3
+    width_floor: float = 3e-3
+    """What the width of every Coulomb step stays above [rad/s]: with three steps a sample at 400 Hz, friction that
+    sticks is not told from this."""
+    initial_width: float = 0.03
+    """[rad/s]"""
+    min_initial_lag: float = 5e-4
+    """[s]"""
+    ftol_coarse: float = 1e-2
+    ftol_near: float = 3e-3
+    ftol: float = 1e-5
+    towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
+    """Shares of the way from the prior to stage 1 at which to begin, the first at which the arm can be simulated."""
+    angle_scale: float = 0.1
+    """[rad]"""
+    outlier_threshold: float = 4.0
+    """Standard deviations."""
+
+
+DEFAULTS = ChainOptions()
+MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
+
+
+@dataclass(frozen=True)
+class ChainFit:
+    """The most likely parameters under one model."""
+
+    value: Array
+    """In the order of `ChainModel.names` [SI]."""
+    covariance: Array
+    """Of `value`, robust against correlated errors."""
+    white_covariance: Array
+    """Of `value`, if every sample's error were independent."""
+    starts: tuple[Array, ...]
+    """Of each period, angles and velocities at the first sample (2, joints)."""
+    positions: tuple[Array, ...]
+    """Of each period, foreseen positions (joints, samples) [rad]."""
+    outliers: int
+    """Samples that were downweighted."""
+    correlation_time: float
+    """Samples over which the residual is correlated; 1 is white."""
+    iterations: int
+    """Simulations with derivatives."""
+    softness: float
+    """Natural frequency of the observer at the end [Hz]."""
+
+
+def fit_periods(
+    periods: Sequence[SettledPeriod],
+    model: ChainModel,
+    linear: ChainLinear,
+    prior: Prior,
+    options: ChainOptions = DEFAULTS,
+) -> ChainFit:
+    """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError."""
+    problem, x = _problem(periods, model, linear, prior, options)
+    coarse = replace(problem, steps=_steps(periods, options.coarse_step))
+    x = _towards_prior(coarse, x, options)
+    spent = 0
+    found: Minimum | None = None
+    softness = options.softness[0]
+    for frequency in options.softness:
+        ftol = options.ftol_near if frequency == options.softness[-1] else options.ftol_coarse
+        try:
+            trial = coarse.softer(frequency).minimise(x if found is None else found.x, ftol)
+        except ConvergenceError:
+            if found is None:
+                raise
+            break
+        spent += trial.iterations
+        growth = options.lost * (softness / frequency) ** 2
+        if found is not None and trial.at.cost > growth * (found.at.cost + trial.x.size):
+            break
+        found, softness = trial, frequency
+    assert found is not None
+    fine = problem.softer(softness)
+    near = fine.minimise(found.x, options.ftol_near)
+    positions = fine.positions(near.x)
+    assert positions is not None  # the minimum's motion is finite
+    weights, outliers = _weights(periods, positions, options.outlier_threshold)
+    last = replace(fine, weights=weights)
+    minimum = last.minimise(near.x, options.ftol, MINIMISER.min_damping)
+    return _fit(last, minimum, outliers, COVARIANCE, spent + near.iterations + minimum.iterations)
+
+
+def _problem(
+    periods: Sequence[SettledPeriod], model: ChainModel, linear: ChainLinear, prior: Prior, options: ChainOptions
+) -> tuple[ChainProblem, Array]:
+    """The problem with every sample weighted by the noise known beforehand, and the point to start from."""
+    velocity = float(np.sqrt(np.mean([np.mean(motion.velocity**2) for motion in linear.motions])))
+    scales = np.concatenate((np.maximum(prior.std, 1e-9), np.ones(len(model.names) - prior.std.size)))
+    coordinates = ChainCoordinates(model.names, scales, options.width_floor)
+    state_scale = np.repeat([options.angle_scale, velocity], model.joints)
+    known = dict(zip(model.linear_names, linear.value.tolist(), strict=True))
+    known |= {
+        "lag": max(linear.delay, options.min_initial_lag),
+        "delay": linear.delay if model.drive == "delay" else 0.0,
+    }
+    start = START | {"coulomb_width": options.initial_width}
+    value = np.array([known.get(name, start.get(kind_of(name), 0.0)) for name in model.names])
+    states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
+    weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0).T for period in periods)
+    steps = _steps(periods, options.fine_step)
+    problem = ChainProblem(
+        tuple(periods), model, coordinates, prior, state_scale, weights, steps, softness=options.softness[0]
+    )
+    return problem, np.concatenate((coordinates.coordinates(value), *states))
+
+
+def _towards_prior(problem: ChainProblem, x: Array, options: ChainOptions) -> Array:
+    """Stage 1's point, moved towards the prior until the arm there can be simulated.
+
+    Where the data say little of some inertias, those found may be of no arm: its mass matrix is not positive.
+    """
+    count = problem.model.base.count
+    likely = problem.prior.value / problem.coordinates.scales[:count]
+    for share in options.towards_prior:
+        moved = x.copy()
+        moved[:count] = likely + share * (x[:count] - likely)
+        if problem.positions(moved) is not None:
+            return moved
+    return x
+
+
+def _steps(periods: Sequence[SettledPeriod], longest: float) -> int:
+    return max(steps_per_sample(period.rate, longest) for period in periods)
+
+
+def _weights(
+    periods: Sequence[SettledPeriod], positions: Sequence[Array], outlier: float
+) -> tuple[tuple[Array, ...], int]:
+    """Weights by how large each joint's errors turned out, and the number of samples far outside them."""
+    weights = []
+    outliers = 0
+    for period, position in zip(periods, positions, strict=True):
+        error = np.where(period.valid, np.abs(period.position - position), 0.0)
+        # 1.35 medians are a standard deviation between those of rounding (1.15) and of normal errors (1.48).
+        typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
+        spread = np.maximum(typical, period.noise)[:, None]
+        far = error > outlier * spread
+        weight = np.where(far, np.sqrt(outlier * spread / np.where(far, error, 1.0)), 1.0)
+        rms = np.sqrt(np.nanmean(np.where(far | ~period.valid, np.nan, error) ** 2, axis=1))[:, None]
+        weights.append(np.where(period.valid, weight / np.maximum(rms, period.noise[:, None]), 0.0).T)
+        outliers += int(far.sum())
+    return tuple(weights), outliers
+
+
+def _fit(
+    problem: ChainProblem, minimum: Minimum, outliers: int, options: CovarianceOptions, iterations: int
+) -> ChainFit:
+    x, count = minimum.x, problem.count
+    positions = problem.positions(x)
+    assert positions is not None  # the minimum's motion is finite
+    residuals = [
+        weight.T * np.where(period.valid, period.position - position, 0.0)
+        for period, position, weight in zip(problem.periods, positions, problem.weights, strict=True)
+    ]
+    lags = correlation_time(residuals, options)
+    longest = max(period.samples for period in problem.periods)
+    window = max(lags, min(options.max_lag, int(options.min_window_share * longest)))
+    samples = int(sum(period.valid.sum() for period in problem.periods))
+    slopes = np.diag(problem.coordinates.slopes(x[:count]))
+    structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
+    robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
+    white = robust_covariance(minimum.at, None, samples, count)
+    value = problem.coordinates.values(x[:count])
+    return ChainFit(
+        value,
+        by_parameters(robust, slopes, value),
+        by_parameters(white, slopes, value),
+        tuple(problem.start(x, index) for index in range(len(problem.periods))),
+        positions,
+        outliers,
+        float(lags),
+        iterations,
+        problem.softness,
+    )

@@ -1,0 +1,267 @@
+"""The chain's motion under given motor torques and its derivatives by parameters and starting state, compiled.
+
+Friction and drive are those of `hil.estimator.simulation.arm`. Each step is its Rosenbrock method ROS2 with the
+second stage written so that both need the regressor at one acceleration only: with f the torques left after friction,
+S friction's slopes, ID inverse dynamics, M the mass matrix and primes at the end that stage 1 foresees,
+
+    ID(q, v, k) + gamma h S k = f        ID(q', v', l + 2 k) + gamma h S' l = f'
+    v += h (3 k + l) / 2                 q += h v + h^2 k / 2
+
+which differs from ROS2 in the Jacobian of its second stage and keeps second order. Differentiating both gives
+
+    W dk = -(ID_q dq + ID_v dv + Y dp + ...)        W = M + gamma h S
+
+so that one more parameter costs one more column. Once a sample the state is drawn to the measured angles by an
+observer, q += g (measured - q), v += g' (measured - q), with its derivatives: what is left at each sample before that
+is what the model could not foresee.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+from hil.estimator.chain.kernels import accelerate, differentiate, invert, move, place, regress
+from hil.estimator.compiled import compiled
+from hil.estimator.simulation.arm import FADED, GAMMA
+
+# Rows of the joints' constants.
+VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING, LOAD, SCALE, ZERO = range(9)
+JOINT_TERMS = (
+    *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
+    *("torque_scale", "zero"),
+)
+WORST = 1e4  # rad or rad/s: a simulation that comes here has run away
+
+
+def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
+    """Torque that drive j leaves its joint, and friction's slope."""
+    motor = p[SCALE, j] * t
+    ratio = v / p[FADING, j]
+    past = ratio * ratio
+    bump = math.exp(-past) if past < FADED else 0.0
+    level = p[COULOMB, j] * (1.0 + p[RISE, j] * bump) + p[LOAD, j] * abs(motor)
+    bend = math.tanh(v / p[WIDTH, j])
+    bent = (1.0 - bend * bend) / p[WIDTH, j]
+    out[0, j] = motor - p[OFFSET, j] - p[VISCOUS, j] * v - level * bend
+    out[1, j] = p[VISCOUS, j] + level * bent
+
+
+def _direct(
+    p: Any, at: Any, j: int, v: float, t: float, late: float, lagged: float, times: Any, ghk: float, by: Any, row: Any
+) -> None:
+    """What the step's equation of joint j changes with directly, by the drive's parameters; by v into `by`.
+
+    ghk: gamma h times the stage's acceleration, late and lagged: the torque's derivatives by delay and by lag, times:
+    their columns."""
+    scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
+    motor = scale * t
+    sign = 1.0 if motor > 0.0 else -1.0
+    ratio = v / fading
+    past = ratio * ratio
+    bump = math.exp(-past) if past < FADED else 0.0
+    coulomb, rise, load = p[COULOMB, j], p[RISE, j], p[LOAD, j]
+    level = coulomb * (1.0 + rise * bump) + load * abs(motor)
+    bend = math.tanh(v / width)
+    bent = (1.0 - bend * bend) / width
+    level_v = -2.0 * coulomb * rise * bump * v / (fading * fading)
+    bent_v = -2.0 * bend * bent / width
+    # The equation is ID - left + ghk slope = 0: of each, how `left` falls and how the slope rises.
+    by[j] = p[VISCOUS, j] + level_v * bend + level * bent + ghk * (level_v * bent + level * bent_v)
+    shape = bend + ghk * bent
+    row[at[VISCOUS, j]] = v + ghk
+    row[at[COULOMB, j]] = (1.0 + rise * bump) * shape
+    row[at[OFFSET, j]] = 1.0
+    bend_w = -v / width * bent
+    bent_w = -(bent + 2.0 * bend * bend_w) / width
+    row[at[WIDTH, j]] = level * (bend_w + ghk * bent_w)
+    row[at[RISE, j]] = coulomb * bump * shape
+    row[at[FADING, j]] = -level_v * ratio * shape
+    row[at[LOAD, j]] = abs(motor) * shape
+    by_motor = load * sign * shape - 1.0
+    row[at[SCALE, j]] = by_motor * t
+    row[times[0]] = by_motor * scale * late
+    row[times[1]] = by_motor * scale * lagged
+
+
+def _mix(out: Any, a: float, x: Any, b: float, y: Any, n: int) -> None:
+    for c in range(n):
+        out[c] += a * x[c] + b * y[c]
+
+
+def _mix_four(out: Any, a: float, x: Any, b: float, y: Any, c: float, z: Any, d: float, w: Any, n: int) -> None:
+    for i in range(n):
+        out[i] += a * x[i] + b * y[i] + c * z[i] + d * w[i]
+
+
+def _combine(A: Any, X: Any, B: Any, Y: Any, n: int, width: int, out: Any) -> None:
+    """out += A X + B Y, (n, n) by (n, width)."""
+    for i in range(n):
+        j = 0
+        while j + 1 < n:
+            _mix_four(out[i], A[i, j], X[j], B[i, j], Y[j], A[i, j + 1], X[j + 1], B[i, j + 1], Y[j + 1], width)
+            j += 2
+        if j < n:
+            _mix(out[i], A[i, j], X[j], B[i, j], Y[j], width)
+
+
+def _solved(inverse: Any, R: Any, n: int, width: int, out: Any) -> None:
+    """out = -inverse R."""
+    for i in range(n):
+        for c in range(width):
+            out[i, c] = 0.0
+        j = 0
+        while j + 1 < n:
+            _mix(out[i], -inverse[i, j], R[j], -inverse[i, j + 1], R[j + 1], width)
+            j += 2
+        if j < n:
+            for c in range(width):
+                out[i, c] -= inverse[i, j] * R[j, c]
+
+
+def _stage(
+    chain: Any, links: Any, p: Any, q: Any, v: Any, t: Any, before: Any, gh: float, found: Any, work: Any, solve: Any
+) -> bool:
+    """Solve ID(q, v, found + before) + gh S found = left for `found`; leaves the accelerations at that."""
+    rotation, translation, axis, gravity = chain
+    link, armature = links
+    left, matrix, inverse, factor, angle, total, rhs = solve
+    n = q.size
+    for j in range(n):
+        angle[j] = q[j] + p[ZERO, j]
+        _left(p, j, v[j], t[j], left)
+    place(rotation, translation, axis, angle, work[0], work[1])
+    move(link, armature, v, work)
+    accelerate(armature, gravity, v, before, work)
+    for i in range(n):
+        for j in range(n):
+            matrix[i, j] = work[4][i, j]
+        matrix[i, i] += gh * left[1, i]
+        rhs[i] = left[0, i] - work[5][i]
+    if not invert(matrix, inverse, factor):
+        return False
+    for i in range(n):
+        x = 0.0
+        for j in range(n):
+            x += inverse[i, j] * rhs[j]
+        found[i] = x
+        total[i] = x + before[i]
+    return True
+
+
+def _follow(
+    chain: Any,
+    links: Any,
+    p: Any,
+    v: Any,
+    t: Any,
+    slopes: Any,
+    found: Any,
+    gh: float,
+    columns: Any,
+    work: Any,
+    solve: Any,
+    by: Any,
+    direct: Any,
+) -> None:
+    """Derivatives of a solved stage's equation: by q and v in `work`, of friction by v too, directly in `direct`."""
+    base, at, times = columns
+    total = solve[5]
+    accelerate(links[1], chain[3], v, total, work)
+    differentiate(chain[3], work)
+    regress(base, total, work, direct)
+    for j in range(v.size):
+        _direct(p, at, j, v[j], t[j], slopes[0, j], slopes[1, j], times, gh * found[j], by, direct[j])
+        work[7][j, j] += by[j]
+    for j in range(v.size):
+        column = at[ZERO, j]
+        for i in range(v.size):
+            direct[i, column] = work[6][i, j]
+
+
+def _run_loop(  # noqa: PLR0912
+    chain: Any,
+    links: Any,
+    p: Any,
+    state: Any,
+    torque: Any,
+    slopes: Any,
+    measured: Any,
+    gain: Any,
+    step: float,
+    columns: Any,
+    room: Any,
+    position: Any,
+    derivative: Any,
+) -> bool:
+    """Simulate as many samples as `torque` (samples, steps, joints) has, from state (2, joints), into position
+    (samples, joints) and derivative (samples, joints, causes); without derivatives where there are no causes."""
+    work, solve, motion, by, zq, zv, dk, dl, R, direct, twice = room
+    q1, v1, k, m, nothing, ahead = motion
+    q, v = state[0], state[1]
+    n, causes = q.size, derivative.shape[2]
+    width = (causes + 7) // 8 * 8
+    h, gh = step, GAMMA * step
+    for sample in range(torque.shape[0]):
+        for j in range(n):
+            position[sample, j] = q[j]
+            if not abs(q[j]) + abs(v[j]) < WORST:
+                return False
+            for c in range(causes):
+                derivative[sample, j, c] = zq[j, c]
+        for j in range(n):
+            miss = measured[sample, j] - q[j]
+            if miss == miss:  # noqa: PLR0124  not missing
+                q[j] += gain[0, j] * miss
+                v[j] += gain[1, j] * miss
+                if causes > 0:
+                    for c in range(width):
+                        zv[j, c] -= gain[1, j] * zq[j, c]
+                        zq[j, c] *= 1.0 - gain[0, j]
+        for s in range(torque.shape[1]):
+            t = torque[sample, s]
+            if not _stage(chain, links, p, q, v, t, nothing, gh, k, work, solve):
+                return False
+            if causes > 0:
+                _follow(chain, links, p, v, t, slopes[sample, s], k, gh, columns, work, solve, by, direct)
+                for i in range(n):
+                    for c in range(width):
+                        R[i, c] = direct[i, c]
+                _combine(work[6], zq, work[7], zv, n, width, R)
+                _solved(solve[2], R, n, width, dk)
+            for j in range(n):
+                q1[j], v1[j], ahead[j] = q[j] + h * v[j], v[j] + h * k[j], 2.0 * k[j]
+            if not _stage(chain, links, p, q1, v1, t, ahead, gh, m, work, solve):
+                return False
+            if causes > 0:
+                _follow(chain, links, p, v1, t, slopes[sample, s], m, gh, columns, work, solve, by, direct)
+                for i in range(n):
+                    for j in range(n):
+                        # By v' = v + h k, and by k through the acceleration.
+                        twice[0, i, j] = h * work[7][i, j] + 2.0 * work[4][i, j]
+                        twice[1, i, j] = work[7][i, j] + h * work[6][i, j]
+                    for c in range(width):
+                        R[i, c] = direct[i, c]
+                _combine(work[6], zq, twice[1], zv, n, width, R)
+                _combine(twice[0], dk, twice[2], dk, n, width, R)
+                _solved(solve[2], R, n, width, dl)
+                for j in range(n):
+                    for c in range(width):
+                        zq[j, c] += h * zv[j, c] + 0.5 * h * h * dk[j, c]
+                    for c in range(width):
+                        zv[j, c] += h * (1.5 * dk[j, c] + 0.5 * dl[j, c])
+            for j in range(n):
+                q[j] += h * v[j] + 0.5 * h * h * k[j]
+                v[j] += h * (1.5 * k[j] + 0.5 * m[j])
+    return True
+
+
+# Only the loop is called from Python.
+_inner: Any = numba.njit(  # type: ignore[call-overload]
+    nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True
+)
+_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow = map(
+    _inner, (_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow)
+)
+run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"})

@@ -1,0 +1,80 @@
+"""A spatial arm behind the fake servos, described: a URDF's links, how the real ones differ, and drives."""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hil.description.arm import ArmDescription, Body
+from hil.description.urdf import read_urdf, rotation_of
+from hil.fakes.plants.arm import Drive, Finite, NotNegative, Positive
+
+MOST_JOINTS = 7
+PLANAR_ONLY = (
+    *("backlash", "presliding_stiffness", "cogging", "saturation"),
+    *("cold_viscous", "cold_coulomb", "cable_stiffness"),
+)
+
+
+class ChainArm(BaseModel):
+    """A serial arm of up to seven joints in space. Its servos' bodies are part of the URDF's links."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    urdf: str = Field(description="file with the links; a relative path is looked up beside the TOML file")
+    joints: tuple[str, ...] = Field(
+        strict=False, min_length=1, max_length=MOST_JOINTS, description="the URDF's names, from the base outwards"
+    )
+    start: tuple[Finite, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
+    gravity: NotNegative = Field(9.81, description="[m/s^2]")
+    base: Annotated[tuple[Finite, Finite, Finite], Field(strict=False)] = Field(
+        (0.0, 0.0, 0.0), description="roll, pitch and yaw of the base [rad]"
+    )
+    mass_scale: tuple[Positive, ...] | None = Field(
+        None, strict=False, description="true over the URDF's mass and inertia, per joint's link"
+    )
+    centre_shift: tuple[Finite, ...] | None = Field(
+        None, strict=False, description="of each link's centre of mass along its frame's x axis [m]"
+    )
+    drives: tuple[Drive, ...] = Field(strict=False, description="one for each joint; their mass is not used")
+
+    @model_validator(mode="after")
+    def _one_of_each_per_joint(self) -> Self:
+        count = len(self.joints)
+        for key in ("start", "drives", "mass_scale", "centre_shift"):
+            values = getattr(self, key)
+            if values is not None and len(values) != count:
+                raise ValueError(f"{key} has {len(values)} entries for {count} joints: give one per joint")
+        for name, angle, drive in zip(self.joints, self.start, self.drives, strict=True):
+            told = [term for term in PLANAR_ONLY if getattr(drive, term)]
+            if told:
+                raise ValueError(f"drives: {told[0]} of {name}: for planar fake arms only; leave it out")
+            if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
+                raise ValueError(f"start: {angle:g} rad for joint {name} is beyond its stops {list(drive.stops)}")
+        _ = self.description
+        return self
+
+    @property
+    def description(self) -> ArmDescription:
+        """The URDF's arm; raises ArmFileError."""
+        return read_urdf(Path(self.urdf), self.joints)
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The links as they really are."""
+        count = len(self.joints)
+        scales, shifts = self.mass_scale or (1.0,) * count, self.centre_shift or (0.0,) * count
+        return tuple(
+            Body(
+                scale * joint.body.mass,
+                joint.body.centre + np.array([shift, 0.0, 0.0]),
+                scale * joint.body.inertia,
+            )
+            for joint, scale, shift in zip(self.description.joints, scales, shifts, strict=True)
+        )
+
+    @property
+    def gravity_vector(self) -> np.ndarray:
+        """In the base's frame (3,) [m/s^2]."""
+        return np.asarray(rotation_of(*self.base).T @ np.array([0.0, 0.0, -self.gravity]))

@@ -1,0 +1,353 @@
+"""URDF files: the branch of a tree that the arm's joints make up, with what is fixed to it merged into its links.
+
+Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are not opened.
+"""
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body
+
+MOST_LENGTH = 3.0  # m from joint to joint: more is millimetres
+MOST_MASS = 100.0  # kg of one link: more is grams
+MOST_GYRATION = 2.0  # m: a radius of gyration that only wrong units make
+TURNING = ("revolute", "continuous")
+MOVABLE = (*TURNING, "prismatic", "planar", "floating")
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: str
+    kind: str
+    parent: str
+    child: str
+    rotation: Array
+    translation: Array
+    axis: Array
+    limits: tuple[float, float] | None
+    mimics: str | None
+
+
+def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
+    """The arm of these joints, from the base outwards; of all that turn if none are named.
+
+    Raises ArmFileError for what is no URDF of a serial arm: loops, joints that are not there, not in line or slide,
+    mimic joints among them, links without mass, axes that are not of length 1, units that are not SI.
+    """
+    root = parse_urdf(path)
+    bodies, physical = _links(root, path)
+    tree = _joints(root, bodies, path)
+    base = _root_link(bodies, tree, path)
+    names = list(joints) if joints is not None else _all_turning(tree, base, path)
+    branch = _branch(tree, base, names, path)
+    chosen = {joint.name for joint in branch if joint.name in names}
+    arm, held = [], []
+    rotation, translation = np.eye(3), np.zeros(3)
+    on_branch = {joint.name for joint in branch}
+    for joint in branch:
+        translation = translation + rotation @ joint.translation
+        rotation = rotation @ joint.rotation
+        if joint.name not in chosen:
+            continue
+        body, fixed, stiff = _rigid(joint.child, bodies, tree, chosen, on_branch)
+        held += stiff
+        if not body.mass > 0.0:
+            raise ArmFileError(
+                f'{path}: link "{joint.child}", which joint "{joint.name}" moves, has no mass: give it an '
+                "<inertial> with a rough mass [kg], centre and inertia; they are only a starting point"
+            )
+        arm.append(
+            ArmJoint(joint.name, joint.child, rotation, translation, joint.axis, joint.limits, body, tuple(fixed))
+        )
+        rotation, translation = np.eye(3), np.zeros(3)
+    _check_units(arm, path)
+    doubts = tuple(
+        f'link "{each.link}": no mass distribution has its inertia; the data decide'
+        for each in arm
+        if not physical[each.link] or not each.body.is_physical
+    )
+    return ArmDescription(path, base, tuple(arm), tuple(held), doubts)
+
+
+def parse_urdf(path: Path) -> ET.Element:
+    """The root element, comments kept. Raises ArmFileError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArmFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ArmFileError(f"{path}: has a document type or entities, which a URDF does not need: take them out")
+    try:
+        root = ET.fromstring(text, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    except ET.ParseError as error:
+        raise ArmFileError(f"{path}: is not XML: {error}") from error
+    if root.tag != "robot":
+        raise ArmFileError(f"{path}: its root is <{root.tag}>, not <robot>: it is no URDF")
+    if "<xacro:" in text:
+        raise ArmFileError(f"{path}: holds xacro macros: expand them first, xacro {path.name} > arm.urdf")
+    return root
+
+
+def _links(root: ET.Element, path: Path) -> tuple[dict[str, Body], dict[str, bool]]:
+    bodies: dict[str, Body] = {}
+    for element in root.findall("link"):
+        name = _name(element, "link", path)
+        if name in bodies:
+            raise ArmFileError(f'{path}: two links are named "{name}"')
+        bodies[name] = _body(element.find("inertial"), f'link "{name}"', path)
+    if not bodies:
+        raise ArmFileError(f"{path}: has no links")
+    return bodies, {name: body.mass == 0.0 or body.is_physical for name, body in bodies.items()}
+
+
+def _body(element: ET.Element | None, where: str, path: Path) -> Body:
+    if element is None:
+        return Body.nothing()
+    rotation, translation = _origin(element, where, path)
+    mass = element.find("mass")
+    kilograms = 0.0 if mass is None else _number(mass, "value", where, path)
+    if kilograms < 0.0:
+        raise ArmFileError(f"{path}: {where}: its mass is {kilograms:g} kg; it cannot be negative")
+    inertia = np.zeros((3, 3))
+    given = element.find("inertia")
+    if given is not None:
+        for (row, column), key in zip(
+            ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), strict=True
+        ):
+            inertia[row, column] = inertia[column, row] = _number(given, key, where, path, 0.0)
+    return Body(kilograms, np.zeros(3), inertia).moved(rotation, translation)
+
+
+def _joints(root: ET.Element, bodies: dict[str, Body], path: Path) -> dict[str, _Joint]:
+    tree: dict[str, _Joint] = {}
+    moved: dict[str, str] = {}
+    for element in root.findall("joint"):
+        name = _name(element, "joint", path)
+        where = f'joint "{name}"'
+        if name in tree:
+            raise ArmFileError(f'{path}: two joints are named "{name}"')
+        ends = {}
+        for end in ("parent", "child"):
+            tag = element.find(end)
+            link = None if tag is None else tag.get("link")
+            if link not in bodies:
+                raise ArmFileError(f"{path}: {where}: its {end} link {link!r} is not in the file")
+            ends[end] = str(link)
+        if ends["child"] in moved:
+            raise ArmFileError(
+                f'{path}: link "{ends["child"]}" is the child of both "{moved[ends["child"]]}" and "{name}": the links '
+                "form a loop, which a serial arm does not have; leave one of the joints out"
+            )
+        moved[ends["child"]] = name
+        kind = element.get("type", "")
+        if kind not in (*MOVABLE, "fixed"):
+            raise ArmFileError(f"{path}: {where}: type {kind!r}: revolute, continuous, prismatic or fixed is known")
+        rotation, translation = _origin(element, where, path)
+        mimic = element.find("mimic")
+        tree[name] = _Joint(
+            name,
+            kind,
+            ends["parent"],
+            ends["child"],
+            rotation,
+            translation,
+            _axis(element, where, path) if kind in TURNING else np.array([1.0, 0.0, 0.0]),
+            _limits(element, kind, where, path),
+            None if mimic is None else str(mimic.get("joint")),
+        )
+    return tree
+
+
+def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> str:
+    children = {joint.child for joint in tree.values()}
+    roots = [name for name in bodies if name not in children]
+    if not roots:
+        raise ArmFileError(f"{path}: every link is some joint's child: the links form a loop; one must be the base")
+    if len(roots) > 1:
+        raise ArmFileError(
+            f"{path}: links {', '.join(roots)} hang on no joint: one base is allowed; join the others by fixed joints"
+        )
+    return roots[0]
+
+
+def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
+    """The only branch's joints that turn."""
+    names: list[str] = []
+    link = base
+    while True:
+        following = [joint for joint in tree.values() if joint.parent == link]
+        turning = [joint for joint in following if joint.mimics is None and _turns(joint, tree)]
+        if not turning:
+            return names
+        if len(turning) > 1:
+            raise ArmFileError(
+                f'{path}: at link "{link}" the arm branches into {", ".join(joint.name for joint in turning)}: say '
+                "which joints are the arm's, in the order from the base"
+            )
+        if turning[0].kind in TURNING:
+            names.append(turning[0].name)
+        link = turning[0].child
+
+
+def _turns(joint: _Joint, tree: dict[str, _Joint]) -> bool:
+    """Whether it or something beyond it turns."""
+    if joint.kind in TURNING:
+        return True
+    return any(_turns(other, tree) for other in tree.values() if other.parent == joint.child and other.mimics is None)
+
+
+def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) -> list[_Joint]:
+    """All joints from the base to the last of `names`, which must be among them in this order."""
+    if not names:
+        raise ArmFileError(f"{path}: no joint turns, so there is no arm")
+    if len(set(names)) < len(names):
+        raise ArmFileError(f"{path}: joints {', '.join(names)}: one is named twice")
+    for name in names:
+        if name not in tree:
+            turning = [joint.name for joint in tree.values() if joint.kind in TURNING]
+            raise ArmFileError(f'{path}: has no joint "{name}"; those that turn are {", ".join(turning) or "none"}')
+        joint = tree[name]
+        if joint.kind not in TURNING:
+            raise ArmFileError(f'{path}: joint "{name}" is {joint.kind}: only joints that turn can be identified')
+        if joint.mimics is not None:
+            raise ArmFileError(
+                f'{path}: joint "{name}" mimics "{joint.mimics}", so it has no motor of its own: leave it out'
+            )
+    branch = max((_way_to(tree, base, name, path) for name in names), key=len)
+    found = [joint.name for joint in branch if joint.name in names]
+    if found != names:
+        missing = [name for name in names if name not in found]
+        if missing:
+            raise ArmFileError(
+                f'{path}: joint "{missing[0]}" does not lie between base and "{branch[-1].name}": the joints must make '
+                "up one branch"
+            )
+        raise ArmFileError(f"{path}: the joints come in the order {', '.join(found)} from the base: name them so")
+    between = [joint for joint in branch if joint.name not in names and joint.kind != "fixed"]
+    if between:
+        raise ArmFileError(
+            f'{path}: joint "{between[0].name}" ({between[0].kind}) lies before "{names[-1]}" and is not among the '
+            "arm's joints: add it, or make it fixed if it never moves"
+        )
+    return branch
+
+
+def _way_to(tree: dict[str, _Joint], base: str, name: str, path: Path) -> list[_Joint]:
+    """All joints from the base to the one of this name."""
+    parent_joint = {joint.child: joint for joint in tree.values()}
+    way = [tree[name]]
+    while way[0].parent != base:
+        way.insert(0, parent_joint[way[0].parent])
+        if len(way) > len(tree):
+            raise ArmFileError(f'{path}: joint "{name}" is not connected to the base: the links form a loop')
+    return way
+
+
+def _rigid(
+    link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str], on_branch: set[str]
+) -> tuple[Body, list[str], list[str]]:
+    """A link with all that does not move against it, the names of what that is, and of movable joints held."""
+    body, fixed, held = bodies[link], [], []
+    for joint in tree.values():
+        if joint.parent != link or joint.name in chosen:
+            continue
+        if joint.kind != "fixed":
+            held.append(joint.name)
+        part, names, more = _rigid(joint.child, bodies, tree, chosen, on_branch)
+        body = body.joined(part.moved(joint.rotation, joint.translation))
+        fixed += [joint.child, *names]
+        held += more
+    return body, fixed, held
+
+
+def _check_units(arm: Sequence[ArmJoint], path: Path) -> None:
+    for joint in arm:
+        length = float(np.linalg.norm(joint.translation))
+        if length > MOST_LENGTH:
+            raise ArmFileError(
+                f'{path}: joint "{joint.name}" is {length:.4g} m from the one before: is that in millimetres? URDF '
+                "is in metres and kilograms"
+            )
+        body = joint.body
+        gyration = math.sqrt(max(float(np.trace(body.inertia)), 0.0) / body.mass)
+        if body.mass > MOST_MASS or gyration > MOST_GYRATION or np.linalg.norm(body.centre) > MOST_LENGTH:
+            raise ArmFileError(
+                f'{path}: link "{joint.link}" has {body.mass:.4g} kg, its centre {np.linalg.norm(body.centre):.4g} m '
+                f"away and a radius of gyration of {gyration:.4g} m: are these grams or millimetres? URDF is in "
+                "metres, kilograms and kg m^2"
+            )
+
+
+def _name(element: ET.Element, what: str, path: Path) -> str:
+    name = element.get("name")
+    if not name:
+        raise ArmFileError(f"{path}: a {what} has no name")
+    return name
+
+
+def _limits(element: ET.Element, kind: str, where: str, path: Path) -> tuple[float, float] | None:
+    limit = element.find("limit")
+    if kind != "revolute" or limit is None or limit.get("lower") is None or limit.get("upper") is None:
+        return None
+    return _number(limit, "lower", where, path), _number(limit, "upper", where, path)
+
+
+def _axis(element: ET.Element, where: str, path: Path) -> Array:
+    given = element.find("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if given is None else _three(given, "xyz", where, path)
+    length = float(np.linalg.norm(axis))
+    if abs(length - 1.0) > 1e-3:
+        raise ArmFileError(
+            f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}: it must be 1; divide it by that"
+        )
+    unit: Array = axis / length
+    return unit
+
+
+def _origin(element: ET.Element, where: str, path: Path) -> tuple[Array, Array]:
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(3), np.zeros(3)
+    roll, pitch, yaw = _three(origin, "rpy", where, path)
+    return rotation_of(roll, pitch, yaw), _three(origin, "xyz", where, path)
+
+
+def rotation_of(roll: float, pitch: float, yaw: float) -> Array:
+    """Rotation matrix (3, 3) of turns [rad] about the fixed x, then y, then z axis."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _three(element: ET.Element, key: str, where: str, path: Path) -> Array:
+    text = element.get(key, "0 0 0")
+    try:
+        numbers = np.array([float(part) for part in text.split()])
+    except ValueError:
+        numbers = np.zeros(0)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise ArmFileError(f'{path}: {where}: {key}="{text}" must be three numbers')
+    return numbers
+
+
+def _number(element: ET.Element, key: str, where: str, path: Path, default: float | None = None) -> float:
+    text = element.get(key)
+    if text is None and default is not None:
+        return default
+    try:
+        number = float(text or "")
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ArmFileError(f"{path}: {where}: {key}={text!r} must be a number")
+    return number

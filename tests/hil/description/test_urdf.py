@@ -1,0 +1,128 @@
+"""URDF files: geometry and inertias as other programs read them, and every fault named."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from hil.description.arm import ArmFileError
+from hil.description.urdf import read_urdf
+from tests.support.chains import random_urdf
+from tests.support.paths import CONFIGS
+
+HEAD = '<robot name="arm"><link name="base"/>'
+INERTIAL = (
+    '<inertial><mass value="{mass}"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+def link(name: str, mass: float = 0.2) -> str:
+    return f'<link name="{name}">{INERTIAL.format(mass=mass)}</link>'
+
+
+def joint(name: str, parent: str, child: str, kind: str = "revolute", more: str = '<axis xyz="0 0 1"/>') -> str:
+    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{more}</joint>'
+
+
+TWO = HEAD + link("upper") + link("lower") + joint("shoulder", "base", "upper") + joint("elbow", "upper", "lower")
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "arm.urdf"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("joints", [1, 3, 6])
+def test_links_are_where_mujoco_has_them(joints: int, tmp_path: Path) -> None:
+    path = written(tmp_path, random_urdf(joints, 10 + joints))
+    arm, model = read_urdf(path), mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[:] = angles = np.linspace(-2.0, 2.0, joints)
+    mujoco.mj_forward(model, data)
+    turn, at = np.eye(3), np.zeros(3)
+    for index, each in enumerate(arm.joints):
+        at, turn = at + turn @ each.translation, turn @ each.rotation
+        np.testing.assert_allclose(turn @ each.axis, data.xaxis[index], atol=1e-9)
+        np.testing.assert_allclose(at, data.xanchor[index], atol=1e-9)
+        x, y, z = each.axis
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        turn = turn @ (np.eye(3) + np.sin(angles[index]) * cross + (1 - np.cos(angles[index])) * cross @ cross)
+        body = model.body(each.link)
+        assert each.body.mass == pytest.approx(float(body.mass[0]))
+        np.testing.assert_allclose(at + turn @ each.body.centre, data.xipos[body.id], atol=1e-9)
+    assert [each.name for each in arm.joints] == [model.joint(i).name for i in range(joints)]
+    assert arm.joints[-1].fixed == ("tip",)
+
+
+def test_the_bundled_arms_are_physical() -> None:
+    for path in CONFIGS.glob("*.urdf"):
+        arm = read_urdf(path)
+        assert not arm.doubts
+        assert all(each.body.is_physical for each in arm.joints)
+
+
+def test_a_gripper_is_held_and_counted_in_its_link(tmp_path: Path) -> None:
+    finger = link("finger", 0.1) + joint("grip", "lower", "finger", "prismatic")
+    mimic = link("other", 0.1) + joint("grip_2", "lower", "other", "prismatic", '<mimic joint="grip"/>')
+    arm = read_urdf(written(tmp_path, TWO + finger + mimic + "</robot>"), ["shoulder", "elbow"])
+    assert arm.held == ("grip", "grip_2")
+    assert arm.joints[1].body.mass == pytest.approx(0.4)
+    assert arm.joints[1].fixed == ("finger", "other")
+
+
+def test_an_inertia_that_no_body_has_is_a_doubt(tmp_path: Path) -> None:
+    odd = TWO.replace('ixx="1e-3"', 'ixx="9e-3"', 1)
+    assert "upper" in read_urdf(written(tmp_path, odd + "</robot>")).doubts[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "joints", "message"),
+    [
+        (TWO + link("x"), None, "hang on no joint"),
+        (TWO + joint("back", "lower", "upper"), None, "loop"),
+        (
+            joint("a", "u", "l").join(
+                (HEAD.replace('<link name="base"/>', ""), link("u") + link("l") + joint("b", "l", "u"))
+            ),
+            None,
+            "loop",
+        ),
+        (TWO, ["shoulder", "wrist"], 'no joint "wrist".*shoulder, elbow'),
+        (TWO, ["elbow", "shoulder"], "order shoulder, elbow"),
+        (TWO, ["elbow"], '"shoulder" .revolute. lies before'),
+        (TWO, ["elbow", "elbow"], "named twice"),
+        (TWO + link("y") + joint("slide", "lower", "y", "prismatic"), ["shoulder", "elbow", "slide"], "prismatic"),
+        (
+            TWO + link("y") + joint("m", "lower", "y", more='<axis xyz="0 0 1"/><mimic joint="elbow"/>'),
+            ["shoulder", "elbow", "m"],
+            'mimics "elbow"',
+        ),
+        (TWO + link("y") + joint("m", "upper", "y"), None, "branches"),
+        (TWO.replace('xyz="0 0 1"', 'xyz="0 0 2"', 1), None, "length 2"),
+        (TWO.replace('xyz="0 0 1"', 'xyz="0 1"', 1), None, "three numbers"),
+        (TWO.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><origin xyz="128 0 0"/>'), None, "millimetres"),
+        (TWO.replace('value="0.2"', 'value="200"'), None, "grams"),
+        (TWO.replace('value="0.2"', 'value="-1"'), None, "negative"),
+        (TWO.replace('value="0.2"', 'value="heavy"'), None, "must be a number"),
+        (HEAD + '<link name="upper"/>' + joint("shoulder", "base", "upper"), None, '"upper".*no mass'),
+        (TWO.replace('type="revolute"', 'type="spherical"'), None, "spherical"),
+        (HEAD, None, "no joint turns"),
+        ("<mujoco>", None, "no URDF"),
+        ('<!DOCTYPE robot [<!ENTITY a "b">]>' + TWO, None, "entities"),
+        (TWO + '<xacro:arm xmlns:xacro="x"/>', None, "xacro"),
+        (TWO + "<", None, "not XML"),
+        (TWO + '<joint type="fixed"/>', None, "no name"),
+        (TWO + joint("j", "lower", "nowhere"), None, "'nowhere' is not in the file"),
+    ],
+)
+def test_what_is_wrong_is_named(text: str, joints: list[str] | None, message: str, tmp_path: Path) -> None:
+    end = "</mujoco>" if text.startswith("<mujoco") else "</robot>"
+    with pytest.raises(ArmFileError, match=message):
+        read_urdf(written(tmp_path, text + end), joints)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ArmFileError, match=r"none\.urdf: cannot be read"):
+        read_urdf(tmp_path / "none.urdf")
