@@ -81,9 +81,22 @@ class Port:
             raise self._lost(error) from error
 
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
-        """`write`, then `read` until `timeout` [s] after `start` [s, on the port's clock]: the control cycle's way."""
+        """`write`, then `read` until `timeout` [s] after `start` [s, on the port's clock]: the control cycle's way.
+
+        What was there before is dropped: a repeated or late answer would answer this request, and each after it one
+        cycle late.
+        """
+        if self.has_input():
+            self.discard_input()
         self.write(data)
         return self.read(count, timeout)
+
+    def has_input(self) -> bool:
+        """Whether bytes have been received and not read."""
+        try:
+            return bool(self._serial.in_waiting)
+        except _FAILURES as error:
+            raise self._lost(error) from error
 
     def discard_input(self) -> None:
         """Throw away what has been received and not read."""
@@ -156,6 +169,8 @@ class DescriptorPort(Port):
         # One Python frame for the whole transaction, and where all goes well three system calls and nothing else:
         # after a wait of a millisecond, with cold caches, every further call costs a microsecond.
         try:
+            if self._wait_ms(0):
+                self.discard_input()
             written = os.write(self._descriptor, data)
             if written < len(data):
                 self._write_rest(data[written:])

@@ -139,10 +139,14 @@ class SyncRead:
         return answers
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
-        found = {}
+        found: dict[int, Answer] = {}
+        latest = -1
         for packet in Framer(longest=self._longest).feed(received):
             if packet.is_status and packet.id in self._ids and (answer := self._answer(packet)):
-                found[packet.id] = answer
+                turn = self._ids.index(packet.id)
+                if turn <= latest:
+                    found.clear()  # they answer in turn: what stands before is left over from an earlier request
+                found[packet.id], latest = answer, turn
         # They answer in turn, so nobody speaks after the last one.
         return [found.get(servo_id) for servo_id in self._ids], self._ids[-1] in found
 

@@ -185,9 +185,15 @@ class PtyServer:
         self.path = os.ttyname(self._slave)
         self._hand = HandSocket(self.path)
         if self._link is not None:
-            self._link.unlink(missing_ok=True)
             try:
                 self._link.symlink_to(self.path)
+            except FileExistsError:
+                self._link, taken = None, self._link  # somebody else's: not to be removed at the end either
+                self.close()
+                raise LinkError(
+                    f"{taken} was made by somebody else while the cable was out; it is left as it is. Remove it or "
+                    "choose another --link"
+                ) from None
             except OSError as error:
                 self.close()
                 raise LinkError(f"{self._link}: cannot be made: {error.strerror}") from error

@@ -71,7 +71,7 @@ def serve_fake(
             server.serve(None if quiet else status.show, watch_every_s=0.5 if sys.stderr.isatty() else 10.0)
             if not quiet:
                 status.end(server.counts)
-        except PlantError as error:
+        except (LinkError, PlantError) as error:
             raise ConfigError(str(error)) from error
         finally:
             for number, handler in former.items():

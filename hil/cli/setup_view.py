@@ -79,7 +79,7 @@ def print_findings(findings: Sequence[Finding], config: Path) -> None:
     if stops:
         console.print(f"\n{stops} to mend before an experiment can start, {warnings} to think about.")
     else:
-        console.print(f"\nReady, {warnings} to think about. Next: hil identify {config}")
+        console.print(f"\nReady, {warnings} to think about. Next: hil identify {escape(str(config))}")
 
 
 def changed(changes: Sequence[Change]) -> dict[str, Any]:

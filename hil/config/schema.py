@@ -84,6 +84,14 @@ class JointConfig(_Table):
     current_limit: PositiveFloat | None = Field(None, le=30, description="A")
     voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
 
+    @field_validator("name")
+    @classmethod
+    def _printable(cls, name: str) -> str:
+        """A name goes into terminals, XML, HTML and CSV: no control character, line break or half of a surrogate."""
+        if bad := [each for each in name if not each.isprintable()]:
+            raise ValueError(f"{name!a}: {bad[0]!a} is not a character that can be printed")
+        return name
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.position_limit
@@ -198,7 +206,9 @@ class ArmConfig(_Table):
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
-    rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+    rest_tolerance: PositiveFloat = Field(
+        0.5, description="rad from the rest pose allowed at the start: friction may hold an arm far from it"
+    )
     link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
     prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
 

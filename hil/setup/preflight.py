@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hil import fakes
 from hil.config.schema import Config, JointConfig
 from hil.drivers.bus import ServoBus
 from hil.drivers.control_table import model_names
@@ -44,6 +45,7 @@ class Finding:
 
 def check_arm(config: Config) -> Iterator[Finding]:
     """Look at port, servos, pose and rate, in this order; what cannot be looked at is a STOP, never an exception."""
+    fakes.register_for(config.url)
     try:
         bus = ServoBus.connect(config.bus)
     except PortNotOpened as error:
