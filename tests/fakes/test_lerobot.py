@@ -1,6 +1,6 @@
 """LeRobot's own tests of its Dynamixel bus, against the fake bus; skipped where LeRobot or its tests are not installed.
 
-LeRobot's wheel holds no tests: `LEROBOT_TESTS` names its tests folder, e.g. of a checkout. Nothing of it is copied here.
+LeRobot's wheel holds no tests: `LEROBOT_TESTS` names the folder of its tests, e.g. in a checkout.
 """
 
 import os
