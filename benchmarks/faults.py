@@ -6,8 +6,8 @@ Each injection is one `hil record` in virtual time with one or two faults: of th
 changes, delays, repeats, forges and drops bytes between program and servos, of other programs on the bus, of the
 computer. It is judged by the emulated servos' own record of every millisecond (fault_campaign/judge.py):
 
-unsafe          current flowed for more than 100 ms (where the program cannot reach the servo: its watchdog's time) after
-                the first moment at which something was wrong for good, or at all after the program's end
+unsafe          current flowed for more than 100 ms (where the program cannot reach the servo: its watchdog's time)
+                after the first moment at which something was wrong for good, or at all after the program's end
 beyond_limit    a joint farther beyond its limit than `hil dry-run` predicts
 unreadable      an error that the program does not foresee, no message, or a recording that cannot be read
 unnamed         the message does not name the cause, judged against the words for all causes; misleading: only others

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from statistics import median
 
-from benchmarks.faults import CONFIG, short_config
+from benchmarks.short_experiment import CONFIG, short_config
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.experiment.guard import Guard

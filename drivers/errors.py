@@ -9,8 +9,10 @@ DriverError
 ├── WrongReply          a servo answered with something that is not an answer to the question
 ├── ServoRefused        a servo answered with an error code: access, range, limit
 ├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
+├── BusShared           another program is master of the same bus
 ├── WrongModel          another model, or one whose firmware is too old, answers at this ID
 ├── WrongSetting        a register holds a value with which no experiment may start
+│   └── TorqueHeld      torque is on already: somebody holds or drives the arm
 └── TorqueNotOff        a servo could not be confirmed to be without torque
 """
 
@@ -56,12 +58,20 @@ class ServoFault(DriverError):
     """The servo reports a hardware error. Example: overload, after which it stays without torque until rebooted."""
 
 
+class BusShared(DriverError):
+    """Somebody else sends instructions on this bus. Example: a controller board plugged in beside the adapter."""
+
+
 class WrongModel(DriverError):
     """Not the servo that the configuration describes. Example: an XL430 where an XM430-W350 should be."""
 
 
 class WrongSetting(DriverError):
     """A register forbids the experiment. Example: Drive Mode with Torque On by Goal Update."""
+
+
+class TorqueHeld(WrongSetting):
+    """A servo has torque on before anybody asked for it. Example: another program holds the arm up."""
 
 
 class TorqueNotOff(DriverError):

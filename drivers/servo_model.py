@@ -71,6 +71,7 @@ class ServoModel:
     stalls: the e-Manual's stall figures.
     other_constants: further published torque constants [N m/A].
     position_steps: ticks of Present Position per turn.
+    min_voltage: the supply below which it shuts down from the factory (Min Voltage Limit) [V].
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that answers Fast Sync Read; None where no firmware does.
     senses_supply: whether Present Current is the supply's, which is the motor's times the share of time in which its
@@ -82,6 +83,7 @@ class ServoModel:
     stalls: tuple[Stall, ...]
     other_constants: tuple[float, ...] = ()
     position_steps: int = 4096
+    min_voltage: float = 9.5
     watchdog_firmware: int = 38
     fast_sync_read_firmware: int | None = 45
     senses_supply: bool = False
@@ -95,6 +97,11 @@ class ServoModel:
     def default_mode(self) -> Mode:
         """Current mode where the servo has it, else PWM."""
         return Mode.PWM if self.current_unit is None else Mode.CURRENT
+
+    @property
+    def resistance(self) -> float:
+        """Ohm between the motor's terminals, from the stall figures: the least of them."""
+        return min(stall.voltage / stall.current for stall in self.stalls)
 
     @property
     def torque_per_ampere(self) -> Published:
@@ -135,12 +142,14 @@ _MODELS = (
         "XL330-M288",
         1.0e-3,
         (Stall(3.7, 1.11, 0.42), Stall(5.0, 1.47, 0.52), Stall(6.0, 1.74, 0.60)),
+        min_voltage=3.5,
         fast_sync_read_firmware=46,
     ),
     ServoModel(
         "XL330-M077",
         1.0e-3,
         (Stall(3.7, 1.11, 0.180), Stall(5.0, 1.47, 0.215), Stall(6.0, 1.74, 0.228)),
+        min_voltage=3.5,
         fast_sync_read_firmware=46,
     ),
     # Its current sensor sits in the supply, not in a motor phase.
@@ -148,10 +157,13 @@ _MODELS = (
         "XC330-T288",
         1.0e-3,
         (Stall(9.0, 0.61, 0.76), Stall(11.1, 0.80, 0.92), Stall(12.0, 0.88, 1.00)),
+        min_voltage=5.5,
         fast_sync_read_firmware=46,
         senses_supply=True,
     ),
-    ServoModel("XL430-W250", None, (Stall(9.0, 1.0, 1.0), Stall(11.1, 1.3, 1.4), Stall(12.0, 1.4, 1.5))),
+    ServoModel(
+        "XL430-W250", None, (Stall(9.0, 1.0, 1.0), Stall(11.1, 1.3, 1.4), Stall(12.0, 1.4, 1.5)), min_voltage=6.0
+    ),
 )
 
 SERVO_MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})

@@ -10,7 +10,7 @@ from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError, PeriodicityError, ShapeError
 from hil.estimator.fit.stage1 import fit_lines
-from hil.estimator.fit.stage2 import fit_runs
+from hil.estimator.fit.stage2 import Near, fit_runs
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.options import LikelihoodOptions, SettlingOptions
@@ -84,6 +84,7 @@ def identify(
     *,
     coarse: bool = False,
     starts: Sequence[Mapping[str, float]] = (),
+    near: Near | None = None,
     options: LikelihoodOptions = LIKELIHOOD,
 ) -> Estimate:
     """Estimate the parameters of `model`: regression on Fourier lines, then maximum likelihood.
@@ -96,6 +97,7 @@ def identify(
         coarse: for trying models: one that leaves much more than the noise is not fitted to its last digits.
         starts: parameters by name [SI], of another experiment or of arms like this one; further initial guesses,
             nothing more.
+        near: where a minimum is known to be close: the only initial guess, for a fraction of the time.
         options: tolerances and limits of the likelihood.
 
     Returns:
@@ -112,7 +114,7 @@ def identify(
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(*used)
-    fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, options=options)
+    fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, near=near, options=options)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
         model,

@@ -211,3 +211,15 @@ class SelectionOptions:
     """Of the error of the best model so far: what a richer one must reach to be kept."""
     explained_error: float = 1.05
     """RMS error of the prediction in units of the noise: nothing is left for another term."""
+    explained_residual: float = 1.02
+    """RMS residual in units of the noise: likewise."""
+    presliding_residual: float = 1.2
+    """The same from which presliding is tried, whose fit takes long."""
+    initial_widths: tuple[float, ...] = (5e-4, 2e-2)
+    """Of the Coulomb step of one joint, tried where the motion is not explained [rad/s]."""
+    overrule_ratio: float = 0.8
+    """Of the chosen model's error of prediction: what another one must reach to be chosen instead."""
+    ripple_evidence: float = 0.15
+    """Of the score test, from which ripple is tried: where it repeats is found roughly, so that a fit sees more."""
+    prune_levels: tuple[float, ...] = (1e-3, 0.1)
+    """Chance at which nothing is taken for something, in turn until the motion is explained as well."""

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import fakes, load_model
+from hil import load_model
 from hil.arm_model import ArmModel
 from hil.config.schema import Config, load_config
-from hil.drivers.bus import ServoBus
 from hil.drivers.rate import FixedRate
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.guard import Guard
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
+from hil.setup.servo_session import servo_session
 
 Array = NDArray[np.float64]
 Controller = Callable[[int, Array, Array], Array]
@@ -38,11 +38,10 @@ def identified_arm() -> tuple[Config, ArmModel]:
 
 def play(config: Config, model: ArmModel, controller: Controller, samples: int) -> Array:
     """Run the controller for so many samples; measured angles (samples, joints) [rad]. Torque is off afterwards."""
-    fakes.register()
     guard = Guard(config)
     measured = np.empty((samples, len(model.joints)))
     goals = [0.0] * len(model.joints)
-    with ServoBus.open(config.bus) as bus, bus.torque(config.safety.watchdog):
+    with servo_session(config) as bus, bus.torque(config.safety.watchdog):
         rate = FixedRate(bus.port.clock, config.experiment.rate)
         for index in range(samples):
             rate.wait()

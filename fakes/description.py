@@ -108,6 +108,7 @@ class FakeArm(BaseModel):
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="from the wire to the host's read, for every byte [us]")
     ] = 0.0
+    adapter_echoes: Annotated[bool, Field(description="whether the adapter hears what the host sends")] = False
     servos: Annotated[
         tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")
     ]
@@ -131,11 +132,11 @@ class FakeArm(BaseModel):
             raise ValueError(f"servos: IDs {', '.join(map(str, ids))}: each servo on a bus needs an ID of its own")
         if sum(each is not None for each in (self.arm, self.chain, self.plant)) != 1:
             raise ValueError('give one of the table arm, the table chain and plant = "module:factory"')
-        arm = self.arm or self.chain
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
             raise ValueError(f"servos: they move the joints {moved}: each joint from 1 on needs a servo")
+        arm = self.arm or self.chain
         if arm is not None and count != len(arm.drives):
             servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")
             raise ValueError(f"{servos} for {len(arm.drives)} drives of the arm: one servo per drive")
@@ -245,6 +246,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         clock,
         joints=fake.joints,
         adapter_latency_us=fake.adapter_latency_us,
+        adapter_echoes=fake.adapter_echoes,
         supply=fake.supply,
         seed=fake.seed,
     )

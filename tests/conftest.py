@@ -1,7 +1,7 @@
 """A fake arm with a short experiment, and the ports that a test opened, to look at the servos themselves."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,22 @@ from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
 from tests.support.paths import CONFIGS
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What programs keep of servos' settings goes where the tests' user does not see it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A state folder of the test's own; that of servos' settings is in it."""
+    folder = tmp_path / "state"
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder))
+    return folder / "hil" / "servos"
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Every shipped configuration made ready for a campaign: another rate, short periods, and a fake arm where it has none."""
+"""Shipped configurations made ready for a campaign: another rate, short periods, a fake arm where there is none."""
 
 import json
 import tomllib

@@ -71,7 +71,9 @@ class Outcome:
     def __str__(self) -> str:
         flags = ["BEYOND LIMIT"] * self.beyond_limit + ["UNREADABLE"] * self.unreadable
         flags += [f"NOT RESTORED {', '.join(self.not_restored)}"] * bool(self.not_restored)
-        head = f"{self.setting.name} {self.setting.rate} Hz: {self.drawn}: {', '.join([describe(self.verdict), *flags])}"
+        head = (
+            f"{self.setting.name} {self.setting.rate} Hz: {self.drawn}: {', '.join([describe(self.verdict), *flags])}"
+        )
         return f"{head}\n    exit {self.code}: {self.text.strip()[-700:]}"
 
 

@@ -56,9 +56,10 @@ class Story:
 
 @dataclass(frozen=True)
 class Verdict:
-    """owed: why current had to end, "" where nothing asked for it; late_ms: how long it flowed from then on; beyond: way
-    of each joint beyond its limit (joints,) [rad]; named: whether the user reads the cause, None where nothing stopped;
-    misleading: the user reads causes that it was not, and not the one that it was.
+    """owed: why current had to end, "" where nothing asked for it; late_ms: how long it flowed from then on.
+
+    beyond: way of each joint beyond its limit (joints,) [rad]. named: whether the user reads the cause, None where
+    nothing stopped. misleading: the user reads causes that it was not, and not the one that it was.
     """
 
     owed: str
@@ -102,7 +103,7 @@ def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
 def causes_in(text: str) -> set[str]:
     """The causes that a message speaks of; what came before the error, and whether torque is off, are no causes."""
     said = [line for line in text.splitlines() if not re.match(r"Torque is off|TORQUE OFF", line.strip())]
-    return {cause for cause, words in WORDS.items() if any(re.search(words, line) for line in said)}
+    return {cause for cause, words in WORDS.items() if any(re.search(words, line, re.IGNORECASE) for line in said)}
 
 
 Reason = tuple[str, float]
@@ -121,12 +122,22 @@ def _reasons(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> 
         found += [
             _since(f"joint {joint + 1} {what}", time, wrong, hold, gap)
             for what, wrong, hold, gap in (
-                ("is not where the program was told", told.lies(joint, time, own, "position", interval), LASTING_MS, GAP_MS),
+                (
+                    "is not where the program was told",
+                    told.lies(joint, time, own, "position", interval),
+                    LASTING_MS,
+                    GAP_MS,
+                ),
                 ("is not as fast as told", told.lies(joint, time, own, "velocity", interval), LASTING_MS, GAP_MS),
                 ("was not heard", told.silent(joint, time, interval, story.ended), LASTING_MS, 1),
                 ("does not do as told", told.disobeys(joint, time, own, interval), LASTING_MS, GAP_MS),
                 ("is beyond a limit", _beyond(config, joint, own), 1, GAP_MS),
-                ("is not where it would be", _astray(drawn, joint, own, undisturbed.record[:, joint]), LASTING_MS, GAP_MS),
+                (
+                    "is not where it would be",
+                    _astray(drawn, joint, own, undisturbed.record[:, joint]),
+                    LASTING_MS,
+                    GAP_MS,
+                ),
             )
         ]
     for attack in drawn.attacks:
@@ -263,5 +274,3 @@ def describe(verdict: Verdict) -> str:
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
     said += ["UNSAFE"] * verdict.unsafe + ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
     return ", ".join(said)
-
-

@@ -70,7 +70,9 @@ class Middle(FakeSerial):
         self._random = Random(seed)
         self._to_come = sorted((each for each in attacks if each.kind in AT_ONCE), key=lambda each: each.start)
         on_bytes = [each for each in attacks if each.kind not in AT_ONCE]
-        self._wakes = min((each.start - LOOK_BACK_S * (each.kind == Kind.REPLAY) for each in on_bytes), default=math.inf)
+        self._wakes = min(
+            (each.start - LOOK_BACK_S * (each.kind == Kind.REPLAY) for each in on_bytes), default=math.inf
+        )
         self._sleeps = max((each.end for each in on_bytes), default=-math.inf)
 
     # What the program calls
@@ -284,9 +286,7 @@ class Forger:
             return packet
         return forged(changed, request)
 
-    def _block(
-        self, attack: Attack, number: int, servo_id: int, block: bytes, request: Request, now: float
-    ) -> bytes:
+    def _block(self, attack: Attack, number: int, servo_id: int, block: bytes, request: Request, now: float) -> bytes:
         if attack.kind == Kind.SWAP:
             others = [kept for other, (_, kept) in self._latest.items() if other != servo_id]
             return others[0] if others and len(others[0]) == len(block) else block

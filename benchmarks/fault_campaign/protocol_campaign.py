@@ -24,7 +24,7 @@ class Bench:
 
 
 class BenchPort(Middle):
-    """A port onto the arm on the bench. Ports opened later find the arm as it was left, in the time that has gone on."""
+    """A port onto the arm on the bench. Ports opened later find the arm as it was left."""
 
     def __init__(self, port: str | None = None, *args: Any, **kwargs: Any) -> None:
         kwargs["description"] = Bench.arm

@@ -13,7 +13,15 @@ STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
 
 RECORD = np.dtype(
-    [("time", "f8"), ("driven", "?"), ("torque", "?"), ("goal", "i4"), ("current", "f8"), ("position", "f8"), ("velocity", "f8")]
+    [
+        ("time", "f8"),
+        ("driven", "?"),
+        ("torque", "?"),
+        ("goal", "i4"),
+        ("current", "f8"),
+        ("position", "f8"),
+        ("velocity", "f8"),
+    ]
 )
 
 

@@ -40,6 +40,20 @@ def noise_power(lines: Lines) -> Array:
     return noise
 
 
+def white_noise(position: Array) -> Array:
+    """Standard deviation of what is white in one period of angles (joints, samples), in their unit (joints,).
+
+    From the upper quarter of the lines, far above any motion. A ramp between the ends is taken off first: where the
+    period does not close, because the arm drifts, its jump is in every line.
+    """
+    samples = position.shape[1]
+    ramp = (position[:, -1:] - position[:, :1]) * (np.arange(samples) / max(1, samples - 1))
+    lines = lines_of(position - ramp)
+    upper = lines[:, lines.shape[1] // 2 :]
+    noise: Array = np.sqrt(noise_power(upper) * samples)
+    return noise
+
+
 def cut_off(lines: Lines) -> int:
     """The highest harmonic that is still signal on some joint, by the mean power of bands of lines."""
     count = (lines.shape[1] - 1) // BAND

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from hil.estimator.arrays import Array, Mask
+from hil.estimator.data.fourier import white_noise
 from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 from hil.estimator.simulation.closed_loop import Stabilised
 
@@ -46,12 +47,16 @@ class SettledPeriod:
     """Where a software stabiliser gave part of `torque`: without it a simulated arm may not stay with the real one."""
     valid: Mask = field(init=False)
     """Where a sample was received (joints, samples)."""
+    noise: Array = field(init=False)
+    """Standard deviation of one sample's error (joints,) [rad]: what is measured to be white, and rounding at least."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "valid", np.isfinite(self.position))
         _check_shapes(self)
         _check_values(self)
         _check_motion(self)
+        rounding = self.position_step / np.sqrt(12.0)
+        object.__setattr__(self, "noise", np.maximum(white_noise(self.filled()), rounding))
 
     @property
     def joints(self) -> int:
@@ -67,13 +72,6 @@ class SettledPeriod:
     def fundamental(self) -> float:
         """Angular frequency of the period [rad/s]."""
         return 2.0 * np.pi * self.rate / self.samples
-
-    @property
-    def noise(self) -> Array:
-        """Standard deviation of one sample's error (joints,) [rad]: rounding, and scatter where known."""
-        scatter = 0.0 if self.position_std is None else self.position_std
-        noise: Array = np.sqrt(self.position_step**2 / 12.0 + np.square(scatter))
-        return noise
 
     def filled(self) -> Array:
         """Positions (joints, samples) with the missing ones interpolated between their neighbours [rad]."""

@@ -83,6 +83,16 @@ class Search:
         spent = sum(each.free.iterations for each in starts) + refined.iterations + minimum.iterations
         return refined, replace(minimum, iterations=spent)
 
+    def nearest(self, x: Array) -> tuple[Refined, Minimum]:
+        """The minimum to which the coordinates `x` lead, and no other. Raises ConvergenceError."""
+        options = self.options
+        found = self.rough.minimise(x, options.ftol_start)
+        refined = self._compare([found], options.ftol_refine)
+        unexplained = refined.cost > options.explained_cost * self.samples
+        ftol = options.ftol_refine if self.coarse and unexplained else options.ftol
+        minimum = refined.weighted.minimise(refined.best.x, ftol, options.minimiser.min_damping, refined.best.at)
+        return refined, replace(minimum, iterations=found.iterations + refined.iterations + minimum.iterations)
+
     def _multistart(self, guesses: Sequence[Array], springs: Array) -> list[Start]:
         """From one guess after the other until the motion is explained. Raises ConvergenceError if none converges."""
         starts: list[Start] = []

@@ -2,9 +2,9 @@
 
 The stabiliser gave k (pose - measured) for a spring of stiffness k; in closed loop the simulated arm would be given
 k (pose - simulated), which is the torque that was commanded and a spring k (measured - simulated) beside it. So the
-simulation has that spring instead of the loop: an arm that falls over by itself stays with the real one, the
-derivatives are those of every other run, and where model and arm agree the spring gives nothing. The stabiliser's
-damper is left out: it only says how fast what is left dies away.
+simulation has that spring instead of the loop: an arm that falls over by itself stays with the real one, derivatives
+are those of every other run, and where model and arm agree the spring gives nothing. The stabiliser's damper is left
+out: it only says how fast what is left dies away.
 """
 
 from collections.abc import Iterator
@@ -60,6 +60,7 @@ class StabilisedRun:
         tracking_stiffness: Array | None = None,
         horizon: float = 1.0,
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """As `SimulatedRun.pieces` gives them; `tracking_stiffness` where it is more than the stabiliser's."""
+        """Piece after piece, as `SimulatedRun.pieces` gives them; with springs stiffer than the stabiliser's where
+        `tracking_stiffness` is."""
         stiffness = self.stiffness if tracking_stiffness is None else np.maximum(self.stiffness, tracking_stiffness)
         return self.run.pieces(physics, start, names, stiffness, horizon)

@@ -49,6 +49,16 @@ class Fit:
     """Simulations with derivatives."""
 
 
+@dataclass(frozen=True)
+class Near:
+    """Where a minimum is known to be close: what a similar model found of the same periods."""
+
+    parameters: Mapping[str, float]
+    """By name [SI]; others start from their usual initial guess."""
+    state: Array
+    """Angles and velocities at the first sample of the first period (2, joints) [rad, rad/s]."""
+
+
 def fit_runs(
     periods: Sequence[SettledPeriod],
     model: Model,
@@ -56,6 +66,7 @@ def fit_runs(
     *,
     coarse: bool = False,
     starts: Sequence[Mapping[str, float]] = (),
+    near: Near | None = None,
     options: LikelihoodOptions = DEFAULTS,
 ) -> Fit:
     """The most likely parameters of `model`.
@@ -66,6 +77,7 @@ def fit_runs(
         linear: stage 1's estimate of the same periods.
         coarse: for trying a model: one that leaves much more than the noise is given up before its last digits.
         starts: parameters by name [SI], further initial guesses that come before all others.
+        near: the only initial guess, where a minimum is known to be close.
         options: tolerances and limits.
 
     Returns:
@@ -80,10 +92,24 @@ def fit_runs(
         runs=tuple(run.integrated(options.coarse_integration) for run in fine.runs),
         max_relative_decrease=options.max_relative_decrease_coarse,
     )
+    if near is not None:
+        x = fine.coordinates.coordinates(_near_values(model, linear, near.parameters, options))
+        states[: fine.state_scale.size] = near.state.reshape(-1) / fine.state_scale
+        return _fit(
+            periods, *Search(periods, fine, rough, options, coarse).nearest(np.concatenate((x, states))), options
+        )
     guesses = [np.concatenate((x, states)) for x in _initial_guesses(fine, periods, model, linear, starts, options)]
     search = Search(periods, fine, rough, options, coarse)
     refined, minimum = search.minimum(guesses, _springs(linear, options))
     return _fit(periods, refined, minimum, options)
+
+
+def _near_values(
+    model: Model, linear: LinearEstimate, parameters: Mapping[str, float], options: LikelihoodOptions
+) -> Array:
+    narrow = _standstill_guesses(linear, options)[0]
+    unnamed = dict(zip(model.names, _guess(model, linear, {}, narrow, options).tolist(), strict=True))
+    return np.array([{**unnamed, **parameters}[name] for name in model.names])
 
 
 def _springs(linear: LinearEstimate, options: LikelihoodOptions) -> Array:

@@ -14,7 +14,16 @@ from hil.estimator.errors import ModelError
 
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]
 Drive = Literal["delay", "lag", "delay_lag"]
-Option = Literal["presliding", "asymmetry", "ripple", "zeros", "torque_scale", "saturation", "cable", "encoder"]
+Option = Literal[
+    "presliding",
+    "asymmetry",
+    "ripple",
+    "zeros",
+    "torque_scale",
+    "saturation",
+    "cable",
+    "encoder",
+]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
 Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation"]

@@ -7,21 +7,28 @@ without meaning would. Without another motion the Bayesian information criterion
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
+from scipy.stats import chi2
 
 from hil.estimator.arrays import Array
-from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError, PeriodicityError
+from hil.estimator.fit.stage1 import fit_lines
+from hil.estimator.fit.stage2 import Near
 from hil.estimator.identify import Estimate, identify, predict
 from hil.estimator.models.model import Model
-from hil.estimator.models.terms import Drive
+from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
 from hil.estimator.options import SelectionOptions
+from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_of
 
 DEFAULTS = SelectionOptions()
+SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
+"""What is nothing where it is small, and so costs a fit nothing but its columns."""
 
 
 @dataclass(frozen=True)
@@ -81,84 +88,231 @@ def choose(
     starts: Sequence[Mapping[str, float]] = (),
     options: SelectionOptions = DEFAULTS,
 ) -> Choice:
-    """Fit `periods` with richer and richer friction as long as it predicts `held_out` better.
+    """Fit `periods` with what the motion asks for, and leave out what it does not.
 
-    Coulomb, Stribeck and load-dependent friction come first; then ripple over the angle, friction that yields before it
-    slides and friction that differs with direction, on top of the best. Ends when the prediction's error is the
-    encoder's own noise. Raises ConvergenceError when no model can be fitted. `torque_scale` is part of every
-    model, or of none; `starts` as of `hil.estimator.identify.identify`.
+    Stribeck friction comes first, with the encoders' zeros and the ratio of two torque constants, which nobody knows
+    exactly. If that does not explain the motion, or if the score test sees something in what is left
+    (`hil.estimator.selection.candidates`), all else that is smooth comes at once: load, direction, saturation, cables,
+    encoders that are not linear. Added one by one they mislead, since each takes over what the others lack; together,
+    with what is usual of them as a prior, they are told apart. Then come friction that yields before it slides and
+    ripple over the angle, and in the end what does not differ from nothing is taken out. A model that predicts
+    `held_out` worse than a plainer one is not chosen.
+
+    Args:
+        periods: what is fitted, settled periods of one arm; the first tells what is missing.
+        held_out: a settled period of another motion, which judges; without one, the Bayesian information criterion.
+        drive: the drive's terms, of every model.
+        torque_scale: whether the ratio of the torque constants stays in whatever it is.
+        starts: as of `hil.estimator.identify.identify`.
+        options: thresholds.
+
+    Raises:
+        ConvergenceError: when no model can be fitted.
     """
-    trials: list[Trial] = []
-    best: Trial | None = None
-    tried = partial(_try, periods, held_out, starts)
-    joints = periods[0].joints
-    for step in _ladder(joints, drive):
-        model = step.having("torque_scale") if torque_scale else step
-        trial = tried(model if best is None else _on_top(model, best.model), coarse=True)
-        trials.append(trial)
-        if best is None or (
-            trial.score < options.keep_ratio * best.score and _beyond_chance(trial.estimate, best.estimate)
-        ):
-            best = trial
-        if best.score < options.explained_error:
-            break
-    if best is None or best.estimate is None:
-        raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
-    if best.score >= options.explained_error:
-        best = tried(best.model, coarse=False)
-    return Choice(tuple(trials), best)
+    search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None)
+    grown = search.grow(Model(periods[0].joints, "stribeck", drive))
+    pruned = search.prune(grown)
+    return Choice(tuple(search.trials), search.judged(pruned))
 
 
-def _ladder(joints: int, drive: Drive) -> Iterator[Model]:
-    yield Model(joints, "coulomb", drive)
-    yield Model(joints, "stribeck", drive)
-    yield Model(joints, "stribeck_load", drive)
-    yield Model(joints, "stribeck_load", drive, {"ripple"})
-    yield Model(joints, "stribeck_load", drive, {"presliding"})
-    yield Model(joints, "coulomb", drive, {"asymmetry"})
+class Selection:
+    """Models tried on one set of periods, each from where the one before it ended."""
+
+    def __init__(
+        self,
+        periods: Sequence[SettledPeriod],
+        held_out: SettledPeriod | None,
+        starts: Sequence[Mapping[str, float]],
+        options: SelectionOptions,
+        fixed: Option | None,
+    ) -> None:
+        self._periods = [without_spikes(period) for period in periods]
+        self._held_out = held_out
+        self._starts = starts
+        self._options = options
+        self._fixed = fixed
+        self._known = ripple_of(self._periods[0], fit_lines(self._periods[0]))
+        self.trials: list[Trial] = []
+        """In the order in which they were made."""
+
+    def grow(self, model: Model) -> Trial:
+        """From `model` to the richest one that the motion asks for. Raises ConvergenceError."""
+        unknown: set[Option] = {"zeros", "torque_scale"} if model.joints == 2 else {"zeros"}
+        plain = self._try_or_none(model.having(*unknown))
+        explained = plain is not None and self._is_explained(plain)
+        if plain is not None and explained and not self._seen(plain):
+            return plain
+        smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
+        best = self._better(self._try_or_none(smooth, plain if explained else None), plain)
+        if best is None:
+            raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
+        if self._left(best) > self._options.presliding_residual**2:
+            best = self._better(self._try_or_none(smooth.having("presliding")), best) or best
+        if not self._is_explained(best):
+            best = self._with_ripple(best)
+        return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
+
+    def _seen(self, trial: Trial) -> list[Candidate]:
+        assert trial.estimate is not None
+        return [each for each in candidates(self._periods[0], trial.estimate, self._known) if each.evidence > 1.0]
+
+    def _with_ripple(self, best: Trial) -> Trial:
+        assert best.estimate is not None
+        for each in candidates(self._periods[0], best.estimate, self._known):
+            if each.part == "ripple" and each.evidence > self._options.ripple_evidence:
+                return self._better(self._try_or_none(each.model, best, each.values), best) or best
+        return best
+
+    def _reshaped(self, best: Trial) -> Trial:
+        """The same model from other widths of friction's step, each joint's for itself: there are local minima."""
+        for joint in range(1, best.model.joints + 1):
+            for width in self._options.initial_widths:
+                name = f"coulomb_width_{joint}"
+                if best.estimate is None or self._is_explained(best) or name not in best.estimate.names:
+                    return best
+                best = self._better(self._try_or_none(best.model, best, {name: width}), best) or best
+        return best
+
+    def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:
+        """`richer` if its terms gain what they must, else `plainer`."""
+        if richer is None or plainer is None:
+            return richer or plainer
+        return richer if self._gain(richer, plainer) > self._worth(richer, plainer) else plainer
+
+    def prune(self, best: Trial) -> Trial:
+        """Take out what is not told from nothing, if the motion is explained as well without it."""
+        assert best.estimate is not None
+        if self._left(best) > self._options.presliding_residual**2:
+            return best  # what is missing would be taken for what is there
+        for level in self._options.prune_levels:
+            plainer = _without_nothings(best.estimate, level, self._fixed)
+            if plainer == best.model:
+                return best
+            trial = self._try_or_none(plainer, best)
+            if trial is not None and self._gain(best, trial) < self._worth(best, trial):
+                return trial
+        return best
+
+    def judged(self, chosen: Trial) -> Trial:
+        """`chosen`, unless another trial predicts the motion held out much better."""
+        if self._held_out is None:
+            return chosen
+        fitted = [trial for trial in self.trials if trial.estimate is not None]
+        best = min(fitted, key=lambda trial: trial.score)
+        return best if best.score < self._options.overrule_ratio * chosen.score else chosen
+
+    @property
+    def _samples(self) -> int:
+        return int(sum(period.valid.sum() for period in self._periods))
+
+    def _left(self, trial: Trial) -> float:
+        """Mean square of what it leaves, in units of the noise."""
+        assert trial.estimate is not None
+        return float(np.nanmean((trial.estimate.residual / self._periods[0].noise[:, None]) ** 2))
+
+    def _is_explained(self, trial: Trial) -> bool:
+        return self._left(trial) < self._options.explained_residual**2
+
+    def _gain(self, richer: Trial, plainer: Trial) -> float:
+        """Twice the gain in log-likelihood, of samples that are counted as far as they are independent."""
+        assert richer.estimate is not None
+        independent = self._samples / colour(richer.estimate.residual)
+        return independent * float(np.log(max(self._left(plainer), 1e-12) / max(self._left(richer), 1e-12)))
+
+    def _worth(self, richer: Trial, plainer: Trial) -> float:
+        """What more terms must gain: the Bayesian information criterion's penalty."""
+        assert richer.estimate is not None
+        independent = max(self._samples / colour(richer.estimate.residual), 3.0)
+        return max(1, len(richer.model.names) - len(plainer.model.names)) * float(np.log(independent))
+
+    def _try_or_none(
+        self, model: Model, near: Trial | None = None, values: Mapping[str, float] = MappingProxyType({})
+    ) -> Trial | None:
+        """A trial; None where the fit does not converge."""
+        try:
+            return self._try(model, near, values)
+        except ConvergenceError:
+            self.trials.append(Trial(model, None, None, np.inf, 0.0))
+            return None
+
+    def _try(self, model: Model, near: Trial | None, values: Mapping[str, float]) -> Trial:
+        """From where `near` ended, with `values` for what it lacks, or from scratch."""
+        started = time.perf_counter()
+        place = None
+        if near is not None and near.estimate is not None:
+            place = Near({**near.estimate.parameters, **values}, near.estimate.start)
+        estimate = identify(self._periods, model, starts=self._starts, near=place)
+        relative, score = self._predicted(estimate)
+        trial = Trial(model, estimate, relative, score, time.perf_counter() - started)
+        self.trials.append(trial)
+        return trial
+
+    def _predicted(self, estimate: Estimate) -> tuple[Array | None, float]:
+        other = self._held_out
+        if other is None:
+            return None, _criterion(estimate, self._periods)
+        try:
+            predicted = predict_period(estimate, other)
+        except PeriodicityError:
+            return None, np.inf
+        return relative_error(other, predicted), float(
+            np.sqrt(np.nanmean(((other.position - predicted) / other.noise[:, None]) ** 2))
+        )
 
 
-def _on_top(model: Model, best: Model) -> Model:
-    """Direction is added to the best so far; presliding and ripple only show with all of friction in place."""
-    if "asymmetry" in model.options:
-        return best.having("asymmetry")
-    return model.having("ripple") if "ripple" in best.options else model
+def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
+    """Positions (joints, samples) [rad] that `estimate` predicts of another settled period, by its torque alone.
 
-
-def _beyond_chance(richer: Estimate | None, plainer: Estimate | None) -> bool:
-    """Whether more terms explain the motion that they were fitted to better than terms without meaning do.
-
-    A flat minimum leaves much to chance in what it predicts of another motion. By Akaike's criterion (IEEE Trans.
-    Automatic Control 19 (1974) 716): twice the gain in log-likelihood above twice the number of terms.
+    Raises PeriodicityError when the simulated arm does not settle.
     """
-    if richer is None or plainer is None:
-        return richer is not None
-    samples = np.sum(np.isfinite(richer.residual), axis=1)
-    gain = 2.0 * float(np.sum(samples * np.log(plainer.residual_steps / richer.residual_steps)))
-    return gain > 2.0 * (len(richer.names) - len(plainer.names))
+    if other.stabiliser is None:
+        return predict(estimate, other.torque, other.rate, other.command_to_sample)
+    pose = other.stabiliser.feedback.pose
+    return other.stabiliser.settled_positions(
+        Physics.of(estimate.parameters), pose, other.rate, other.command_to_sample
+    )
 
 
-def _try(
-    periods: Sequence[SettledPeriod],
-    held_out: SettledPeriod | None,
-    starts: Sequence[Mapping[str, float]],
-    model: Model,
-    *,
-    coarse: bool,
-) -> Trial:
-    started = time.perf_counter()
-    relative = None
-    try:
-        estimate = identify(periods, model, coarse=coarse, starts=starts)
-        if held_out is None:
-            score = _criterion(estimate, periods)
-        else:
-            predicted = predict(estimate, held_out.torque, held_out.rate, held_out.command_to_sample)
-            relative = relative_error(held_out, predicted)
-            score = float(np.sqrt(np.nanmean(((held_out.position - predicted) / held_out.noise[:, None]) ** 2)))
-    except (ConvergenceError, PeriodicityError):
-        return Trial(model, None, None, np.inf, time.perf_counter() - started)
-    return Trial(model, estimate, relative, score, time.perf_counter() - started)
+def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
+    """The model without what is not told from nothing, the least sure taken out first.
+
+    What a part lacks in significance is A. Wald's test (Trans. AMS 54 (1943) 426): its distance from nothing in
+    standard errors, squared, against chi^2 at `level`. What is left is then known as far as a linear model has it.
+    """
+    model, value, covariance = estimate.model, estimate.value.copy(), estimate.covariance.copy()
+    names = list(estimate.names)
+    covariance[~np.isfinite(covariance)] = 0.0
+    while True:
+        doubtful = []
+        for part, plainer in _parts(model):
+            at = [names.index(name) for name in _tested(model, plainer)]
+            away = value[at] - np.array([term_of(names[i]).absent for i in at])
+            own = np.linalg.pinv(covariance[np.ix_(at, at)], rcond=1e-12, hermitian=True)
+            doubtful.append((float(away @ own @ away) / float(chi2.isf(level, len(at))), part, plainer, at, own, away))
+        doubtful = [each for each in doubtful if each[0] < 1.0 and each[1] != fixed]
+        if not doubtful:
+            return model
+        _, _, model, at, own, away = min(doubtful, key=lambda each: each[0])
+        follow = covariance[:, at] @ own
+        value = value - follow @ away
+        covariance = covariance - follow @ covariance[at]
+
+
+def _parts(model: Model) -> list[tuple[str, Model]]:
+    """What could be taken out of a model, each with the model that is left; presliding has no test against nothing."""
+    parts: list[tuple[str, Model]] = [
+        (option, model.without(option)) for option in sorted(model.options) if option != "presliding"
+    ]
+    law = FRICTIONS.index(model.friction)
+    if law:
+        parts.append((model.friction, replace(model, friction=FRICTIONS[law - 1])))
+    return parts
+
+
+def _tested(model: Model, plainer: Model) -> list[str]:
+    """What is tested of what `plainer` lacks; where that is nothing, what it scales says nothing."""
+    lacking = [name for name in model.names if name not in plainer.names]
+    return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "stribeck_velocity")]
 
 
 def relative_error(period: SettledPeriod, predicted: Array) -> Array:

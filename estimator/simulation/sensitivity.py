@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.arm import (
     ASYMMETRY,
@@ -201,13 +202,12 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     cable = p[CABLE + joint]
     left[stage, joint] = motor - offset - cable * q - viscous * v - dry * bend
     slope[stage, joint] = viscous + level * bent
-    n = now * NUMBERS + stage * BY_STATE
-    numbers[n + 5 * joint] = cycles * turn * passed - cable
-    numbers[n + 5 * joint + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
-    numbers[n + 8 + 2 * joint], numbers[n + 9 + 2 * joint] = (
-        cycles * turn * loaded * bent,
-        level_v * bent + level * bent_v,
-    )
+    left_by = now * NUMBERS + stage * BY_STATE + 5 * joint
+    slope_by = left_by + 8 - 3 * joint
+    numbers[left_by] = cycles * turn * passed - cable
+    numbers[left_by + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
+    numbers[slope_by] = cycles * turn * loaded * bent
+    numbers[slope_by + 1] = level_v * bent + level * bent_v
 
 
 def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple[float, float]:
@@ -408,4 +408,4 @@ fused: Any = numba.njit(  # type: ignore[call-overload]
     no_cfunc_wrapper=True,
 )
 _drive, _arm, arm_step, follow = map(fused, (_drive, _arm, arm_step, follow))
-_advance: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_loop)
+_advance: Callable[..., None] = compiled(_loop, fastmath={"contract"})

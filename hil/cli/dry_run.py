@@ -6,9 +6,7 @@ from typing import Annotated
 import typer
 
 from hil import strict_json
-
-ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="TOML file that describes the arm.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+from hil.cli.options import ConfigPath, Json
 
 
 def dry_run(
@@ -28,20 +26,18 @@ def dry_run(
     """Simulate the experiment on arms like yours; exit code 1 if it might touch a limit."""
     from rich.console import Console
 
+    from hil.api.dry_run import dry_run as simulate
     from hil.cli.terminal import Terminal
-    from hil.config.schema import load_config
     from hil.dry_run.plot import draw
-    from hil.dry_run.run import dry_run as simulate
-    from hil.dry_run.summary import dry_run_json, print_dry_run
+    from hil.dry_run.summary import print_dry_run
 
-    checked = load_config(config)
-    with Terminal(quiet=json_only).busy("Simulating"):
-        run = simulate(checked, result, arms, servos)
+    with Terminal(quiet=json_only).following(config) as follow:
+        rehearsal = simulate(config, result=result, arms=arms, servos=servos, on_progress=follow)
     if picture is not None:
-        draw(checked, run.largest.prediction if run.asked is None else run.asked, picture)
+        draw(rehearsal.config, rehearsal.prediction, picture)
     if json_only:
-        print(strict_json.dumps(dry_run_json(checked, run)))
+        print(strict_json.dumps(rehearsal.to_json()))
     else:
-        print_dry_run(checked, run, Console(highlight=False))
-    if not run.is_safe(checked):
+        print_dry_run(rehearsal.config, rehearsal.found, Console(highlight=False))
+    if not rehearsal.is_safe:
         raise typer.Exit(1)

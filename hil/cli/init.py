@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
+from hil.cli.options import PortOrFile
+
 
 def init(
-    port: Annotated[
-        str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, a TOML file, or a bundled name.")
-    ],
+    port: PortOrFile,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")] = Path("my_arm.toml"),
     baud: Annotated[
         list[int] | None, typer.Option("--baud", help="Ask only at this baud; may be given more than once.")
@@ -17,6 +17,7 @@ def init(
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: take what an empty answer means.")] = False,
 ) -> None:
     """Scan the bus, ask what it cannot tell, write a commented TOML file. Nothing is written to the servos."""
+    from hil.cli.terminal import Terminal
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
@@ -32,8 +33,8 @@ def init(
     bauds = tuple(baud or BAUD_RATES)
     opened = open_port(url, bauds[0])
     try:
-        typer.echo("Asking who is on the bus ...", err=True)
-        heard = list(scan(opened, bauds))
+        with Terminal(quiet=False).scanning() as watch:
+            heard = list(scan(opened, bauds, watch))
         answers = interview(opened, url, heard, _default if yes else _prompt, _say)
     finally:
         opened.close()

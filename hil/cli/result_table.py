@@ -3,13 +3,14 @@
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.results.parts import Quantity
-from hil.results.result import SettledResult
+from hil.results.result import SettledResult, ShootingResult
 
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
@@ -22,12 +23,32 @@ def print_result(result: SettledResult, config: Config, run: Path, console: Cons
         console.print(line, soft_wrap=True, markup=False)
 
 
+def print_shooting_result(result: ShootingResult) -> None:
+    """A result of multiple shooting."""
+    print(f"{result.joints}-joint arm, {result.config}")
+    for name, entry in result.quantities.items():
+        print(f"{name:22s} {entry.unit:10s} {entry.value:12.5g} {entry.std:9.1e}")
+    rms = ", ".join(f"{1000 * value:.3g}" for value in result.fit.residual_rms_rad)
+    for found in result.zeros or ():
+        shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(found.zero, found.std, strict=True))
+        print(f"Encoder zeros of {found.recording or result.config}: {shown} rad.")
+    print(f"{result.method}.")
+    print(f"Residual {rms} mrad RMS over {result.fit.segments} segments.")
+    for warning in result.warnings:
+        print(f"Warning: {warning}")
+    if result.model_choice is not None:
+        choice = result.model_choice
+        print(f"Chosen by segments left out: {choice.chosen}, error {choice.error_divided_by:.2f} times smaller.")
+    if result.physical is not None:
+        print("\n".join(physical_lines(result.physical)))
+
+
 def _parameters(result: SettledResult) -> Table:
     truth = result.truth
     # Narrow enough for 80 columns, so that no figure is cut.
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.title, table.title_justify, table.title_style = (
-        f"{result.joints}-joint arm, {result.config}",
+        f"{result.joints}-joint arm, {escape(str(result.config))}",
         "left",
         "",
     )
@@ -36,10 +57,10 @@ def _parameters(result: SettledResult) -> Table:
     for heading in ("value", "std", *(("truth", "error %", "in std.") if truth else ())):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, entry in result.parameters.items():
-        table.add_row(name, entry.unit, *_numbers(entry, truth.get(name) if truth else None))
+        table.add_row(escape(name), escape(entry.unit), *_numbers(entry, truth.get(name) if truth else None))
     table.add_row()
     for name, entry in result.extra.items():
-        table.add_row(name, entry.unit, f"{entry.value:.5g}", f"{entry.std:.1e}")
+        table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
     table.add_row()
     return table
 

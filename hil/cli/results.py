@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")]
+from hil.cli.options import RunPath
 
 
 def report(

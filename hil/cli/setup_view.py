@@ -61,18 +61,6 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
         console.print("The servos of one arm need the same baud: see hil setup --help.")
 
 
-def found(findings: Sequence[Finding]) -> dict[str, Any]:
-    """A check as plain values."""
-    stops = sum(finding.level is Level.STOP for finding in findings)
-    return {
-        "ready": not stops,
-        "findings": [
-            {"level": str(f.level), "where": f.where, "what": f.what, "found": f.found, "mend": f.mend}
-            for f in findings
-        ],
-    }
-
-
 def print_findings(findings: Sequence[Finding], config: Path) -> None:
     """One line for each finding, how to mend it below it, and whether an experiment can start."""
     console = Console(highlight=False, soft_wrap=True)
@@ -91,7 +79,7 @@ def print_findings(findings: Sequence[Finding], config: Path) -> None:
     if stops:
         console.print(f"\n{stops} to mend before an experiment can start, {warnings} to think about.")
     else:
-        console.print(f"\nReady, {warnings} to think about. Next: hil identify {config}")
+        console.print(f"\nReady, {warnings} to think about. Next: hil identify {escape(str(config))}")
 
 
 def changed(changes: Sequence[Change]) -> dict[str, Any]:
@@ -101,7 +89,7 @@ def changed(changes: Sequence[Change]) -> dict[str, Any]:
 
 def print_changes(changes: Sequence[Change]) -> None:
     if not changes:
-        print("Nothing was asked for: give --new-id, --new-baud or --return-delay-us.")
+        print("Nothing was asked for: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
     for change in changes:
         if change.written:
             print(f"{change.register}: {change.before} -> {change.after}, read back.")

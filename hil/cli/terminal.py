@@ -1,17 +1,23 @@
 """What a person sees while the arm moves: a progress bar with each joint's position and current. Quiet when asked."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hil.api.progress import OnProgress
+from hil.api.progress import Progress as Report
 from hil.cli.live_view import LiveView
-from hil.config.schema import Config
+from hil.cli.verbosity import is_quiet
+from hil.config.schema import Config, load_config
 from hil.experiment.stream import Progress as StreamProgress
 from hil.experiment.stream import Watch
 from hil.runs.recording import Phase
+from hil.setup.scan import Asking
+from hil.setup.scan import Watch as ScanWatch
 
 _PHASES = {
     Phase.REST: "resting",
@@ -27,7 +33,7 @@ class Terminal:
     """Messages on standard error, so that standard output holds results only."""
 
     def __init__(self, quiet: bool) -> None:
-        self.console = Console(stderr=True, quiet=quiet, highlight=False)
+        self.console = Console(stderr=True, quiet=quiet or is_quiet(), highlight=False)
 
     def say(self, text: str) -> None:
         self.console.print(text, markup=False)
@@ -37,6 +43,43 @@ class Terminal:
         """A spinner beside `text` while the block runs."""
         with self.console.status(f"{text} ..."):
             yield
+
+    @contextmanager
+    def following(self, config: Path | None) -> Iterator[OnProgress]:
+        """Shows what a long call tells: a live view of the arm of `config` while it moves, else a spinner or a line."""
+        with ExitStack() as showing:
+            watch: Watch | None = None
+
+            def follow(report: Report) -> None:
+                nonlocal watch
+                if report.stream is not None and config is not None:
+                    if watch is None:
+                        watch = showing.enter_context(self.streaming(load_config(config)))
+                    watch(report.stream)
+                elif report.stage == "experiment":
+                    self.say(report.message)
+                else:
+                    showing.close()
+                    watch = None
+                    showing.enter_context(self.busy(report.message))
+
+            yield follow
+
+    @contextmanager
+    def scanning(self) -> Iterator[ScanWatch]:
+        """Servos as they answer, and on a terminal below them what is asked and how long it will take."""
+        if self.console.quiet:
+            yield lambda _: None
+            return
+        with self.console.status("Asking ...") as status:
+
+            def watch(asking: Asking) -> None:
+                if asking.servo is not None:
+                    servo_id, model = asking.servo
+                    self.say(f"{asking.baud} baud, ID {servo_id}: {model}")
+                status.update(f"Asking at {asking.baud} baud, about {asking.left_s:.0f} s left")
+
+            yield watch
 
     @contextmanager
     def streaming(self, config: Config) -> Iterator[Watch]:

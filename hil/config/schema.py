@@ -5,10 +5,22 @@
 
 import math
 import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PositiveFloat,
+    Tag,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from hil import fakes
 from hil.config.bundled import find_config
@@ -16,13 +28,13 @@ from hil.config.chain import MOST_JOINTS, chain_slips
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
 from hil.drivers.bus import BusConfig
-from hil.drivers.joint import Joint
+from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import find_arm
-from hil.toml_errors import describe
+from hil.toml_errors import UNSAID, describe
 
 FAKE_URL = "fake://"
 
@@ -34,6 +46,13 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
+BusId = Annotated[int, Field(ge=0, le=252)]
+_One = TypeVar("_One")
+OneOrList = Annotated[
+    Annotated[_One, Tag(f"{UNSAID}one")] | Annotated[list[_One], Tag(f"{UNSAID}list")],
+    Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
+]
+"""A value, or a list of such; a wrong one is named as what it looks like."""
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -50,9 +69,11 @@ class JointConfig(_Table):
     """`[[joints]]`: one joint, from the base outwards."""
 
     name: str = Field(min_length=1, max_length=20)
-    id: int = Field(ge=0, le=252)
+    servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or those of the two servos of the joint")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
-    direction: Literal[-1, 1] = 1
+    turns: OneOrList[Literal[-1, 1]] = Field(
+        1, alias="direction", description="-1 where the servo turns against the joint; for two servos one each"
+    )
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
     mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
@@ -64,12 +85,50 @@ class JointConfig(_Table):
     current_limit: PositiveFloat | None = Field(None, le=30, description="A")
     voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
 
+    @field_validator("name")
+    @classmethod
+    def _printable(cls, name: str) -> str:
+        """A name goes into terminals, XML, HTML and CSV: no control character, line break or half of a surrogate."""
+        if bad := [each for each in name if not each.isprintable()]:
+            raise ValueError(f"{name!a}: {bad[0]!a} is not a character that can be printed")
+        return name
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.position_limit
         if low >= high:
             raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
         return self
+
+    @model_validator(mode="after")
+    def _a_direction_for_each_servo(self) -> Self:
+        if isinstance(self.servos, list) and not 1 <= len(self.servos) <= 2:
+            raise ValueError(f"id has {len(self.servos)} entries: one servo or two move a joint")
+        if len(set(self.ids)) < len(self.ids):
+            raise ValueError(f"id = {list(self.ids)}: each servo needs one of its own")
+        if isinstance(self.turns, list) and len(self.turns) != len(self.ids):
+            raise ValueError(f"direction has {len(self.turns)} entries for {len(self.ids)} servos: one each")
+        return self
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The IDs of its servos, the first one's first."""
+        return tuple(self.servos) if isinstance(self.servos, list) else (self.servos,)
+
+    @property
+    def id(self) -> int:
+        """The ID of its servo, the first where it has two."""
+        return self.ids[0]
+
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """+1 or -1 for each of its servos."""
+        return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
+
+    @property
+    def direction(self) -> int:
+        """+1 or -1, of the first servo."""
+        return self.directions[0]
 
     @model_validator(mode="after")
     def _driven(self) -> Self:
@@ -113,7 +172,16 @@ class JointConfig(_Table):
 
     @property
     def joint(self) -> Joint:
-        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks, self.drive_mode)
+        seconds = tuple(SecondServo(*each) for each in zip(self.ids[1:], self.directions[1:], strict=True))
+        return Joint(
+            self.name,
+            self.id,
+            servo_model(self.model),
+            self.direction,
+            self.zero_ticks,
+            self.drive_mode,
+            seconds=seconds,
+        )
 
 
 class PriorConfig(_Table):
@@ -143,7 +211,9 @@ class ArmConfig(_Table):
         [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of its base, rad"
     )
     rest_pose: list[float] = Field(description="rad: where the arm hangs, or lies, when nothing drives it")
-    rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+    rest_tolerance: PositiveFloat = Field(
+        0.5, description="rad from the rest pose allowed at the start: friction may hold an arm far from it"
+    )
     link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
     prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
 
@@ -162,6 +232,9 @@ class ExperimentConfig(_Table):
     ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
     settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
+    drift_within: float = Field(
+        0.05, ge=0, lt=1, description="the same, of a motion that still drifts after max_settling_periods"
+    )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="settled periods used")
     held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")
@@ -243,12 +316,13 @@ class SafetyConfig(_Table):
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
     max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
-    min_voltage: float = Field(0.0, ge=0, description="V; the servos' own limits hold beside it")
+    min_voltage: float = Field(0.0, ge=0, description="V; what the models shut down at from the factory, unless given")
     max_voltage: PositiveFloat = Field(30.0, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
     follow_share: PositiveFloat = Field(
         0.3, le=1, description="of the planned peak, by how much it may differ for longer"
     )
+    take_over: bool = Field(False, description="let an arm that is held sink slowly and take it over; else refuse it")
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
     damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
     limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
@@ -291,6 +365,19 @@ class Config(_Table):
     columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
     fake: FakeArm | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _usual_voltage(cls, values: Any) -> Any:
+        """Where no min_voltage is given: that of the model that takes least. 0 V is no supply for any of them."""
+        if not isinstance(values, dict) or not isinstance(values.get("safety", {}), dict):
+            return values
+        joints = values.get("joints")
+        names = (
+            [str(joint.get("model")) for joint in joints if isinstance(joint, dict)] if isinstance(joints, list) else []
+        )
+        least = min((SERVO_MODELS[name].min_voltage for name in names if name in SERVO_MODELS), default=0.0)
+        return {**values, "safety": {"min_voltage": least, **values.get("safety", {})}}
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         count = len(self.joints)
@@ -305,10 +392,8 @@ class Config(_Table):
             excited = [line for lines in self.experiment.lines for line in lines]
             if len(set(excited)) != len(excited):
                 raise ValueError("experiment.lines: two joints share a line; each joint needs its own")
-        for key in ("id", "name"):
-            values = [getattr(joint, key) for joint in self.joints]
-            if len(set(values)) != count:
-                raise ValueError(f"joints: two joints have the same {key} {values[0]!r}")
+        _all_different("id", [servo_id for joint in self.joints for servo_id in joint.ids])
+        _all_different("name", [joint.name for joint in self.joints])
         for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
             _check_rest_pose(joint, rest)
         if self.experiment.peak_torque is not None:
@@ -317,8 +402,6 @@ class Config(_Table):
         self._check_pilot()
         if self.model.torque_scale and count != 2 and not self.is_chain:
             raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
-        if len({joint.drive_mode for joint in self.joints}) != 1:
-            raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
         return self
@@ -362,11 +445,12 @@ class Config(_Table):
         return BusConfig(
             self.url,
             self.port.baud,
-            tuple(joint.joint for joint in self.joints),
+            tuple(replace(joint.joint, near=rest) for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True)),
             one_write=self.port.one_write,
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
             watchdog_required=not self.safety.allow_no_watchdog,
+            take_over=self.safety.take_over,
             interval=1 / self.experiment.rate,
         )
 
@@ -408,6 +492,12 @@ def parse_config(text: str, path: Path) -> Config:
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
     if len(values) != count:
         raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each of [[joints]]")
+
+
+def _all_different(key: str, values: Sequence[int | str]) -> None:
+    again = [value for place, value in enumerate(values) if value in values[:place]]
+    if again:
+        raise ValueError(f"joints: two joints have the same {key} {again[0]!r}")
 
 
 def _check_rest_pose(joint: JointConfig, rest: float) -> None:

@@ -1,22 +1,29 @@
 """The simulated arms over time against the position limits, as a PNG or SVG."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hil.config.schema import Config
+from hil.drawing import new_figure
 from hil.dry_run.prediction import Prediction
 from hil.errors import RunFolderError
 
 
 def draw(config: Config, prediction: Prediction, path: Path) -> None:
-    """Write the picture; raises RunFolderError without matplotlib, or where `path` cannot be written."""
+    """Write the picture; raises MissingExtra without matplotlib, RunFolderError where `path` cannot be written."""
+    figure = plot(config, prediction)
     try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise RunFolderError('The picture needs matplotlib: install it with pip install "hil[png]".') from None
+        figure.savefig(path, dpi=130)
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{path} cannot be written: {error}.") from error
+
+
+def plot(config: Config, prediction: Prediction) -> Any:
+    """The picture as a matplotlib figure; raises MissingExtra."""
     joints = len(config.joints)
-    figure = Figure(figsize=(9, 2.6 * joints), layout="constrained")
+    figure = new_figure(9, 2.6 * joints)
     axes = figure.subplots(joints, 1, sharex=True, squeeze=False)[:, 0]
     time = np.arange(prediction.shown.shape[2]) / prediction.rate
     every = max(1, time.size // 4000)
@@ -30,7 +37,4 @@ def draw(config: Config, prediction: Prediction, path: Path) -> None:
         axis.set_ylabel(f"{joint.name} [rad]")
     axes[0].set_title("Simulated arms; red: limits, dashed: 99 % of the predicted peaks", fontsize=10, loc="left")
     axes[-1].set_xlabel("time [s]")
-    try:
-        figure.savefig(path, dpi=130)
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{path} cannot be written: {error}.") from error
+    return figure

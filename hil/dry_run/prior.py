@@ -1,8 +1,7 @@
 """What is known of an arm before anything was identified: masses, lengths and friction, each with its spread.
 
 `[arm.prior]` gives what its author knows. The rest is guessed from link lengths by rules of thumb (below), which have
-no better source than a look at a few arms, and from the servo models (hil.drivers.servo_prior), both with a wide
-spread.
+no better source than a look at a few arms, and from the servo models (hil.drivers.servo_prior): both spread widely.
 """
 
 from dataclasses import dataclass

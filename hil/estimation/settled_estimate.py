@@ -1,10 +1,8 @@
 """From a run folder to its result: settled period, both stages, the check on a multisine that was not used."""
 
+import logging
 import time
 from dataclasses import replace
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.estimation.chain_estimate import estimate_chain_run
@@ -15,9 +13,9 @@ from hil.estimation.result_checks import describe_choice, describe_validation, d
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimator.data.settled_period import SettledPeriod
-from hil.estimator.identify import Estimate, identify, predict
-from hil.estimator.models.parameters import Physics
-from hil.estimator.selection.settled import Choice, choose
+from hil.estimator.identify import Estimate, identify
+from hil.estimator.selection.candidates import considered
+from hil.estimator.selection.settled import Choice, choose, predict_period
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import judge
 from hil.plan.plan import HELD_OUT, IDENTIFY
@@ -28,6 +26,8 @@ from hil.runs.period_file import PlayedPeriod, save_periods
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
 from hil.runs.timing import timing
+
+log = logging.getLogger(__name__)
 
 
 def estimate_run(run: RunFolder) -> SettledResult:
@@ -40,9 +40,10 @@ def estimate_run(run: RunFolder) -> SettledResult:
     period = settled_period(config, facts, samples, IDENTIFY)
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     estimate, choice = _estimate(config, period, other, run.load_starts())
+    estimate = replace(estimate, covariance=considered(period, estimate))
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if other is not None:
-        predicted = _predict(config, estimate, other)
+        predicted = predict_period(estimate, other)
         played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
@@ -60,6 +61,9 @@ def estimate_run(run: RunFolder) -> SettledResult:
     if config.stabiliser is not None:
         chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(IDENTIFY))
         result = replace(result, stabiliser=stabiliser_share(config, samples[chosen]))
+    log.info("%s: %s, %d parameters, %.3g s", run.path, result.method, len(result.quantities), seconds)
+    for warning in result.warnings:
+        log.warning("%s: %s", run.path, warning)
     save_periods(run.path, played)
     run.write_result(result)
     return result
@@ -74,11 +78,3 @@ def _estimate(
         choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts)
         return choice.estimate, choice
     return identify(period, wanted_model(wanted, len(config.joints)), starts=starts), None
-
-
-def _predict(config: Config, estimate: Estimate, other: SettledPeriod) -> NDArray[np.float64]:
-    """The model's free prediction of another multisine, (joints, samples) [rad]."""
-    if other.stabiliser is None:
-        return predict(estimate, other.torque, other.rate, other.command_to_sample)
-    arm, pose = Physics.of(estimate.parameters), np.array(config.arm.rest_pose)
-    return other.stabiliser.settled_positions(arm, pose, other.rate, other.command_to_sample)

@@ -30,6 +30,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         if whole and not np.isfinite(position[:, index]).any():
             raise RecordingCutShort(f"{joint.name} never said where it is during {role!r}: look at its cable and ID.")
     first = _first_settled(position, experiment.settle_within)
+    if first is None and whole > max(experiment.max_settling_periods, experiment.periods):
+        first = _drifting(position, experiment.drift_within, experiment.periods)
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
         raise RecordingCutShort(
@@ -96,3 +98,8 @@ def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
         if settling_difference(position[period - 1], position[period]) <= within:
             return period
     return None
+
+
+def _drifting(position: NDArray[np.float64], within: float, wanted: int) -> int | None:
+    """The first of the last `wanted` periods, where all that is left of the settling is slow."""
+    return len(position) - wanted if settling_difference(position[-2], position[-1]) <= within else None

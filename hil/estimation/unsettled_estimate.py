@@ -1,5 +1,6 @@
 """Estimates from recordings that hold no settled period: CSV files, and runs that were cut short."""
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,6 +26,8 @@ from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Zeros
 from hil.results.result import ShootingResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
+
+log = logging.getLogger(__name__)
 
 START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
 START_WIDTH = 0.05  # rad/s
@@ -86,6 +89,9 @@ def _estimate(
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3))
     result = replace(result, warnings=tuple(any_warnings(recordings, estimate)))
+    log.info("%s: %s", shown_path, result.method)
+    for warning in result.warnings:
+        log.warning("%s: %s", shown_path, warning)
     return result if choice is None else replace(result, model_choice=describe_segment_choice(choice))
 
 

@@ -11,6 +11,7 @@ from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import DriverError, ServoFault, TorqueNotOff, WrongSetting
 from hil.drivers.latency import command_to_set, latency_timer
 from hil.drivers.state import State
+from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
@@ -23,6 +24,7 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
+from hil.setup.servo_session import has_moved, servo_session
 
 _LAST_SAMPLES = 100
 """How many samples an error carries with it."""
@@ -34,15 +36,26 @@ _PATIENCE_S = 0.2
 """How long the end of a run waits for whoever watches."""
 
 
-def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch, plan: Plan | None = None) -> str:
+_MOVED = 2.0
+
+
+def run_experiment(
+    config: Config,
+    run: RunFolder,
+    shown_path: Path,
+    watch: Watch,
+    plan: Plan | None = None,
+    arms: Ensemble | None = None,
+) -> str:
     """Play the configuration's experiment and record it in `run`; the sentence about torque at the end.
 
-    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`.
+    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`. arms: what
+    is known of the arm, by default its prior.
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
     plan = plan_of(config) if plan is None else plan
     fakes.register_for(config.url)
-    with StopRequest() as stop, EventLog(run) as log, ServoBus.open(config.bus) as bus:
+    with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
 
         def note(what: str) -> None:
@@ -55,7 +68,7 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
             # Signals are only noted from before torque comes on until the servos are as they were.
             with stop.only_noted(), servo_limits(config, bus, note):
-                _play(config, plan, bus, recorder, stop, shown, note)
+                _play(config, plan, bus, recorder, stop, shown, note, arms)
             torque = str(bus.torque_off_report)
             note(torque)
             with suppress(RunFolderError):  # the recording holds all of it
@@ -74,10 +87,17 @@ def _check_still_wanted(stop: StopRequest, torque: str) -> None:
 
 
 def _play(
-    config: Config, plan: Plan, bus: ServoBus, recorder: Recorder, stop: StopRequest, watch: Watch, note: Note
+    config: Config,
+    plan: Plan,
+    bus: ServoBus,
+    recorder: Recorder,
+    stop: StopRequest,
+    watch: Watch,
+    note: Note,
+    arms: Ensemble | None,
 ) -> None:
     """Torque on, stream, torque off; whatever stops it is kept among the events."""
-    stream = Stream(bus, plan, config, recorder, stop, watch, note)
+    stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     try:
         # In this order: what _on_time does takes longer than the watchdog waits.
         with _on_time(bus.port.clock, note), bus.torque(config.safety.watchdog):
@@ -138,22 +158,34 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms on the wire alone at "
             f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
         )
+    slowest = bus.port.latency + wire
+    if slowest <= 1 / rate:
+        return
     file = latency_timer(bus.port.url)
-    if file is not None and bus.port.latency + wire > 1 / rate:
+    if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which leaves "
-            f"{1 / (bus.port.latency + wire):.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+            f"{1 / slowest:.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+        )
+    if bus.port.latency_measured:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: replies lie {bus.port.latency * 1e3:.0f} ms in this adapter, as measured, which "
+            f"leaves {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short latency, such as a U2D2."
         )
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described."""
+    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described.
+
+    Where the run before it has passed that check, friction may hold the arm twice as far away.
+    """
+    tolerance = config.arm.rest_tolerance * (_MOVED if has_moved() else 1.0)
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
-        if abs(position - rest) > config.arm.rest_tolerance:
+        if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
                 f"{joint} is at {position:.3f} rad; arm.rest_pose says {rest:.3f} and arm.rest_tolerance allows "
-                f"{config.arm.rest_tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
+                f"{tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
                 f"Only if it is in its rest pose now, set zero_ticks = {ticks}."
             )
 

@@ -17,8 +17,10 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
+from hil.dry_run.ensemble import Ensemble
 from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.experiment.guard import Guard
+from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
@@ -48,18 +50,30 @@ class Stream:
     """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
 
     watch: called about 20 times a second with the progress. note: called with each event worth keeping. Neither may
-    block. Make it before torque is on: it works out all that can be worked out beforehand.
+    block. arms: what is known of the arm, by default its prior. Make it before torque is on: it works out all that can
+    be worked out beforehand.
     """
 
     def __init__(
-        self, bus: ServoBus, plan: Plan, config: Config, recorder: Recorder, stop: StopRequest, watch: Watch, note: Note
+        self,
+        bus: ServoBus,
+        plan: Plan,
+        config: Config,
+        recorder: Recorder,
+        stop: StopRequest,
+        watch: Watch,
+        note: Note,
+        arms: Ensemble | None = None,
     ) -> None:
         self._bus = bus
         self._clock = bus.port.clock
         self._plan = plan
         self._config = config
         self._safety = config.safety
-        self._guard = Guard(config, _largest_goals(plan))
+        planned = _largest_goals(plan)
+        self._guard = Guard(config, planned)
+        # Arms in space have no watch by a model yet, and are played on the fake bus only.
+        self._model = None if config.is_chain else ModelWatch(config, planned, arms)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -123,10 +137,14 @@ class Stream:
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                 return
+        if difference <= self._plan.drift_within:
+            self._note(f"{segment.role}: still changes by {difference:.2%} a period, slowly; the last ones are used")
+            return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}. Look for play, a dragging cable or a slipping joint; or raise "
+            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} of what only "
+            "drifts. Look for play, a dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 
@@ -194,6 +212,8 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        if self._model is not None:
+            self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 

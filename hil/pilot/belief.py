@@ -22,6 +22,7 @@ from hil.pilot.seen import Seen
 from hil.plan.stabiliser import feedback_of
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _LINEAR = ("offset", "zero")
 """Of either sign: not by their logarithms."""
@@ -32,6 +33,12 @@ _LINEAR_RANGE = 0.02  # rad: smaller displacements count as they are, larger one
 _ERROR = 0.08
 """Of a displacement so counted: what models of this kind leave."""
 _LEAST_ERROR_STEPS = 1.5
+MOVED_STEPS = 12
+"""Encoder steps that a joint must swing to count as moved."""
+_STILL = 0.02  # rad: what a simulated joint may swing where the real one stood still
+_MOST_RAISES, _RAISE = 12, (0.05, 0.25)
+"""Of friction's logarithm, one after the other, until a simulated joint stands still too."""
+
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
 """By how much errors are overstated each time; the reciprocals add up to 1, which makes the data count once."""
 _LONGEST_MOVE = 1.0  # of a parameter at a time, in e-folds, or in standard deviations of the prior
@@ -73,34 +80,53 @@ class Belief:
     def ensemble(self, farther: float = 1.0) -> Ensemble:
         """For a dry run; farther: range of motion that will be simulated over the one that was seen."""
         belief = self if not self.learned else self._widened(_LEAST_SPREAD * (1.0 + np.log2(max(1.0, farther))))
-        physics = tuple(Physics.of(values) for values in belief.parameters)
-        joints = 2 if any(name.endswith("_2") for name in self.names) else 1
-        return Ensemble(physics, np.ones((len(physics), joints)), "belief" if self.learned else "prior")
+        parameters = belief.parameters
+        joints = 2 if "torque_scale_2" in parameters[0] else 1
+        scale = np.array([[1.0, each.pop("torque_scale_2", 1.0)][:joints] for each in parameters])
+        physics = tuple(Physics.of(each) for each in parameters)
+        return Ensemble(physics, scale, "belief" if self.learned else "prior")
 
     def after(self, config: Config, seen: Seen) -> "Belief":
         """What is thought after `seen`."""
+        step = np.array([joint.joint.servo.position_unit for joint in config.joints])
+        moved = seen.swing > MOVED_STEPS * step
         random = np.random.default_rng((self.seed, 8, self.learned))
+        belief = self._held(config, seen, ~moved, random)
+        if moved.any():
+            belief = belief._drawn_to(config, seen, moved, random)._held(config, seen, ~moved, random)
+        return replace(belief, learned=self.learned + 1)
+
+    def _held(self, config: Config, seen: Seen, still: Mask, random: np.random.Generator) -> "Belief":
+        """Arms whose joints move where the real ones stood `still` (joints,) get dry friction until they stand too."""
+        belief = self
+        places = [self.names.index(f"coulomb_{joint + 1}") for joint in np.flatnonzero(still)]
+        for _ in range(_MOST_RAISES if places else 0):
+            motions = belief._motions(config, seen)[:, still]
+            moves = np.ptp(motions, axis=2) > _STILL
+            if not moves.any():
+                break
+            x = belief.coordinates.copy()
+            x[:, places] += np.where(moves, random.uniform(*_RAISE, moves.shape), 0.0)
+            belief = replace(belief, coordinates=x)
+        return belief
+
+    def _drawn_to(self, config: Config, seen: Seen, moved: Mask, random: np.random.Generator) -> "Belief":
+        """The smoother, on the motion of the joints that `moved` (joints,)."""
         index = np.unique(np.linspace(0, seen.command.shape[1] - 1, _TIMES).astype(int))
         index = index[np.isfinite(seen.position[:, index]).all(axis=0)]
         step = np.array([joint.joint.servo.position_unit for joint in config.joints])
-        error = np.hypot(_ERROR * _compressed(seen.swing), _LEAST_ERROR_STEPS * step / _LINEAR_RANGE)[:, None]
-        measured = (_compressed(seen.position[:, index] - seen.pose[:, None]) / error).reshape(-1)
+        error = np.hypot(_ERROR * _compressed(seen.swing), _LEAST_ERROR_STEPS * step / _LINEAR_RANGE)[moved, None]
+        measured = (_compressed(seen.position[:, index] - seen.pose[:, None])[moved] / error).reshape(-1)
 
         def foreseen(belief: Belief) -> Array:
-            moved = belief._motions(config, seen)[:, :, index] - seen.pose[:, None]
-            return np.nan_to_num(_compressed(np.clip(moved, -10.0, 10.0)) / error).reshape(len(moved), -1)
+            displaced = (belief._motions(config, seen)[:, :, index] - seen.pose[:, None])[:, moved]
+            return np.nan_to_num(_compressed(np.clip(displaced, -10.0, 10.0)) / error).reshape(len(displaced), -1)
 
         belief = self
         for inflation in _INFLATIONS:
             belief = belief._moved(foreseen(belief), measured, inflation, random)
         left = np.mean((foreseen(belief) - measured) ** 2, axis=1)
-        return replace(belief._without_strays(left, random), learned=self.learned + 1)
-
-    def misfit(self, config: Config, seen: Seen) -> Array:
-        """RMS of simulated less measured position of each arm over the motion's largest swing (arms,)."""
-        away = self._motions(config, seen) - seen.position
-        rms: Array = np.sqrt(np.nanmean(np.clip(away, -10.0, 10.0) ** 2, axis=(1, 2))) / seen.swing.max()
-        return rms
+        return belief._without_strays(left, random)
 
     def _motions(self, config: Config, seen: Seen) -> Array:
         """Of every arm under what was commanded (arms, joints, samples) [rad]."""

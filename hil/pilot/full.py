@@ -12,6 +12,7 @@ from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player, Say
 from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
+from hil.setup.servo_session import servo_session
 
 MOST_TRIES = 3
 """Full runs, where one passes a limit or does not settle."""
@@ -27,7 +28,9 @@ def identify_in_steps(
 
     Raises what a run raises, and ExperimentError when a joint does not move at its current limit.
     """
-    with StopRequest():  # a request to stop that comes in one step, however late, is for all that would follow
+    # A request to stop that comes in one step, however late, is for all that would follow. What the servos were set to
+    # is kept once for all steps, and put back once: EEPROM wears.
+    with StopRequest(), servo_session(config, run.path, say):
         search = Search.of(config, run, Player(shown_path, watch, say))
         played = _full(search, *search.find())
         run.write_starts([search.belief.middle])
@@ -44,7 +47,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         number += 1
         chosen = with_torque(config, found.peak_torque)
         run.write_played(chosen)
-        played = search.player.play(chosen, run, "Full run", found)
+        played = search.play(chosen, run, "Full run", found)
         search.learn(chosen, played)
         if played.error is None:
             return played

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
-from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque
+from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
 from hil.dry_run.prediction import GUARDED, predict
 from hil.dry_run.waves import designed_plan, roomy_plan
-from hil.errors import ExperimentError
+from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.models.parameters import Physics
-from hil.pilot.belief import Belief, prior_belief
+from hil.pilot.belief import MOVED_STEPS, Belief, prior_belief
 from hil.pilot.gains import with_stabiliser
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
@@ -33,17 +33,15 @@ MOST_STEPS, MOST_PILOTS = 12, 10
 CERTAIN = 0.85
 """A typical arm should come this far on its way to a limit; where it stays below, uncertainty costs too much range."""
 
-MOVED_STEPS = 12
-"""Encoder steps that a joint must swing before anything larger than a pilot is played."""
-
 _PILOT_PERIOD_SHARE = 0.5
 _PILOT_SETTLING = 1
 _AFTER_LIMIT = 0.85
 """Of the torque under which a limit was passed: the most of what follows."""
 _MOST_RAISE = 1.6
 _AT_LIMIT = 0.99
-_MORE = 1.15
-"""Times the torque of the run before: where one more would add less, it is not made."""
+_MORE, _LITTLE_MORE, _FAIR = 1.15, 1.03, 0.7
+"""Times the torque of the run before: where one more would add less, it is not made; the first where a typical arm
+comes fairly far on its way to a limit."""
 
 
 @dataclass
@@ -87,7 +85,7 @@ class Search:
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
-        self.pose = played.seen.pose
+        self.pose = played.seen.end
         swing = played.seen.swing
         self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
 
@@ -99,8 +97,21 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest safe one for the arms that could be this one. Raises NoSafeTorque."""
-        return largest_amplitude(config, self.belief.ensemble(self._farther), share, plan, self.pose, self.cap)
+        """The largest safe one for the arms that could be this one.
+
+        Where none is, that of the last run, which the real arm has shown to be safe, or less if it was not. Raises
+        NoSafeTorque when there was no run yet.
+        """
+        ensemble = self.belief.ensemble(self._farther)
+        try:
+            return largest_amplitude(config, ensemble, share, plan, self.pose, self.cap)
+        except NoSafeTorque:
+            if not self.steps:
+                raise
+        torque = self.steps[-1].peak_torque
+        torque = torque if self.cap is None else np.minimum(torque, self.cap)
+        plan = with_peaks(config, torque) if plan is None else scaled(config, plan, torque)
+        return Amplitude(plan, torque, predict(config, plan, ensemble, pose=self.pose))
 
     @property
     def _farther(self) -> float:
@@ -154,14 +165,19 @@ class Search:
             self._play(step_config(config), f"step-{number}", f"Step {number}", only_first(found))
             former, config = found.peak_torque, self.held
             found = self.amplitude(config, 1.0, self._waves(config) if config.stabiliser is not None else plan)
-            if (found.peak_torque <= _MORE * former).all():
+            if (found.peak_torque <= (_MORE if self._shares(found).min() > _FAIR else _LITTLE_MORE) * former).all():
                 break  # what was learned lets it go no farther
         return config, found
 
     def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
         played_config = with_torque(config, found.peak_torque)
-        played = self.player.play(played_config, self.run.below(folder, played_config), name, found)
+        played = self.play(played_config, self.run.below(folder, played_config), name, found)
         self.learn(played_config, played)
+
+    def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
+        """Play one run, for the arms that could be this one, from where the last one left it."""
+        arms = self.belief.ensemble(self._farther)
+        return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 
     def _waves(self, config: Config) -> Plan:
         arm = Physics.of(self.belief.middle)
@@ -170,10 +186,15 @@ class Search:
         return roomy_plan(config, arm)
 
     def _certain(self, config: Config, found: Amplitude) -> bool:
-        shares = np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0)
+        shares = self._shares(found)
         full = found.peak_torque >= _AT_LIMIT * most_torque(config)
         capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= _AT_LIMIT * self.cap
         return bool(((shares >= CERTAIN) | full | capped).all())
+
+    @staticmethod
+    def _shares(found: Amplitude) -> Array:
+        """How far a typical arm comes on its way to a limit (joints,)."""
+        return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
     def _give_up(self, config: Config, still: list[str]) -> None:
         tried = "; ".join(
@@ -181,9 +202,9 @@ class Search:
         )
         most = ", ".join(f"{torque:.3g}" for torque in most_torque(config))
         raise ExperimentError(
-            f"{_and(still)} did not move by {MOVED_STEPS} encoder steps. Tried: {tried}; the current limits allow {most} "
-            "N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, look at the "
-            "supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
+            f"{_and(still)} did not move by {MOVED_STEPS} encoder steps. Tried: {tried}; the current limits allow "
+            f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
+            "look at the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
         )
 
 
@@ -198,6 +219,11 @@ def pilot_config(config: Config) -> Config:
         low, high = experiment.band
         update |= {"period": period, "band": [max(low, 1 / period), high]}
     return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
+
+
+def _from_anywhere(config: Config) -> Config:
+    """The configuration for an arm that was in its rest pose when the search began, and is where friction left it."""
+    return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_tolerance": 2 * np.pi})})
 
 
 def only_first(found: Amplitude) -> Amplitude:

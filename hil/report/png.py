@@ -1,31 +1,32 @@
 """Charts as PNG, drawn by matplotlib from the same description as the SVG."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hil.errors import ExportError
+from hil.drawing import new_figure
 from hil.report.chart import Chart, Figure, Matrix, Series
 
 
 def save_png(figure: Figure, path: Path) -> None:
-    """Draw one picture; raises ExportError where matplotlib is not installed, OSError as writing does."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure as Canvas
-    except ImportError as error:
-        raise ExportError("PNG needs the package matplotlib: pip install 'hil[png]'.") from error
-    square = isinstance(figure, Matrix)
-    canvas = Canvas(figsize=(8.8, 8.2) if square else (8.8, 3.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(canvas)
-    axes = canvas.subplots()
-    axes.set_title(figure.title, fontsize=11)
-    if isinstance(figure, Chart):
-        _draw_chart(axes, figure)
-    else:
-        _draw_matrix(axes, figure)
-    canvas.savefig(path)
+    """Draw one picture; raises MissingExtra where matplotlib is not installed, OSError as writing does."""
+    draw_figures([figure], dpi=150).savefig(path)
+
+
+def draw_figures(figures: Sequence[Figure], dpi: int = 90) -> Any:
+    """The pictures below each other as one matplotlib figure; raises MissingExtra."""
+    heights = [8.2 if isinstance(figure, Matrix) else 3.6 for figure in figures]
+    canvas = new_figure(8.8, sum(heights), dpi)
+    rows = canvas.subplots(len(figures), 1, squeeze=False, height_ratios=heights)
+    for axes, figure in zip(rows[:, 0], figures, strict=True):
+        axes.set_title(figure.title, fontsize=11)
+        if isinstance(figure, Chart):
+            _draw_chart(axes, figure)
+        else:
+            _draw_matrix(axes, figure)
+    return canvas
 
 
 def _draw_chart(axes: Any, chart: Chart) -> None:

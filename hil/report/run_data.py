@@ -1,6 +1,5 @@
 """Everything a report shows, read once from a run folder."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,6 @@ from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
 from hil.config.schema import Config
-from hil.errors import RunFolderError
 from hil.model_file import model_of, read_settled_result
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.results.result import SettledResult
@@ -45,7 +43,7 @@ class RunData:
             model_of(result, path),
             load_samples(run.samples_path, len(config.joints)),
             load_periods(path),
-            _events(path / "events.jsonl"),
+            run.load_events(),
         )
 
     @property
@@ -62,19 +60,3 @@ class RunData:
     def held_out(self) -> PlayedPeriod | None:
         """The settled period that the model predicted without having seen it."""
         return self.periods.get(HELD_OUT)
-
-
-def _events(path: Path) -> tuple[tuple[float, str], ...]:
-    """The events; a last line that was cut short by a crash is left out."""
-    if not path.is_file():
-        return ()
-    lines = path.read_text(encoding="utf-8").splitlines()
-    found = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            entry = json.loads(line)
-            found.append((float(entry["time"]), str(entry["event"])))
-        except (ValueError, KeyError, TypeError) as error:
-            if number < len(lines):
-                raise RunFolderError(f"{path} is damaged in line {number}: {line[:60]!r}.") from error
-    return tuple(found)

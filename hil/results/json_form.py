@@ -1,7 +1,8 @@
 """Frozen dataclasses to JSON values and back, without loss. Standard library only, so that a model loads quickly.
 
-A field is a key of the same name, or of the name in its metadata under "key". A field that may be None, and is unless
-given, is left out of the JSON while it is None. Keys that no field has are ignored when read: a newer hil wrote them.
+A field is a key of the same name, or of the name in its metadata under "key"; with False under "json", it is none.
+A field that may be None, and is unless given, is left out of the JSON while it is None. Keys that no field has are
+ignored when read: a newer hil wrote them.
 JSON has no infinity and no NaN: they are written as null, which is read as NaN, or as infinity in a `Spread`.
 """
 
@@ -30,7 +31,7 @@ def to_json(value: Any) -> Any:
         return {
             _key(field): to_json(entry)
             for field in fields(value)
-            if (entry := getattr(value, field.name)) is not None or field.default is not None
+            if ((entry := getattr(value, field.name)) is not None or field.default is not None) and not _is_aside(field)
         }
     if isinstance(value, Mapping):
         return {name: to_json(entry) for name, entry in value.items()}
@@ -99,6 +100,10 @@ def _hints(kind: type) -> dict[str, Any]:
 
 def _key(field: Field[Any]) -> str:
     return str(field.metadata.get("key", field.name))
+
+
+def _is_aside(field: Field[Any]) -> bool:
+    return field.metadata.get("json") is False
 
 
 def _below(where: str, key: str) -> str:

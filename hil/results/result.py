@@ -25,6 +25,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from hil.results.display import as_html, as_text
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.parts import (
     ArmFacts,
@@ -50,7 +51,7 @@ __all__ = ["SCHEMA", "Result", "SettledResult", "ShootingResult", "result_from_j
 SCHEMA = 1
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Result:
     """What an identification found, whatever it was estimated from. Fields in the order of result.json.
 
@@ -90,8 +91,25 @@ class Result:
         described: dict[str, Any] = to_json(self)
         return described
 
+    def __repr__(self) -> str:
+        return as_text(self._title, self.quantities, self._sentences)
 
-@dataclass(frozen=True, kw_only=True)
+    def _repr_html_(self) -> str:
+        return as_html(self._title, self.quantities, self.truth or {}, self._sentences)
+
+    @property
+    def _title(self) -> str:
+        trust = "" if self.verdict is None else f", trust it: {self.verdict.trust}"
+        residual = ", ".join(f"{value:.3f}" for value in self.fit.residual_rms_ticks)
+        return f"{self.joints}-joint arm of {self.config}{trust}; residual {residual} encoder steps RMS"
+
+    @property
+    def _sentences(self) -> list[str]:
+        judged = [] if self.verdict is None else list(self.verdict.sentences)
+        return [*judged, *(f"Warning: {warning}" for warning in self.warnings)]
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class SettledResult(Result):
     """From the settled periods of a run."""
 
@@ -104,7 +122,7 @@ class SettledResult(Result):
     steps: tuple[PlayedStep, ...] | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class ShootingResult(Result):
     """From any motion, by multiple shooting: recordings made elsewhere, and runs without a settled period."""
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hil.drivers.state import State
 from hil.errors import RunFolderError
+from hil.runs.file_size import check_array
 
 
 class Phase(IntEnum):
@@ -164,7 +165,8 @@ def missed(goal_current: Sequence[float], now: float) -> State:
 def load_samples(path: Path, joints: int) -> NDArray[np.void]:
     """The recorded rows of a `samples.npy`, also of one whose process was killed. Raises RunFolderError."""
     try:
-        samples = np.load(path, allow_pickle=False)
+        check_array(path)
+        samples = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, ValueError, EOFError) as error:
         raise RunFolderError(f"{path} cannot be read as a recording: {error}.") from error
     expected = sample_type(joints)

@@ -4,6 +4,7 @@ config.toml     copied byte for byte
 experiment.json the [experiment] that was really played, where the tool chose it (pilot, torque found by dry runs)
 stabiliser.json the [stabiliser] likewise
 run.json        versions, start time, and the few facts that the samples need to be read again
+servo_settings.json  what the servos were set to before (hil.setup.servo_session)
 events.jsonl    what happened when, one JSON object a line, written as it happens
 samples.npy     every sample (hil.runs.recording)
 lateness.json   how many samples were how late (hil.runs.timing)
@@ -12,6 +13,7 @@ period.npz      the settled periods as measured and as the model has them (hil.r
 """
 
 import json
+import logging
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -28,6 +30,8 @@ from hil.errors import RunFolderError
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
+
+log = logging.getLogger(__name__)
 
 SCHEMA = 1
 _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
@@ -217,6 +221,7 @@ class RunFolder:
 
     def event(self, time: float, what: str) -> None:
         """Append one event, with its time on the port's clock [s]; raises RunFolderError."""
+        log.info("%.3f s: %s", time, what)
         line = json.dumps({"time": round(time, 6), "event": what}, ensure_ascii=False)
         path = self.path / "events.jsonl"
         try:
@@ -224,6 +229,25 @@ class RunFolder:
                 file.write(line + "\n")
         except OSError as error:
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+    def load_events(self) -> tuple[tuple[float, str], ...]:
+        """(time on the port's clock [s], what happened); a last line that a crash cut short is left out.
+
+        Raises RunFolderError.
+        """
+        path = self.path / "events.jsonl"
+        if not path.is_file():
+            return ()
+        lines = path.read_text(encoding="utf-8").splitlines()
+        found = []
+        for number, line in enumerate(lines, start=1):
+            try:
+                entry = json.loads(line)
+                found.append((float(entry["time"]), str(entry["event"])))
+            except (ValueError, KeyError, TypeError) as error:
+                if number < len(lines):
+                    raise RunFolderError(f"{path} is damaged in line {number}: {line[:60]!r}.") from error
+        return tuple(found)
 
     def write_result(self, result: Result) -> None:
         """Write result.json. Raises RunFolderError."""

@@ -7,6 +7,7 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.rate import FixedRate
 from hil.drivers.servo_model import VELOCITY_UNIT, VOLTAGE_UNIT, Mode
+from hil.setup.servo_session import servo_session
 
 _SECONDS = 1.0
 
@@ -14,7 +15,7 @@ _SECONDS = 1.0
 def quiet_stream(config: Config) -> tuple[str, ...]:
     """What the servos say of themselves, and how the exchange keeps time, in lines for a person. Raises DriverError."""
     fakes.register_for(config.url)
-    with ServoBus.open(config.bus) as bus:
+    with servo_session(config) as bus:
         return (*_limits(config, bus), _timing(config, bus))
 
 

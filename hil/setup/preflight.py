@@ -1,19 +1,24 @@
-"""Everything that would stop an experiment, looked at before one, with how to mend it. Torque stays off."""
+"""Everything that would stop an experiment, looked at before one, with how to fix it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hil import fakes
 from hil.config.schema import Config, JointConfig
 from hil.drivers.bus import ServoBus
 from hil.drivers.control_table import model_names
-from hil.drivers.errors import DriverError, NoReply, PortLost, PortNotOpened
+from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNotOpened
 from hil.drivers.joint import Joint
 from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
-from hil.drivers.packet import HardwareError
+from hil.drivers.packet import MAX_ID, HardwareError
+from hil.drivers.preparation import TIME_BASED_PROFILE, check_quiet
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
-from hil.setup.bus_rate import check_rate
+from hil.drivers.settings import WATCHDOG_TRIPPED, arms_itself
+from hil.setup.bus_rate import check_rate, goals_taken
+from hil.setup.others import others_on_the_bus
+from hil.setup.servo_session import recover
 
 _WARM_BELOW_LIMIT_C = 15
 _LONG_RETURN_DELAY_US = 20
@@ -40,6 +45,7 @@ class Finding:
 
 def check_arm(config: Config) -> Iterator[Finding]:
     """Look at port, servos, pose and rate, in this order; what cannot be looked at is a STOP, never an exception."""
+    fakes.register_for(config.url)
     try:
         bus = ServoBus.connect(config.bus)
     except PortNotOpened as error:
@@ -48,15 +54,20 @@ def check_arm(config: Config) -> Iterator[Finding]:
     with bus:
         yield Finding(Level.OK, bus.port.url, "port", f"opened at {config.port.baud} baud")
         yield _latency_timer(bus)
+        yield from _others(config, bus)
         all_well = True
         for joint_config, joint in zip(config.joints, bus.joints, strict=True):
-            for finding in _servo(config, joint_config, joint, bus.servo(joint)):
-                all_well &= finding.level is not Level.STOP
-                yield finding
+            for drive, servo in zip(joint.drives, bus.servos(joint), strict=True):
+                for finding in _servo(config, joint_config, drive, servo):
+                    all_well &= finding.level is not Level.STOP
+                    yield finding
         if not all_well:
-            yield Finding(Level.STOP, "bus", "rate", "not measured", "Mend what stops the servos first.")
+            yield Finding(Level.STOP, "bus", "rate", "not measured", "Fix the servo problems above first.")
             return
-        yield from _rate(config, bus)
+        goals = list(_goals(bus))
+        yield from goals
+        if all(finding.level is not Level.STOP for finding in goals):
+            yield from _rate(config, bus)
 
 
 def _latency_timer(bus: ServoBus) -> Finding:
@@ -73,8 +84,31 @@ def _latency_timer(bus: ServoBus) -> Finding:
     return Finding(level, url, what, f"{before_ms} ms, {WANTED_MS} is needed", f"Type: {command_to_set(file)}")
 
 
+def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
+    """Servos beside the arm's: nothing is ever sent to them, but whoever drives them should know."""
+    try:
+        check_quiet(bus.port)
+    except BusShared as error:
+        yield Finding(Level.STOP, config.port.url, "other masters", "another one speaks", str(error))
+        return
+    except DriverError as error:
+        yield Finding(Level.WARNING, config.port.url, "other masters", "not listened for", str(error))
+        return
+    try:
+        found = others_on_the_bus(bus)
+    except DriverError as error:
+        yield Finding(Level.WARNING, config.port.url, "others", "not asked", str(error))
+        return
+    if found:
+        mend = "They are left alone: no torque and no setting of theirs is changed."
+        yield Finding(Level.WARNING, config.port.url, "others on this bus", "; ".join(found), mend)
+
+
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
-    """Everything about one servo, read only; breaks off where it does not answer or is another model."""
+    """Everything about one servo; breaks off where it does not answer or is another model.
+
+    Nothing is written, but for what an earlier program left behind: that is put back.
+    """
     where = str(joint)
     try:
         number = servo.ping()
@@ -90,6 +124,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
         yield Finding(Level.STOP, where, "model", f"a {found}", "Correct `model` or `id` in the configuration.")
         return
     yield Finding(Level.OK, where, "model", servo.table.model)
+    yield from _left_behind(config, joint, servo)
     for look in (*_LOOKS, _pose):
         try:
             level, what, found, mend = look(config, joint_config, joint, servo)
@@ -104,6 +139,20 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
             yield Finding(Level.STOP, where, "registers", "cannot be read", mend)
             return
         yield Finding(level, where, what, found, mend)
+
+
+def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding]:
+    """What a run that was killed could not put back."""
+    what = "settings of an earlier run"
+    try:
+        written = recover(servo, config.url)
+    except DriverError as error:
+        yield Finding(Level.WARNING, str(joint), what, "cannot be put back", str(error))
+        return
+    if written:
+        yield Finding(
+            Level.OK, str(joint), what, f"it was ended before it could put them back; now {', '.join(written)}"
+        )
 
 
 _Seen = tuple[Level, str, str, str]
@@ -144,7 +193,28 @@ def _drive_mode(_config: Config, _joint_config: JointConfig, _joint: Joint, serv
         "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), bit 3 lets any goal turn torque on. "
         "Set it with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(drive_mode == 0, "drive mode", str(drive_mode), mend)
+    return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), mend)
+
+
+def _secondary_id(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
+    secondary = servo.read("Secondary(Shadow) ID")
+    others = {servo_id for each in config.joints for servo_id in each.ids} - {joint.id}
+    none = secondary > MAX_ID
+    mend = (
+        f"It does what is told to that ID too, EEPROM aside. Type: hil setup {_port(config)} --id {joint.id} "
+        "--secondary-id 255"
+    )
+    level = Level.STOP if secondary in others else Level.WARNING
+    return _graded(none, "secondary ID", "none" if none else str(secondary), mend, level)
+
+
+def _startup(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+    armed = arms_itself(servo)
+    mend = (
+        "Startup Configuration arms it whenever it is switched on or reboots, also in the middle of a run. Set that "
+        "register to 0 with DYNAMIXEL Wizard 2.0."
+    )
+    return _graded(not armed, "at switch-on", "torque comes on by itself" if armed else "torque stays off", mend)
 
 
 def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -167,17 +237,37 @@ def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo
     return _graded(config.port.baud >= 1_000_000, "baud", found, mend, Level.WARNING)
 
 
+def _share(joint_config: JointConfig) -> float:
+    """Of the joint's limit, what one of its servos gives [A or V]."""
+    return joint_config.goal_limit / len(joint_config.ids)
+
+
 def _drive_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     if joint.mode is Mode.PWM:
         volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * servo.read("PWM Limit") / FULL_PWM_TICKS
         mend = f"Lower voltage_limit in the configuration, or raise the servo's PWM Limit (at most {FULL_PWM_TICKS})."
-        return _graded(joint_config.goal_limit <= volts, "PWM limit", f"{volts:.1f} V at this supply", mend)
+        return _graded(_share(joint_config) <= volts, "voltage limit", f"{volts:.1f} V at this supply", mend)
     amperes = servo.read("Current Limit") * abs(joint.drive_unit(0.0))
     mend = (
         f"The configuration's current_limit is {joint_config.goal_limit:g} A: lower it, or raise the servo's Current "
         "Limit with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(joint_config.goal_limit <= amperes, "current limit", f"{amperes:.3f} A", mend)
+    return _graded(_share(joint_config) <= amperes, "current limit", f"{amperes:.3f} A", mend)
+
+
+def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
+    pwm = servo.read("PWM Limit")
+    volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * pwm / FULL_PWM_TICKS
+    share = _share(joint_config)
+    needed = share * joint.servo.resistance if joint.mode is Mode.CURRENT else share
+    found = f"{pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply"
+    mend = (
+        f"It bounds the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
+        "rest and more at speed: raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
+    )
+    if volts < needed:
+        return Level.STOP, "PWM limit", found, mend
+    return _graded(pwm >= FULL_PWM_TICKS, "PWM limit", found, mend, Level.WARNING)
 
 
 def _shutdown(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
@@ -187,12 +277,15 @@ def _shutdown(_config: Config, _joint_config: JointConfig, _joint: Joint, servo:
     return _graded(wanted in mask, "shuts down on", describe_error(mask), mend, Level.WARNING)
 
 
-def _voltage(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
+def _voltage(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     voltage, low, high = (
         VOLTAGE_UNIT * servo.read(name) for name in ("Present Input Voltage", "Min Voltage Limit", "Max Voltage Limit")
     )
     found = f"{voltage:.1f} V ({low:.1f} to {high:.1f})"
-    return _graded(low <= voltage <= high, "voltage", found, "Mend the supply: outside its limits it shuts down.")
+    if voltage < config.safety.min_voltage:
+        mend = f"A {joint.servo.name} needs {config.safety.min_voltage:g} V (safety.min_voltage): switch the supply on."
+        return Level.STOP, "voltage", found, mend
+    return _graded(low <= voltage <= high, "voltage", found, "Fix the supply: outside its limits it shuts down.")
 
 
 def _temperature(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
@@ -206,8 +299,11 @@ def _temperature(_config: Config, _joint_config: JointConfig, _joint: Joint, ser
 
 def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     ticks = servo.read("Present Position")
-    angle = joint.angle(ticks)
-    rest = config.arm.rest_pose[[each.id for each in config.joints].index(joint.id)]
+    index = [joint.id in each.ids for each in config.joints].index(True)
+    if joint.id != config.joints[index].id:
+        return Level.OK, "pose", f"the first servo's counts (ID {config.joints[index].id})", ""
+    angle = joint.within_turn(ticks).angle(ticks)
+    rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
     mend = (
         f"arm.rest_pose says {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "
@@ -222,14 +318,40 @@ _LOOKS: tuple[_Look, ...] = (
     _hardware_error,
     _torque,
     _drive_mode,
+    _secondary_id,
     _mode,
     _baud,
     _return_delay,
+    _startup,
     _drive_limit,
+    _pwm_limit,
     _shutdown,
     _voltage,
     _temperature,
 )
+
+
+def _goals(bus: ServoBus) -> Iterator[Finding]:
+    """Whether goals arrive: a Sync Write has no answer, so each servo is asked what it holds, with torque off."""
+    try:
+        taken = goals_taken(bus)
+    except DriverError as error:
+        yield Finding(Level.STOP, "bus", "goals", "not tried", str(error))
+        return
+    for joint, servo in bus.drives.items():
+        if joint in taken:
+            continue
+        tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
+        if tripped:
+            yield Finding(
+                Level.OK, str(joint), "goals", "refused until its tripped Bus Watchdog is cleared, as a run does"
+            )
+            continue
+        mend = (
+            "A goal sent by Sync Write did not arrive though reads are answered: try port.one_write = false; look for "
+            "an adapter or hub that swallows bytes, and for a second servo with this ID."
+        )
+        yield Finding(Level.STOP, str(joint), "goals", "not taken", mend)
 
 
 def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:

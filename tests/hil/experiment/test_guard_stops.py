@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import serial
 
-from benchmarks.faults import SpiedPlant, Spy, call_at
 from hil.config.schema import Config, parse_config
 from hil.drivers.errors import TorqueNotOff, WrongModel
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
@@ -25,6 +24,7 @@ from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
 from tests.support.paths import CONFIGS
+from tests.support.spied_plant import SpiedPlant, Spy, call_at
 
 Arm = Callable[..., Config]
 STIFF_GUARD = ("[experiment]\n", "[safety]\nmax_temperature = 40.0\nmin_voltage = 11.0\n\n[experiment]\n")

@@ -196,9 +196,14 @@ def test_what_forbids_an_experiment_is_found_before_torque(
     assert ports[0].bus.plant.position == pytest.approx([-np.pi / 2, 0.0], abs=1e-3), "the arm did not move"
 
 
-def test_a_servo_in_another_mode_is_brought_into_current_mode(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
-    run(arm(), tmp_path / "run")  # the fake, as servos from the factory, starts in position mode
-    assert [servo.operating_mode for servo in ports[0].bus.servos.values()] == [0, 0]
+def test_a_servo_in_another_mode_is_brought_into_current_mode_and_back(
+    arm: Arm, tmp_path: Path, ports: list[Any]
+) -> None:
+    seen: list[int] = []
+    look = at_sample(10, lambda: seen.extend(servo.operating_mode for servo in ports[0].bus.servos.values()))
+    run(arm(), tmp_path / "run", look)  # the fake, as servos from the factory, starts in position mode
+    assert seen == [0, 0]
+    assert [servo.operating_mode for servo in ports[0].bus.servos.values()] == [3, 3]
 
 
 def test_factory_return_delay_is_waited_for(arm: Arm, tmp_path: Path) -> None:

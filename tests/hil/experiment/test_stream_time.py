@@ -10,7 +10,7 @@ import pytest
 import serial
 
 from hil.config.schema import Config
-from hil.drivers.errors import PortLost, WrongSetting
+from hil.drivers.errors import PortLost, TorqueNotOff, WrongSetting
 from hil.errors import SafetyStop
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
@@ -72,7 +72,7 @@ def test_a_lost_port_carries_the_last_samples(arm: Arm, tmp_path: Path, ports: l
         ports[0].write = fail
 
     config = arm()
-    with pytest.raises(Exception, match="NOT CONFIRMED") as caught:
+    with pytest.raises(TorqueNotOff, match="NOT CONFIRMED") as caught:
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, once_at(900, pull))
     lost: Any = caught.value.__context__
     assert isinstance(lost, PortLost)

@@ -1,0 +1,67 @@
+"""Torque that was on before anybody asked for it: told apart, refused, or taken over so that the arm sinks slowly."""
+
+from collections.abc import Mapping
+
+from hil.drivers.clock import Clock
+from hil.drivers.errors import TorqueHeld
+from hil.drivers.joint import Joint
+from hil.drivers.servo import Servo
+from hil.drivers.servo_model import Mode
+from hil.drivers.settings import WATCHDOG_TRIPPED
+
+FADE_S = 1.0
+"""How long the limit of what a held servo may give is taken down to nothing [s]."""
+
+SINKING_S = 4.0
+"""How long a joint may go on sinking, braked by its own motor, before torque is cut [s]."""
+
+_STEPS = 20
+_STILL_TICKS = 2  # of Present Velocity
+
+
+def is_held(servo: Servo) -> bool:
+    """Whether it has torque on that holds or drives it; raises as `Servo.read`.
+
+    A tripped Bus Watchdog has set its goal to nothing: in current and PWM mode its joint is free.
+    """
+    if not servo.read("Torque Enable"):
+        return False
+    tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
+    return not (tripped and servo.read("Operating Mode") in (Mode.CURRENT, Mode.PWM))
+
+
+def refuse_held(servos: Mapping[Joint, Servo]) -> None:
+    """Raise TorqueHeld where a joint is held; raises as `Servo.read`."""
+    held = [joint for joint, servo in servos.items() if is_held(servo)]
+    if held:
+        raise TorqueHeld(
+            f"{' and '.join(joint.title for joint in held)}: torque is on, so another program drives or holds the arm, "
+            "or left it so. Cutting it would let the arm fall, so nothing was written. Stop that program; or hold "
+            "the arm by hand and take it over with --take-over (BusConfig.take_over), which lets it sink slowly."
+        )
+
+
+def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
+    """Take away what held servos give, step by step, wait until they no longer sink, and cut their torque.
+
+    With its PWM at nothing and its torque on a motor is shorted and brakes. Raises as `Servo.write`.
+    """
+    held = {joint: servo for joint, servo in servos.items() if is_held(servo)}
+    goals = {joint: _what_drives(servo) for joint, servo in held.items()}
+    begun = {joint: servo.read(goals[joint]) for joint, servo in held.items()}
+    for step in range(1, _STEPS + 1):
+        clock.wait_until(clock.now() + FADE_S / _STEPS)
+        for joint, servo in held.items():
+            servo.write(goals[joint], round(begun[joint] * (1 - step / _STEPS)))
+    until = clock.now() + SINKING_S
+    while held and clock.now() < until:
+        clock.wait_until(clock.now() + 0.1)
+        if all(abs(servo.read("Present Velocity")) <= _STILL_TICKS for servo in held.values()):
+            break
+    for servo in held.values():
+        servo.write("Torque Enable", 0)
+
+
+def _what_drives(servo: Servo) -> str:
+    """The goal that limits what the motor gives in the servo's present mode."""
+    return "Goal Current" if servo.read("Operating Mode") == Mode.CURRENT else "Goal PWM"

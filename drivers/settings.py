@@ -1,0 +1,80 @@
+"""What a servo is set to: the registers that an experiment changes, and those that the servo itself changes with them.
+
+Operating Mode and Current Limit are EEPROM: what a program leaves there is there after a power cycle, and the next
+program's plain Torque Enable drives the full current of the wrong mode. A change of Operating Mode resets goals and
+gains (ROBOTIS e-Manual, Operating Mode). Goal Position is left out: a servo takes its present position for it when
+torque comes on, and an old one must never move an arm.
+"""
+
+from collections.abc import Mapping
+from contextlib import suppress
+
+from hil.drivers.control_table import Register
+from hil.drivers.errors import DriverError, WrongSetting
+from hil.drivers.servo import Servo
+
+EEPROM = ("Current Limit", "Operating Mode")
+"""Each may be written twice in an experiment, set and put back; in this order, since the limit bounds the goal."""
+
+RAM = (
+    "Velocity I Gain",
+    "Velocity P Gain",
+    "Position D Gain",
+    "Position I Gain",
+    "Position P Gain",
+    "Feedforward 2nd Gain",
+    "Feedforward 1st Gain",
+    "Goal PWM",
+    "Goal Current",
+    "Goal Velocity",
+    "Profile Acceleration",
+    "Profile Velocity",
+)
+
+STARTUP_CONFIGURATION = Register("Startup Configuration", 60, 1)
+"""Not in the SDK's tables. Bit 0: torque on by itself after power-up or reboot; bit 1: RAM area restored then."""
+
+TORQUE_ON_AT_STARTUP = 0x01
+WATCHDOG_TRIPPED = 0xFF
+
+
+def read_settings(servo: Servo) -> dict[str, int]:
+    """The registers that an experiment may change, by name [ticks]; raises as `Servo.read`."""
+    settings = {name: servo.read(name) for name in (*EEPROM, *RAM) if name in servo.table}
+    watchdog = servo.read("Bus Watchdog")
+    # A tripped one cannot be written; who clears it leaves it off.
+    settings["Bus Watchdog"] = 0 if watchdog == WATCHDOG_TRIPPED else watchdog
+    return settings
+
+
+def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+    """Write what differs from `settings`, each read back; what was written, from what to what.
+
+    Raises WrongSetting while torque is on, else as `Servo.write`; everything that can be written is then written.
+    """
+    if servo.read("Torque Enable"):
+        raise WrongSetting(f"{servo.title}: its settings cannot be put back while its torque is on.")
+    if servo.read("Bus Watchdog") != 0:
+        servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    written: dict[str, tuple[int, int]] = {}
+    failures: list[DriverError] = []
+    for name in (*EEPROM, *RAM, "Bus Watchdog"):
+        if name not in settings or name not in servo.table:
+            continue
+        try:
+            present = servo.read(name)
+            if present != settings[name]:
+                servo.write(name, settings[name])
+                written[name] = present, settings[name]
+        except DriverError as error:
+            failures.append(error)
+    if failures:
+        raise failures[0]
+    return written
+
+
+def arms_itself(servo: Servo) -> bool:
+    """Whether torque comes on by itself when this servo is switched on or rebooted; raises as `Servo.read`."""
+    with suppress(DriverError):
+        return bool(servo.read_entry(STARTUP_CONFIGURATION) & TORQUE_ON_AT_STARTUP)
+    return False  # older firmware has no such register

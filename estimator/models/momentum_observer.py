@@ -1,0 +1,234 @@
+"""Watches whether an arm's motion is one that its model allows, sample by sample and without accelerations.
+
+The planar arm's equations, integrated once, are linear in its parameters and hold angles, velocities and torques alone:
+
+    torque = d/dt momentum(q, v) theta + rest(q, v) theta
+
+Passed through a first-order low-pass both sides become sums over the past (generalised momentum: A. De Luca and
+R. Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li,
+"On the adaptive control of robot manipulators", 1987). The parameters are known as a mean and a covariance, those of an
+ensemble of arms; from sample to sample they are learnt (recursive least squares, that is, a Kalman filter on constants
+that drift slowly). So what the arm may do is wide for an arm hardly known, and narrows as it moves.
+
+Alarm: for `HOLD_S` the torque lacking in a joint is more than `TIMES` standard deviations of what parameters and noise
+leave open, more than friction can hold while the joint stands, and more than a share of the largest planned torque.
+Noise is learnt too: what the model lacks (Stribeck friction, play, flexibility) widens what is allowed.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numba
+import numpy as np
+
+from hil.estimator.arrays import Array
+
+NAMES = (
+    *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
+    *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2", "tilt_1", "tilt_2"),
+)
+"""Of the parameters; a tilt is gravity across the direction in which the angles' zero expects it."""
+
+FILTER_S = 0.02
+HOLD_S = 0.02
+TIMES = 4.0
+FLOOR_SHARE = 0.25
+"""Of the largest planned torque: less is never an alarm."""
+
+_COUNT = len(NAMES)
+_STANDING = 0.05  # rad/s below which a joint may be held by its dry friction
+_STATIC = 1.5  # static friction over Coulomb's
+_VELOCITY_STD = 0.0135  # rad/s: a register's step, which is 0.024, and some noise
+_FIRST_NOISE_SHARE = 0.1  # of the largest planned torque
+_NOISE_S = 1.0  # in which the noise is learnt
+_CLIPPED = 9.0  # variances by which one sample may teach it
+_DRIFT = 0.03  # of its first deviation by which a parameter may drift in a second, as a standard deviation
+_WARM_S = 3 * FILTER_S
+_LONGEST_GAP = 3.0  # intervals between two samples behind which the past is forgotten
+
+# Rows of the observer's memory: momentum and rest through the filter, rest at the former sample (two joints each), the
+# parameters, one of single numbers, then their covariance.
+_MOMENTUM, _REST, _FORMER, _THETA, _SINGLE, _COVARIANCE = 0, 2, 4, 6, 7, 8
+# Of the single numbers: per joint filtered torque, noise variance, standing, time of alarm, samples of it, lacking
+# torque; then the time since the last lesson and since the start.
+_TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
+
+
+class MomentumObserver:
+    """For arms of one or two joints.
+
+    mean: parameters by their NAMES, 0 where left out. covariance: in the order of NAMES (14, 14). largest: planned
+    torque of each joint (joints,) [N m]. interval: from one sample to the next [s].
+    """
+
+    def __init__(self, mean: Mapping[str, float], covariance: Array, largest: Array, interval: float) -> None:
+        joints = len(largest)
+        if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
+            raise ValueError(f"{joints} joints and a covariance of {covariance.shape}: 1 or 2, and 14 x 14, are needed")
+        self._joints = joints
+        self._memory = np.zeros((_COVARIANCE + _COUNT, _COUNT))
+        self._memory[_THETA] = [mean.get(name, 0.0) for name in NAMES]
+        self._memory[_COVARIANCE:] = covariance
+        self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * largest) ** 2
+        floor = np.zeros(2)
+        floor[:joints] = FLOOR_SHARE * largest
+        self._constants = np.concatenate(
+            ([joints, interval, *floor], (_DRIFT**2 * np.diag(covariance)), (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2)
+        )
+        self.observe((0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf)  # compiled, and begun anew
+
+    def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
+        """One sample: angles [rad], velocities [rad/s], the torques that were commanded since the sample before
+        [N m], and the time since then [s]. The joint (from 0) whose motion no arm explains, -1 for none.
+        """
+        if self._joints == 1:
+            return _observe(self._memory, self._constants, position[0], 0.0, velocity[0], 0.0, torque[0], 0.0, seconds)
+        return _observe(self._memory, self._constants, *position, *velocity, *torque, seconds)
+
+    @property
+    def lacking(self) -> list[float]:
+        """Torque per joint that the commanded one lacks to explain the motion, latest (joints,) [N m]."""
+        return [float(value) for value in self._memory[_SINGLE, _LACKING : _LACKING + self._joints]]
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What has been learnt so far, by name."""
+        return dict(zip(NAMES, self._memory[_THETA].tolist(), strict=True))
+
+
+def _regressors(momentum: Any, rest: Any, q1: float, q2: float, v1: float, v2: float) -> None:
+    """Rows of both joints, in the order of NAMES."""
+    cos_2, sin_2 = math.cos(q2), math.sin(q2)
+    both = v1 + v2
+    momentum[0, 0] = v1
+    momentum[0, 1] = cos_2 * (v1 + both)
+    momentum[0, 2] = both
+    momentum[1, 1] = cos_2 * v1
+    momentum[1, 2] = both
+    momentum[1, 3] = v2
+    rest[1, 1] = sin_2 * v1 * both
+    rest[0, 4] = math.cos(q1)
+    rest[0, 5] = rest[1, 5] = math.cos(q1 + q2)
+    rest[0, 12] = math.sin(q1)
+    rest[0, 13] = rest[1, 13] = math.sin(q1 + q2)
+    rest[0, 6] = v1
+    rest[1, 7] = v2
+    rest[0, 8] = math.tanh(v1 / _STANDING)
+    rest[1, 9] = math.tanh(v2 / _STANDING)
+    rest[0, 10] = rest[1, 11] = 1.0
+
+
+# Compiled code takes its arguments by position; m is the observer's memory, k its constants, j a joint.
+def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
+    """Forget the past: nothing is known of what the arm did since the sample before."""
+    single = m[_SINGLE]
+    for j in range(2):
+        for i in range(_COUNT):
+            m[_MOMENTUM + j, i] = momentum[j, i]
+            m[_REST + j, i] = m[_FORMER + j, i] = rest[j, i]
+        single[_TORQUE + j] = t1 if j == 0 else t2
+        single[_STANDS + j] = 1.0
+        single[_HELD + j] = single[_SAMPLES + j] = 0.0
+    single[_LESSON] = single[_AGE] = 0.0
+
+
+def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: float, slope: float, row: Any) -> None:
+    """One joint's signals through the low-pass; the filtered equation's regressors into `row`."""
+    single = m[_SINGLE]
+    for i in range(_COUNT):
+        m[_MOMENTUM + j, i] += fallen * (momentum[j, i] - m[_MOMENTUM + j, i])
+        m[_REST + j, i] += fallen * (0.5 * (rest[j, i] + m[_FORMER + j, i]) - m[_REST + j, i])
+        m[_FORMER + j, i] = rest[j, i]
+        row[i] = slope * (momentum[j, i] - m[_MOMENTUM + j, i]) + m[_REST + j, i]
+    single[_TORQUE + j] += fallen * (torque - single[_TORQUE + j])
+    single[_STANDS + j] += fallen * (1.0 - abs(rest[j, 8 + j]) - single[_STANDS + j])
+
+
+def _lacks(m: Any, j: int, row: Any, gain: Any) -> tuple[float, float]:
+    """Torque that the commanded one lacks, and the variance of it that the parameters leave open; `gain` times it."""
+    lacking = m[_SINGLE, _TORQUE + j]
+    left_open = 0.0
+    for i in range(_COUNT):
+        lacking -= row[i] * m[_THETA, i]
+        gain[i] = 0.0
+        for n in range(_COUNT):
+            gain[i] += m[_COVARIANCE + i, n] * row[n]
+        left_open += row[i] * gain[i]
+    return lacking, left_open
+
+
+def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
+    for i in range(_COUNT):
+        m[_THETA, i] += gain[i] * lacking / spread
+        for n in range(_COUNT):
+            m[_COVARIANCE + i, n] -= gain[i] * gain[n] / spread
+
+
+def _held_by_friction(m: Any, j: int) -> float:
+    """Torque that dry friction may hold for as much of the past as the joint stood [N m]."""
+    dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
+    return float(_STATIC * max(dry, 0.0) * min(max(m[_SINGLE, _STANDS + j], 0.0), 1.0))
+
+
+def _of_rounding(m: Any, j: int, slope: float) -> float:
+    """Variance of the lacking torque from velocities in whole ticks."""
+    inertia = m[_THETA, 0] + m[_THETA, 2] + 2.0 * abs(m[_THETA, 1]) if j == 0 else m[_THETA, 2] + m[_THETA, 3]
+    rounding = slope * _VELOCITY_STD * max(inertia, 0.0)
+    return float(rounding * rounding)
+
+
+def _alarms(single: Any, j: int, is_beyond: bool, dt: float) -> bool:
+    """Whether this lasts long enough."""
+    if not is_beyond:
+        single[_HELD + j] = single[_SAMPLES + j] = 0.0
+        return False
+    single[_HELD + j] += dt
+    single[_SAMPLES + j] += 1.0
+    return bool(single[_HELD + j] >= HOLD_S and single[_SAMPLES + j] >= 2.0)
+
+
+def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float) -> int:
+    momentum, rest = np.zeros((2, _COUNT)), np.zeros((2, _COUNT))
+    _regressors(momentum, rest, q1, q2, v1, v2)
+    if dt > _LONGEST_GAP * k[1]:
+        _begin_anew(m, momentum, rest, t1, t2)
+        return -1
+    single = m[_SINGLE]
+    fallen = 1.0 - math.exp(-dt / FILTER_S)
+    slope = fallen / ((1.0 - fallen) * dt)  # of what is left of a value behind the filter: its filtered derivative
+    single[_LESSON] += dt
+    single[_AGE] += dt
+    is_warm = single[_AGE] > _WARM_S
+    # What is filtered repeats itself: only after the filter's time there is something new to learn.
+    lesson = is_warm and single[_LESSON] >= FILTER_S
+    if lesson:
+        for i in range(_COUNT):
+            m[_COVARIANCE + i, i] += k[4 + i] * single[_LESSON]
+        single[_LESSON] = 0.0
+    alarm = -1
+    row, gain = np.empty(_COUNT), np.empty(_COUNT)
+    for j in range(int(k[0])):
+        _filter(m, j, momentum, rest, t1 if j == 0 else t2, fallen, slope, row)
+        if not is_warm:
+            continue
+        lacking, left_open = _lacks(m, j, row, gain)
+        single[_LACKING + j] = lacking
+        holds, rounding = _held_by_friction(m, j), _of_rounding(m, j, slope)
+        spread = left_open + rounding + single[_NOISE + j]
+        beyond = max(abs(lacking) - holds, 0.0)
+        is_beyond = beyond > TIMES * math.sqrt(spread)
+        if _alarms(single, j, is_beyond and beyond > k[2 + j], dt):
+            alarm = j
+        taught = min(beyond * beyond, _CLIPPED * spread) - left_open - rounding
+        single[_NOISE + j] += min(dt / _NOISE_S, 1.0) * (max(taught, k[4 + _COUNT + j]) - single[_NOISE + j])
+        if lesson and not is_beyond:
+            _learn(m, gain, lacking, spread + holds * holds)
+    return alarm
+
+
+_inner: Any = numba.njit(nogil=True, error_model="numpy")
+_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms = map(
+    _inner, (_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms)
+)
+_observe: Callable[..., int] = numba.njit(cache=True, nogil=True, error_model="numpy")(_observe_loop)

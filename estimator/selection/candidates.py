@@ -1,0 +1,236 @@
+"""What a model leaves out, judged without fitting it: the score test, and what leaving it out does to error bars.
+
+About an estimate the motion is linear in small changes of any parameter, those of terms that the model lacks too. One
+simulation with the derivatives by all of them tells by how much the sum of squares would fall if a term were added
+(C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50), and how far the fitted parameters would move. Terms
+that nobody can rule out, such as an encoder's zero or torque that saturates, so widen the error bars even where the
+motion does not show them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with what is
+usual of them as the prior and what the motion says of them on top.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.settled_period import SettledPeriod, without_spikes
+from hil.estimator.fit.covariance import autocorrelation
+from hil.estimator.fit.reparametrisation import Sizes
+from hil.estimator.fit.ripple import find_ripple
+from hil.estimator.fit.simulated_run import SimulatedRun
+from hil.estimator.fit.stabilised_run import StabilisedRun
+from hil.estimator.fit.stage1 import LinearEstimate
+from hil.estimator.identify import Estimate
+from hil.estimator.models.model import Model
+from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import FRICTIONS, OPTIONS, term_of
+from hil.estimator.options import IntegrationOptions
+
+MAX_LAG_SHARE = 0.05  # of the samples, over which a residual's correlation is summed
+INTEGRATION = IntegrationOptions()
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model with one thing more than the estimate's, and what the score test says of it."""
+
+    model: Model
+    part: str
+    """The option or law of friction that it adds."""
+    names: tuple[str, ...]
+    """The parameters that it adds."""
+    evidence: float
+    """By how much it lowers the sum of squares, over what chance would: above 1 it is seen."""
+    explained: float
+    """Share of the sum of squares that it explains."""
+    values: Mapping[str, float]
+    """First guesses of the added parameters."""
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """The weighted sum of squares about an estimate, by changes of parameters, then of the first state."""
+
+    names: tuple[str, ...]
+    """Of the parameters: those of the estimate and those of candidates."""
+    value: Array
+    """Where it is expanded (parameters,) [SI]."""
+    normal: Array
+    """J'WJ (causes, causes)."""
+    gradient: Array
+    """J'Wr, r simulated less measured (causes,)."""
+    samples: int
+    """Of all joints: the sum of squares, weighted by the residual as it is."""
+    colour: float
+    """By how much the residual's correlation makes chance larger: 1 is white."""
+    precision: Array
+    """Inverse variances expected of the parameters (parameters,), 0 where nothing is."""
+
+    @cached_property
+    def states(self) -> list[int]:
+        """Places of the first state's causes."""
+        return list(range(len(self.names), len(self.normal)))
+
+    def places(self, names: Sequence[str]) -> list[int]:
+        """Places of parameters."""
+        return [self.names.index(name) for name in names]
+
+    def fall(self, names: Sequence[str]) -> tuple[float, Array]:
+        """By how much the sum of squares falls when these parameters and the first state move, and how far they do."""
+        at = [*self.places(names), *self.states]
+        normal, gradient = self.normal[np.ix_(at, at)], self.gradient[at]
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        prior = np.concatenate((self.precision[at[: len(names)]], np.zeros(len(self.states)))) * self.colour
+        inverse = np.linalg.pinv((normal + np.diag(prior)) / np.outer(scale, scale), rcond=1e-11, hermitian=True)
+        step = -(inverse @ (gradient / scale)) / scale
+        return float(-gradient @ step), step[: len(names)]
+
+
+def linearised(
+    period: SettledPeriod, estimate: Estimate, names: Sequence[str], known: Mapping[str, float]
+) -> Linearised:
+    """Expand the sum of squares of `period` about `estimate`, which was fitted to it.
+
+    `names`: parameters beside the estimate's; they are expanded about what `known` says, else where they are absent.
+    """
+    used = without_spikes(period)
+    added = [name for name in names if name not in estimate.names]
+    every = (*estimate.names, *added)
+    values = {name: known.get(name, term_of(name).absent) for name in added} | estimate.parameters
+    physics = Physics.of({**known, **values})
+    run = (
+        SimulatedRun.of(used, INTEGRATION)
+        if used.stabiliser is None
+        else StabilisedRun.of(used, used.stabiliser, INTEGRATION)
+    )
+    rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
+    weight = np.where(np.isfinite(estimate.residual), 1.0 / np.maximum(rms, 1e-300), 0.0)
+    causes = len(every) + 2 * period.joints
+    normal, gradient = np.zeros((causes, causes)), np.zeros(causes)
+    for part, position, derivative in run.pieces(physics, estimate.start, every):
+        J = (derivative * weight[:, part, None]).reshape(-1, causes)
+        normal += J.T @ J
+        gradient += J.T @ (weight[:, part] * (position - run.measured[:, part])).reshape(-1)
+    sizes = _sizes(period, estimate)
+    spread = np.array(
+        [np.inf if term_of(name).spread is None else sizes.of(term_of(name).spread or 1.0) for name in every]
+    )
+    return Linearised(
+        every,
+        np.array([values[name] for name in every]),
+        normal,
+        gradient,
+        int(np.isfinite(estimate.residual).sum()),
+        colour(estimate.residual * weight),
+        1.0 / spread**2,
+    )
+
+
+def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
+    """What could be added to the estimate's model, the best seen first.
+
+    `known`: where ripple repeats (`hil.estimator.fit.ripple.find_ripple`), by parameter name.
+    """
+    model = estimate.model
+    richer = _richer(model)
+    new = {part: tuple(n for n in more.names if n not in model.names) for part, more in richer.items()}
+    about = linearised(period, estimate, [n for names in new.values() for n in names], known)
+    base, _ = about.fall(estimate.names)
+    found = []
+    for part, more in richer.items():
+        fall, step = about.fall((*estimate.names, *new[part]))
+        free = sum(term_of(name).part != "ripple" or "cycles" not in name for name in new[part])
+        chance = about.colour * free * np.log(max(about.samples / about.colour, 3.0))
+        moved = dict(zip(new[part], step[len(estimate.names) :].tolist(), strict=True))
+        found.append(
+            Candidate(
+                more,
+                part,
+                new[part],
+                max(0.0, fall - base) / chance,
+                max(0.0, fall - base) / about.samples,
+                {name: _started(name, change, known) for name, change in moved.items()},
+            )
+        )
+    return sorted(found, key=lambda each: -each.evidence)
+
+
+def considered(period: SettledPeriod, estimate: Estimate) -> Array:
+    """The estimate's covariance (parameters, parameters) with what its model leaves out and nobody can rule out.
+
+    Of each such parameter the prior and what the motion says of it are taken together. It is as if it were fitted too,
+    but for the value, which stays where it is: by how far it would move comes on top.
+    """
+    model = estimate.model
+    absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
+    left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
+    left_out = [name for name in left_out if term_of(name).spread is not None]
+    if not left_out:
+        return estimate.covariance
+    about = linearised(period, estimate, left_out, {})
+    fitted = [*about.places(estimate.names), *about.states]
+    extra = about.places(left_out)
+    scale = np.sqrt(np.maximum(np.diag(about.normal), 1e-300))
+    normal, gradient = about.normal / np.outer(scale, scale), about.gradient / scale
+    own = normal[np.ix_(fitted, fitted)]
+    across = normal[np.ix_(fitted, extra)]
+    prior = about.precision[extra] / scale[extra] ** 2
+    inverse = np.linalg.pinv(own, rcond=1e-11, hermitian=True)
+    follow = -inverse @ across
+    told = (normal[np.ix_(extra, extra)] + across.T @ follow) / about.colour
+    open_ = np.linalg.inv(0.5 * (told + told.T) + np.diag(prior) + 1e-12 * np.eye(len(extra)))
+    moved = -open_ @ (gradient[extra] + follow.T @ gradient[fitted]) / about.colour
+    count = len(estimate.names)
+    wider = follow[:count] / scale[:count, None]
+    widened = wider @ (open_ + np.outer(moved, moved)) @ wider.T
+    seen = np.isfinite(np.diag(estimate.covariance))
+    covariance: Array = estimate.covariance + np.where(np.outer(seen, seen), widened, 0.0)
+    return covariance
+
+
+def colour(residual: Array) -> float:
+    """Integrated autocorrelation of a residual (joints, samples), worst joint, missing samples as 0; 1 is white."""
+    worst = 1.0
+    for row in np.nan_to_num(residual):
+        rho = autocorrelation(row, max(2, int(MAX_LAG_SHARE * row.size)))
+        below = np.flatnonzero(rho[1:] < 2.0 / np.sqrt(row.size))
+        last = int(below[0]) + 1 if below.size else rho.size
+        worst = max(worst, 1.0 + 2.0 * float(rho[1:last].sum()))
+    return worst
+
+
+def _richer(model: Model) -> dict[str, Model]:
+    """Models with one option, or one law of friction, more: those that are linear in what they add."""
+    absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
+    richer: dict[str, Model] = {option: model.having(option) for option in absent if option != "presliding"}
+    higher = FRICTIONS[FRICTIONS.index(model.friction) + 1 :][:1]
+    return richer | {law: replace(model, friction=law) for law in higher}
+
+
+def _may_be(option: str, model: Model) -> bool:
+    return option != "torque_scale" or model.joints == 2
+
+
+def _started(name: str, change: float, known: Mapping[str, float]) -> float:
+    term = term_of(name)
+    if "cycles" in name:
+        return known.get(name, term.initial)
+    if term.range == "positive":
+        return max(0.1 * term.initial, min(term.absent + change, 3.0 * term.initial)) if term.initial else change
+    return term.absent + change
+
+
+def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
+    velocity = np.diff(estimate.position, axis=1) * period.rate
+    return Sizes(
+        float(np.sqrt(np.mean(period.torque**2))),
+        float(np.sqrt(np.mean(velocity**2))),
+        abs(estimate.parameters["inertia_1"]),
+    )
+
+
+def ripple_of(period: SettledPeriod, linear: LinearEstimate) -> dict[str, float]:
+    """Where ripple repeats, for `candidates`."""
+    return {name: value for name, value in find_ripple([period], linear).items() if "cycles" in name}

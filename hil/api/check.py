@@ -1,0 +1,66 @@
+"""`hil.check`: everything that would stop an experiment, found before one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.api.experiment import ConfigLike, loaded
+from hil.api.progress import OnProgress, Progress, ignore
+from hil.results.display import html_table
+from hil.setup.preflight import Finding, Level, check_arm
+
+__all__ = ["CheckReport", "Finding", "Level", "check"]
+
+
+@dataclass(frozen=True, repr=False)
+class CheckReport:
+    """What was looked at, in order, on the arm of the file `config`."""
+
+    config: Path
+    findings: tuple[Finding, ...]
+
+    @property
+    def ready(self) -> bool:
+        """Whether nothing stops an experiment."""
+        return not self.problems
+
+    @property
+    def problems(self) -> tuple[Finding, ...]:
+        """What stops it."""
+        return tuple(finding for finding in self.findings if finding.level is Level.STOP)
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """What does not stop it, but is not as it should be."""
+        return tuple(finding for finding in self.findings if finding.level is Level.WARNING)
+
+    def to_json(self) -> dict[str, Any]:
+        """What `hil check --json` prints."""
+        findings = [
+            {"level": str(each.level), "where": each.where, "what": each.what, "found": each.found, "mend": each.mend}
+            for each in self.findings
+        ]
+        return {"ready": self.ready, "findings": findings}
+
+    def __repr__(self) -> str:
+        state = "ready" if self.ready else f"{len(self.problems)} blocking problems"
+        title = f"{self.config}: {state}, {len(self.warnings)} warnings"
+        told = (*self.problems, *self.warnings)
+        return "\n".join([title, *(f"  {each.level:>8} {each.where}: {each.what}: {each.found}" for each in told)])
+
+    def _repr_html_(self) -> str:
+        rows = [(str(each.level), each.where, each.what, each.found) for each in self.findings]
+        return html_table(("", "where", "what", "found"), rows)
+
+
+def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckReport:
+    """Look at port, servos, pose and rate, with torque off: `hil check` as a function. Nothing moves.
+
+    What cannot be looked at is a finding, not an exception.
+
+    Raises:
+        ConfigError: the configuration is wrong.
+    """
+    checked, shown = loaded(config)
+    on_progress(Progress("check", "Looking"))
+    return CheckReport(shown, tuple(check_arm(checked)))

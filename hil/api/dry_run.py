@@ -1,0 +1,108 @@
+"""`hil.dry_run`: the experiment simulated on arms like the one on the bench. Nothing moves."""
+
+from dataclasses import dataclass
+from html import escape
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from hil.api.experiment import ConfigLike, loaded
+from hil.api.progress import OnProgress, Progress, ignore
+from hil.config.schema import Config
+from hil.dry_run.prediction import Prediction, quantities_of
+from hil.dry_run.run import ARMS
+from hil.dry_run.run import dry_run as simulate
+from hil.dry_run.summary import DryRun, dry_run_json
+from hil.results.display import html_table
+
+__all__ = ["Rehearsal", "dry_run"]
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Rehearsal:
+    """What a dry run foretells. file: the configuration's, as the caller wrote it. found: everything it computed."""
+
+    file: Path
+    config: Config
+    found: DryRun
+
+    @property
+    def is_safe(self) -> bool:
+        """Whether the experiment as configured may be run; without a configured torque, the largest safe one is."""
+        return self.found.is_safe(self.config)
+
+    @property
+    def stop_chance(self) -> float:
+        """Chance that the guard would have to stop the arm, from 0 to 1."""
+        return float(self.prediction.stop_chance)
+
+    @property
+    def largest_peak_torque(self) -> tuple[float, ...]:
+        """The largest safe peak torque of each joint [N m]."""
+        return tuple(float(value) for value in self.found.largest.peak_torque)
+
+    @property
+    def prediction(self) -> Prediction:
+        """Of the configured torque; without one, of the largest safe one."""
+        return self.found.largest.prediction if self.found.asked is None else self.found.asked
+
+    def to_json(self) -> dict[str, Any]:
+        """What `hil dry-run --json` prints."""
+        return dry_run_json(self.config, self.found)
+
+    def plot(self) -> Any:
+        """The simulated arms over time against the position limits, as a matplotlib figure. Raises MissingExtra."""
+        from hil.dry_run.plot import plot
+
+        return plot(self.config, self.prediction)
+
+    def __repr__(self) -> str:
+        torque = ", ".join(f"{value:.2f}" for value in self.largest_peak_torque)
+        return (
+            f"Dry run of {self.file} on {self.found.arms} arms drawn from the {self.found.source}: "
+            f"{'safe' if self.is_safe else 'NOT SAFE'}, chance of a guard stop {100 * self.stop_chance:.2g} %; "
+            f"largest safe peak_torque = [{torque}] N m"
+        )
+
+    def _repr_html_(self) -> str:
+        shown = self.prediction
+        rows = [
+            (
+                joint.name,
+                name,
+                unit,
+                *(f"{values[row, index]:.3g}" for values in (shown.median, shown.quantile, shown.limits)),
+            )
+            for index, joint in enumerate(self.config.joints)
+            for row, (name, unit) in enumerate(quantities_of(self.config))
+        ]
+        return f"<p>{escape(repr(self))}</p>" + html_table(("joint", "peak", "unit", "median", "99 %", "limit"), rows)
+
+
+def dry_run(
+    config: ConfigLike,
+    *,
+    result: str | PathLike[str] | None = None,
+    arms: int = ARMS,
+    servos: bool = False,
+    on_progress: OnProgress = ignore,
+) -> Rehearsal:
+    """Simulate the experiment on arms that could be this one: `hil dry-run` as a function.
+
+    Args:
+        config: TOML file of the arm, the name of a bundled one, or a loaded configuration.
+        result: run folder or result.json of a former identification, in place of [arm.prior].
+        arms: how many to simulate.
+        servos: also read the servos' limits and time the bus, with torque off.
+        on_progress: called with a `Progress` when the simulation begins.
+
+    Raises:
+        ConfigError: the configuration is wrong.
+        ResultError: `result` holds no result.
+        NoSafeTorque: no torque keeps all simulated arms within their limits.
+        hil.drivers.errors.DriverError: with `servos`, they do not answer.
+    """
+    checked, shown = loaded(config)
+    on_progress(Progress("simulation", "Simulating"))
+    former = None if result is None else Path(result)
+    return Rehearsal(shown, checked, simulate(checked, former, arms, servos))

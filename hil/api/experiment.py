@@ -1,0 +1,138 @@
+"""`hil.identify` and `hil.record`: an experiment on the bus, or on a fake one."""
+
+import logging
+from datetime import datetime
+from os import PathLike
+from pathlib import Path
+
+from hil.api.progress import OnProgress, Progress, forgiving, ignore
+from hil.api.run import Identification, Run, identification, load_run
+from hil.config.schema import Config, load_config
+from hil.errors import ConfigError
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.experiment.stream import Progress as StreamProgress
+from hil.report.page import FILE_NAME, write_report
+from hil.report.run_data import RunData
+from hil.runs.run_folder import RunFolder
+
+__all__ = ["identify", "record"]
+
+log = logging.getLogger(__name__)
+
+ConfigLike = str | PathLike[str] | Config
+"""A TOML file, the bare name of a bundled one, or a configuration that was loaded."""
+
+
+def identify(
+    config: ConfigLike,
+    *,
+    out: str | PathLike[str] | None = None,
+    take_over: bool = False,
+    on_progress: OnProgress = ignore,
+) -> Identification:
+    """Excite the arm, record a settled period and estimate the arm's parameters: `hil identify` as a function.
+
+    The arm moves. Torque is off when this returns or raises.
+
+    Args:
+        config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
+        out: run folder, which must be new or empty; runs/TIME-ARM unless given.
+        take_over: let an arm that another program holds sink slowly and take it over; hold it by hand.
+        on_progress: called with a `Progress` about 20 times a second while the arm moves, on a real bus by a thread of
+            its own. It cannot disturb the experiment: what comes too fast is dropped, and when it raises, that is
+            logged and it is not called again.
+
+    Returns:
+        The result, with the run folder as `run`; its report is in there too.
+
+    Raises:
+        ConfigError: the configuration is wrong.
+        RunFolderError: `out` is taken or cannot be written.
+        ExperimentError: the experiment could not be finished; its subclasses say why, SafetyStop for a limit passed.
+        hil.drivers.errors.DriverError: the servos do not answer as they should.
+        hil.estimator.errors.EstimationError: the recording does not determine the parameters.
+    """
+    checked, shown = loaded(config)
+    if take_over:
+        checked = _taking_over(checked)
+    run = new_run_folder(checked, shown, out)
+    tell = forgiving(on_progress)
+
+    def watch(stream: StreamProgress) -> None:
+        tell(Progress("experiment", stream=stream))
+
+    def say(message: str) -> None:
+        tell(Progress("experiment", message))
+
+    if checked.experiment.pilot:
+        from hil.pilot import identify_in_steps
+
+        torque, result = identify_in_steps(checked, run, shown, watch, say)
+        say(torque)
+    else:
+        say(run_experiment(checked, run, shown, watch))
+        tell(Progress("estimation", "Estimating"))
+        result = estimate_run(run)
+    write_run_report(run)
+    log.info("%s: trust it: %s", run.path, result.verdict.trust)
+    return identification(result, run.path)
+
+
+def record(
+    config: ConfigLike,
+    *,
+    out: str | PathLike[str] | None = None,
+    take_over: bool = False,
+    on_progress: OnProgress = ignore,
+) -> Run:
+    """Play the experiment and keep its recording, to be estimated later: `hil record` as a function.
+
+    The arm moves. Arguments and exceptions are those of `identify`.
+    """
+    checked, shown = loaded(config)
+    if take_over:
+        checked = _taking_over(checked)
+    if checked.experiment.pilot:
+        raise ConfigError(
+            f"{shown}: experiment.pilot = true: each step's torque follows from an estimate of the one before, which "
+            "`hil identify` does. To record alone, give experiment.peak_torque and set pilot = false."
+        )
+    run = new_run_folder(checked, shown, out)
+    tell = forgiving(on_progress)
+    torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
+    tell(Progress("experiment", torque))
+    return load_run(run.path)
+
+
+def loaded(config: ConfigLike) -> tuple[Config, Path]:
+    """The checked configuration, and its path as the caller wrote it. Raises ConfigError."""
+    if isinstance(config, Config):
+        return config, config.path
+    return load_config(Path(config)), Path(config)
+
+
+def _taking_over(config: Config) -> Config:
+    return config.model_copy(update={"safety": config.safety.model_copy(update={"take_over": True})})
+
+
+def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
+    """The folder `out`, or a new one in runs/ named after time and arm. Raises RunFolderError."""
+    path = _unused(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
+    log.info("run folder %s", path)
+    return RunFolder.create(path, config)
+
+
+def _unused(path: Path) -> Path:
+    """`path`, or with a number after it: a program may start two runs within a second."""
+    number = 2
+    tried = path
+    while tried.exists():
+        tried = path.with_name(f"{path.name}-{number}")
+        number += 1
+    return tried
+
+
+def write_run_report(run: RunFolder) -> None:
+    """The HTML report, into the run folder."""
+    write_report(RunData.load(run.path), run.path / FILE_NAME)

@@ -1,0 +1,58 @@
+"""What a long call tells while it runs."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from hil.experiment.stream import Progress as StreamProgress
+
+__all__ = ["OnProgress", "Progress", "Stage"]
+
+log = logging.getLogger(__name__)
+
+Stage = Literal["experiment", "estimation", "simulation", "check"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One report. Called about 20 times a second while the arm moves, and whenever there is something to say.
+
+    stage: what the call is doing. message: a sentence for a person; empty while nothing new happened. stream: while the
+    arm moves, the samples taken, the phase, and the latest state of every joint.
+    """
+
+    stage: Stage
+    message: str = ""
+    stream: StreamProgress | None = None
+
+    @property
+    def fraction(self) -> float | None:
+        """Of the samples of this experiment, from 0 to 1; None outside one."""
+        if self.stream is None:
+            return None
+        return self.stream.taken / max(1, self.stream.expected, self.stream.taken)
+
+
+OnProgress = Callable[[Progress], None]
+
+
+def forgiving(listener: OnProgress) -> OnProgress:
+    """The same, but its first exception is logged and it is not called again: nothing disturbs an arm under torque."""
+    failed = False
+
+    def tell(progress: Progress) -> None:
+        nonlocal failed
+        if failed:
+            return
+        try:
+            listener(progress)
+        except Exception:
+            failed = True
+            log.exception("on_progress raised an exception; it is not called again")
+
+    return tell
+
+
+def ignore(_: Progress) -> None:
+    """For a caller who does not listen."""

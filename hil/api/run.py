@@ -1,0 +1,213 @@
+"""A run folder as an object, and results that know the run they came from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.arm_model import ArmModel
+from hil.config.schema import Config
+from hil.errors import ResultError
+from hil.model_file import model_of, read_result
+from hil.results.display import html_table
+from hil.results.parts import StreamTiming
+from hil.results.result import Result, SettledResult, ShootingResult
+from hil.runs.period_file import PlayedPeriod, load_periods
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder, RunRecord
+from hil.runs.timing import timing
+
+if TYPE_CHECKING:
+    from hil.export.formats import Written
+
+__all__ = ["Estimation", "Identification", "Run", "load_run"]
+
+_ON_FILE_ELSEWHERE = {"json": False}  # where the result is, which it need not say of itself
+_SHOWN = ("position", "residual")
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Identification(SettledResult):
+    """An identified arm: everything in its result.json, and the run folder that holds it."""
+
+    run: Path = field(metadata=_ON_FILE_ELSEWHERE)
+
+    @property
+    def model(self) -> ArmModel:
+        """The arm as a model to compute torques and motions with."""
+        return model_of(self, self.run)
+
+    def plot(self, *names: str) -> Any:
+        """Pictures of the report below each other, as a matplotlib figure that a notebook shows.
+
+        Args:
+            names: of the pictures, such as "residual_1", "friction_2" or "correlation", or how they begin; without any,
+                measured and predicted positions and what is left of them.
+
+        Raises:
+            MissingExtra: matplotlib is not installed.
+            ValueError: no picture has such a name; the message lists those there are.
+        """
+        from hil.report.pictures import figures
+        from hil.report.png import draw_figures
+        from hil.report.run_data import RunData
+
+        found = {figure.name: figure for figure in figures(RunData.load(self.run))}
+        wanted = names or _SHOWN
+        for name in names:
+            if not any(each.startswith(name) for each in found):
+                raise ValueError(f"no picture begins with {name!r}; there are {', '.join(found)}")
+        chosen = [figure for each, figure in found.items() if each.startswith(wanted)]
+        return draw_figures(chosen or list(found.values()))
+
+    def report(self, out: str | PathLike[str] | None = None) -> Path:
+        """Write the HTML report, into the run folder unless `out` names a file; where it is."""
+        from hil.report.page import FILE_NAME, write_report
+        from hil.report.run_data import RunData
+
+        path = self.run / FILE_NAME if out is None else Path(out)
+        write_report(RunData.load(self.run), path)
+        return path
+
+    def export(
+        self, kind: str, out: str | PathLike[str] | None = None, *, link_length: float | None = None
+    ) -> "Written":
+        """Write the arm or its recording as "urdf", "mjcf", "toml", "json", "csv", "parquet", "mcap" or "mat".
+
+        Returns:
+            Where the file is, and what the format has no place for, a sentence each.
+
+        Raises:
+            ExportError: the format cannot hold this arm, or a package for it is not installed.
+        """
+        from hil.export.formats import export
+
+        return export(self.run, kind, None if out is None else Path(out), link_length)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Estimation(ShootingResult):
+    """What multiple shooting found in any motion; run: the run folder, None for recordings made elsewhere."""
+
+    run: Path | None = field(default=None, metadata=_ON_FILE_ELSEWHERE)
+
+    def plot(self) -> Any:
+        """The correlations of the parameters: which of them this motion can hardly tell apart. Raises MissingExtra."""
+        from hil.report.chart import Matrix
+        from hil.report.png import draw_figures
+        from hil.report.sections.correlation import correlations
+
+        names = self.covariance.names
+        return draw_figures(
+            [Matrix("correlation", "Correlation of the parameters", names, correlations(self.covariance.array()))]
+        )
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Run:
+    """A recorded run. samples: every sample taken (hil.runs.recording.sample_type); result: None before an estimate.
+
+    config: with the experiment that was really played. record: run.json. events: (time on the port's clock [s], what
+    happened). periods: by role, the settled periods as measured and as the model predicts them, after an estimate.
+    """
+
+    path: Path
+    config: Config
+    record: RunRecord
+    samples: NDArray[np.void]
+    events: tuple[tuple[float, str], ...]
+    periods: Mapping[str, PlayedPeriod]
+    result: Identification | Estimation | None
+
+    @property
+    def timing(self) -> StreamTiming:
+        """How the stream kept its deadlines."""
+        return timing(self.samples, self.config.experiment.rate)
+
+    @property
+    def model(self) -> ArmModel:
+        """The identified arm; raises ResultError before an estimate from settled periods."""
+        if not isinstance(self.result, Identification):
+            raise ResultError(f"{self.path} holds no estimate from settled periods yet; hil.estimate makes one.")
+        return self.result.model
+
+    def plot(self) -> Any:
+        """Positions and goals of every joint over the whole recording, as a matplotlib figure. Raises MissingExtra."""
+        from hil.report.chart import BLUE, ORANGE, Chart, Series, thin
+        from hil.report.png import draw_figures
+
+        time = self.samples["deadline"] - self.samples["deadline"][0]
+        charts = []
+        for index, joint in enumerate(self.config.joints):
+            unit = "V" if joint.drive_mode.name == "PWM" else "A"
+            for key, said, colour in (("position", "position [rad]", BLUE), ("goal_current", f"goal [{unit}]", ORANGE)):
+                x, y = thin(time, np.asarray(self.samples[key][:, index], dtype=np.float64), 4000)
+                title = f"{said.split(' [')[0].capitalize()} of {joint.name}"
+                charts.append(Chart(f"{key}_{index + 1}", title, "time [s]", said, (Series("", x, y, colour),)))
+        return draw_figures(charts)
+
+    def __repr__(self) -> str:
+        kept = self.timing
+        state = "not estimated" if self.result is None else repr(self.result)
+        return (
+            f"Run {self.path}: {self.record.config}, {kept.samples} samples in {kept.seconds:g} s at "
+            f"{kept.rate_held:g} Hz, {kept.lost_replies} replies lost, {kept.missed_ticks} ticks missed\n{state}"
+        )
+
+    def _repr_html_(self) -> str:
+        kept = self.timing
+        rows = [
+            ("run folder", str(self.path)),
+            ("configuration", self.record.config),
+            ("started", self.record.started),
+            ("samples", f"{kept.samples} in {kept.seconds:g} s at {kept.rate_held:g} Hz"),
+            ("replies lost, ticks missed", f"{kept.lost_replies}, {kept.missed_ticks}"),
+        ]
+        return html_table(("", ""), rows) + ("" if self.result is None else self.result._repr_html_())
+
+
+def load_run(path: str | PathLike[str]) -> Run:
+    """Read a run folder: configuration, samples, events, and its result where there is one.
+
+    Raises:
+        RunFolderError: the folder holds no readable run.
+        ResultError: its result.json is damaged, or from a newer hil.
+        ConfigError: its copy of the configuration is not valid any more.
+    """
+    run = RunFolder.open(Path(path))
+    config = run.load_config()
+    return Run(
+        run.path,
+        config,
+        run.load_record(),
+        load_samples(run.samples_path, len(config.joints)),
+        run.load_events(),
+        load_periods(run.path),
+        with_run(read_result(run.path), run.path) if run.result_path.is_file() else None,
+    )
+
+
+def with_run(result: Result, run: Path) -> Identification | Estimation:
+    """The result, knowing where its run is."""
+    if isinstance(result, SettledResult):
+        return identification(result, run)
+    assert isinstance(result, ShootingResult)
+    return estimation(result, run)
+
+
+def identification(result: SettledResult, run: Path) -> Identification:
+    """A result that knows its run."""
+    return Identification(**_fields(result), run=run)
+
+
+def estimation(result: ShootingResult, run: Path | None) -> Estimation:
+    """The same of multiple shooting; without a run for recordings made elsewhere."""
+    return Estimation(**_fields(result), run=run)
+
+
+def _fields(result: Result) -> dict[str, Any]:
+    return {each.name: getattr(result, each.name) for each in fields(result)}

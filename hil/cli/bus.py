@@ -1,0 +1,111 @@
+"""The subcommands about the servos on the bus: scan, check, setup.
+
+The modules that do the work are imported inside the commands, so that `hil --help` answers at once.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+from hil.cli.options import ConfigPath, Json, PortOrFile
+
+PortOrConfig = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[PORT]",
+        help="Serial port or pyserial URL, a TOML file, or a bundled name; without it: list the ports.",
+    ),
+]
+
+
+def scan(
+    port: PortOrConfig = None,
+    baud: Annotated[
+        list[int] | None, typer.Option("--baud", help="Only this baud; may be given more than once.")
+    ] = None,
+    json_only: Json = False,
+) -> None:
+    """Find servos: every baud, every ID, with model, firmware, voltage, temperature and errors."""
+    from hil.cli.setup_view import print_ports, print_scan, scanned
+    from hil.cli.terminal import Terminal
+    from hil.config.schema import port_url
+    from hil.drivers.port import open_port
+    from hil.drivers.servo_model import BAUD_RATES
+    from hil.setup import scan as scanning
+
+    if port is None:
+        print_ports(scanning.serial_ports(), json_only)
+        return
+    bauds = tuple(baud or BAUD_RATES)
+    terminal = Terminal(quiet=json_only)
+    opened = open_port(port_url(port), bauds[0])
+    try:
+        with terminal.scanning() as watch:
+            heard = list(scanning.scan(opened, bauds, watch))
+    finally:
+        opened.close()
+    print(json.dumps(scanned(heard))) if json_only else print_scan(heard, port)
+    if not any(each.servos for each in heard):
+        raise typer.Exit(1)
+
+
+def check(config: ConfigPath, json_only: Json = False) -> None:
+    """Look for everything that would stop an experiment, with how to mend it. Torque stays off."""
+    from hil.api.check import check as check_arm
+    from hil.cli.setup_view import print_findings
+    from hil.cli.terminal import Terminal
+
+    with Terminal(quiet=json_only).following(config) as follow:
+        report = check_arm(config, on_progress=follow)
+    print(json.dumps(report.to_json())) if json_only else print_findings(report.findings, config)
+    if not report.ready:
+        raise typer.Exit(1)
+
+
+def setup(
+    port: PortOrFile,
+    servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
+    baud: Annotated[int, typer.Option("--baud", help="Its present baud.")] = 1_000_000,
+    new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
+    new_baud: Annotated[int | None, typer.Option("--new-baud")] = None,
+    return_delay_us: Annotated[
+        int | None, typer.Option("--return-delay-us", min=0, max=508, help="0 is wanted.")
+    ] = None,
+    secondary_id: Annotated[
+        int | None, typer.Option("--secondary-id", min=0, max=255, help="255 is none, which is wanted.")
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Answer every question with yes.")] = False,
+    json_only: Json = False,
+) -> None:
+    """Set a servo's ID, baud, return delay or Secondary ID: a question before each write, each write read back."""
+    from hil.cli.setup_view import changed, print_changes
+    from hil.config.schema import port_url
+    from hil.drivers.port import open_port
+    from hil.drivers.servo_model import BAUD_RATES
+    from hil.setup.servo_session import recover
+    from hil.setup.servo_settings import open_servo, set_up
+
+    if new_baud is not None and new_baud not in BAUD_RATES:
+        raise typer.BadParameter(f"{new_baud}: a servo can do {', '.join(map(str, BAUD_RATES))}.")
+    if json_only and not yes:
+        raise typer.BadParameter("--json asks no questions: it needs --yes.")
+    opened = open_port(port_url(port), baud)
+    try:
+        servo = open_servo(opened, servo_id)
+        if written := recover(servo, opened.url):
+            print(f"What an earlier run could not put back is put back: {', '.join(written)}.", file=sys.stderr)
+        confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
+        changes = set_up(
+            servo,
+            confirm,
+            new_id=new_id,
+            new_baud=new_baud,
+            return_delay_us=return_delay_us,
+            secondary_id=secondary_id,
+        )
+    finally:
+        opened.close()
+    print(json.dumps(changed(changes))) if json_only else print_changes(changes)

@@ -1,0 +1,89 @@
+"""The subcommands from an arm to its parameters: identify, record, estimate.
+
+The modules that do the work are imported inside the commands, so that `hil --help` answers at once.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hil import strict_json
+from hil.cli.options import ConfigPath, Json, OutPath
+
+if TYPE_CHECKING:
+    from hil.api.run import Estimation, Identification
+
+TakeOver = Annotated[
+    bool, typer.Option("--take-over", help="Let an arm that is held sink slowly and take it over. Hold it by hand.")
+]
+Recordings = Annotated[
+    list[Path], typer.Argument(metavar="RUN | FILE.csv ..", help="Run folder, or CSV files of one arm with --config.")
+]
+ArmPath = Annotated[
+    Path | None, typer.Option("--config", metavar="ARM.toml", help="For CSV files: [columns] says what is in them.")
+]
+AllSamples = Annotated[
+    bool, typer.Option("--all-samples", help="No settled period is needed: every sample, by multiple shooting.")
+]
+
+
+def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
+    """Excite the arm, take one settled period, print its parameters with error bars."""
+    from hil.api.experiment import identify as identify_arm
+    from hil.cli.terminal import Terminal
+
+    with Terminal(quiet=json_only).following(config) as follow:
+        result = identify_arm(config, out=out, take_over=take_over, on_progress=follow)
+    _show(result, json_only)
+
+
+def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
+    """Play the experiment and keep its recording, for `hil estimate`."""
+    from hil.api.experiment import record as record_arm
+    from hil.cli.terminal import Terminal
+    from hil.results.json_form import to_json
+
+    with Terminal(quiet=json_only).following(config) as follow:
+        run = record_arm(config, out=out, take_over=take_over, on_progress=follow)
+    if json_only:
+        recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
+        print(strict_json.dumps(recorded))
+        return
+    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nEstimate from it: hil estimate {run.path}")
+
+
+def estimate(
+    recordings: Recordings, config: ArmPath = None, all_samples: AllSamples = False, json_only: Json = False
+) -> None:
+    """Estimate again from a recording; writes its result.json anew. Or from CSV files of any motion."""
+    from hil.api.estimate import are_csv
+    from hil.api.estimate import estimate as estimate_arm
+    from hil.cli.terminal import Terminal
+
+    paths: Sequence[Path] = recordings
+    try:
+        are_csv(paths)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    with Terminal(quiet=json_only).following(config) as follow:
+        result = estimate_arm(paths, config=config, all_samples=all_samples, on_progress=follow)
+    _show(result, json_only)
+
+
+def _show(result: "Identification | Estimation", json_only: bool) -> None:
+    if json_only:
+        print(strict_json.dumps(result.to_json()))
+        return
+    from rich.console import Console
+
+    from hil.api.run import Identification
+    from hil.cli.result_table import print_result, print_shooting_result
+    from hil.runs.run_folder import RunFolder
+
+    if isinstance(result, Identification):
+        config = RunFolder.open(result.run).load_config()
+        print_result(result, config, result.run, Console(highlight=False))
+    else:
+        print_shooting_result(result)

@@ -1,0 +1,65 @@
+"""The subcommands about fake arms: what they take. hil.cli.fake does the work, imported when it is asked to."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.cli.verbosity import is_quiet
+
+
+def _list_faults(wanted: bool) -> None:
+    if wanted:
+        from hil.cli import fake as work
+
+        work.list_faults()
+        raise typer.Exit
+
+
+def fake(
+    config: Annotated[
+        Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or the name of an arm; see below.")
+    ],
+    pty: Annotated[bool, typer.Option("--pty", help="Serve it on a terminal device until Ctrl-C or SIGTERM.")] = False,
+    link: Annotated[Path | None, typer.Option(metavar="PATH", help="Symbolic link to that device.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND[:KEY=VALUE,...]", help="Let this go wrong; may be repeated. See --list-faults."),
+    ] = None,
+    move: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ID:to=RAD[,at=S,duration=S]",
+            help="Let a hand move this servo's joint while its torque is off (or ID:ticks=POSITION); may be repeated.",
+        ),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of noise and faults, instead of the file's.")] = None,
+    _: Annotated[
+        bool,
+        typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="Print the kinds of faults and exit."),
+    ] = False,
+) -> None:
+    """Serve a fake arm to any program, in real time; without --pty, say what it is made of.
+
+    Arms by name: koch, viperx_300, open_manipulator_x, fake_two_link and the other fake arms that come with hil.
+    """
+    from hil.cli import fake as work
+
+    if pty:
+        work.serve_fake(config, link, fault or [], move or [], seed, is_quiet())
+    else:
+        work.describe_fake(config, fault or [], move or [], seed)
+
+
+def hand(
+    device: Annotated[Path, typer.Argument(metavar="DEVICE", help="The terminal that `hil fake --pty` serves.")],
+    moves: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[ID:to=RAD]...", help="Where to: an angle, or ID:ticks=POSITION; also at, duration."),
+    ] = None,
+    release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Let go of this servo's joint.")] = None,
+) -> None:
+    """Move joints of a fake arm whose torque is off, as somebody does who calibrates an arm."""
+    from hil.cli import fake as work
+
+    work.move_by_hand(device, moves or [], release or [])

@@ -1,0 +1,114 @@
+"""The dry run's model beside the experiment: is the motion one that any arm like this could make?
+
+What is known before the run is what the dry run knows: an ensemble of arms, from `[arm.prior]` or from a former result.
+Its mean and covariance, made wider, are where `hil.estimator.models.momentum_observer` begins. Without link lengths,
+with which no dry run is possible either, nothing is known but the torque that shall move the arm: then the first motion
+teaches the model, and only what comes after it is judged.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hil.config.schema import Config
+from hil.drivers.state import State
+from hil.dry_run.ensemble import Ensemble, prior_ensemble
+from hil.errors import Cause, SafetyStop
+from hil.estimator.arrays import Array
+from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
+from hil.estimator.models.parameters import CONSTANTS
+
+ARMS = 64
+WIDENED = 1.5
+"""Times the ensemble's standard deviations: what its arms lack is none of their parameters."""
+
+_OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
+_RELATIVE_STD = 0.1
+_FRICTIONS = 8.0
+"""Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
+an alarm."""
+_TILT_SHARE = 0.2  # of gravity, in a direction that the angles' zero does not expect
+_STILL_RAD_S = 0.06
+
+
+class ModelWatch:
+    """Looks at every sample; None of `look` where all is well. arms: what is known of the arm, by default its prior.
+
+    planned: largest goal of each joint [A, or V under PWM].
+    """
+
+    def __init__(self, config: Config, planned: Sequence[float], arms: Ensemble | None = None) -> None:
+        self._constants = [joint.torque_per_goal for joint in config.joints]
+        largest = np.array([constant * goal for constant, goal in zip(self._constants, planned, strict=True)])
+        mean, covariance = _known(config, largest, arms)
+        interval = 1.0 / config.experiment.rate
+        # A pilot's torque is hardly more than dry friction, and what that does near standstill is not in the model.
+        dry = [_FRICTIONS * mean.get(f"coulomb_{number}", 0.0) for number in range(1, len(largest) + 1)]
+        self._observer = MomentumObserver(mean, covariance, np.maximum(largest, dry), interval)
+        self._names = [joint.joint.title for joint in config.joints]
+        self._goal: Sequence[float] | None = None
+        self._seen_at = 0.0
+
+    def look(self, state: State) -> None:
+        """The latest sample; raises SafetyStop when no arm like this could have moved so."""
+        if any(state.missing):
+            return
+        goal, self._goal = self._goal, state.goal_current
+        seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
+        if goal is None:
+            goal, seconds = state.goal_current, float("inf")
+        torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
+        joint = self._observer.observe(state.position, state.velocity, torque, seconds)
+        if joint >= 0:
+            self._raise(joint, torque[joint], state)
+
+    def _raise(self, joint: int, torque: float, state: State) -> None:
+        lacking = self._observer.lacking[joint]
+        name, velocity = self._names[joint], state.velocity[joint]
+        if abs(velocity) < _STILL_RAD_S:
+            said = (
+                f"{name} stands still under {torque:+.3f} N m, which would move any arm that fits what is known and "
+                "was seen of this one. Something holds it, it is stuck, or its encoder is frozen."
+            )
+        else:
+            said = (
+                f"{name} does not move as any arm would that fits what is known and was seen of this one: "
+                f"{lacking:+.3f} N m of the commanded torque are not to be found in its motion. Its torque or its "
+                "encoder fails, something pushes or holds it, or the arm is another one than described."
+            )
+        raise SafetyStop(said, Cause.UNEXPECTED)
+
+
+def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
+    """Mean and covariance of the observer's parameters."""
+    if arms is None and config.arm.link_lengths is None:
+        return {}, np.diag(_hardly_known(largest) ** 2)
+    arms = prior_ensemble(config, ARMS) if arms is None else arms
+    joint = np.array([1 if name.endswith("_2") else 0 for name in NAMES])
+    drawn = np.array(
+        [[dict(zip(CONSTANTS, each.vector, strict=True)).get(name, 0.0) for name in NAMES] for each in arms.physics]
+    )
+    # What is known of an arm in N m is known in units of the commanded torque as well as its torque constants are.
+    drawn = drawn / arms.torque_scale[:, np.minimum(joint, len(largest) - 1)]
+    if len(largest) == 1:
+        drawn[:, [name in _OF_TWO for name in NAMES]] = 0.0
+    mean = drawn.mean(axis=0)
+    covariance = WIDENED**2 * np.cov(drawn.T) + np.diag((_RELATIVE_STD * mean) ** 2)
+    for number in (1, 2)[: len(largest)]:
+        gravity, tilt, coulomb, offset = (
+            NAMES.index(f"{name}_{number}") for name in ("gravity", "tilt", "coulomb", "offset")
+        )
+        covariance[tilt, tilt] += (_TILT_SHARE * mean[gravity]) ** 2
+        covariance[offset, offset] += (0.5 * mean[coulomb]) ** 2
+    return dict(zip(NAMES, mean.tolist(), strict=True)), np.asarray(covariance)
+
+
+def _hardly_known(largest: Array) -> Array:
+    """Standard deviations of the parameters of an arm of which only the torque that shall move it is known."""
+    each = {"gravity": 3.0, "tilt": 1.0, "coulomb": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
+    torque = [largest[-1] if name.endswith("_2") else largest[0] for name in NAMES]
+    share = [each.get(name.rpartition("_")[0], 3.0) for name in NAMES]
+    spread: Array = np.array(share) * np.array(torque)
+    if len(largest) == 1:
+        spread[[name in _OF_TWO for name in NAMES]] = 0.0
+    return spread

@@ -1,0 +1,29 @@
+"""Servos on the bus that are not the arm's: found, told, and left alone."""
+
+from hil.drivers.bus import ServoBus
+from hil.drivers.clock import WallClock
+from hil.drivers.control_table import load_control_table
+from hil.drivers.errors import DriverError
+from hil.drivers.servo import Servo
+from hil.setup.scan import Found, listen
+
+_AT_ONCE_S = 0.005
+"""On a virtual bus they answer one directly after the other; real ones may each wait for the slots before theirs."""
+
+
+def others_on_the_bus(bus: ServoBus) -> list[str]:
+    """Each servo at this baud that is not one of the arm's, in words; raises PortLost."""
+    ours = {joint.id for joint in bus.joints}
+    heard = listen(bus.port) if isinstance(bus.port.clock, WallClock) else listen(bus.port, _AT_ONCE_S)
+    return [_describe(bus, found) for found in heard.servos if found.id not in ours]
+
+
+def _describe(bus: ServoBus, found: Found) -> str:
+    name = f"ID {found.id}, {found.model or f'model number {found.model_number}'}"
+    if found.model is None:
+        return name
+    try:
+        torque = Servo(bus.port, found.id, load_control_table(found.model)).read("Torque Enable")
+    except (DriverError, KeyError):
+        return name
+    return f"{name}, torque {'on' if torque else 'off'}"

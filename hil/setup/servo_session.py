@@ -1,0 +1,185 @@
+"""The arm's servos from the first write to the last: what they were set to is kept before it and put back after it.
+
+A session holds the port. One inside another of the same arm shares it, so that the steps of a pilot write each EEPROM
+register once, and put it back once, when the outermost block is left, however that is. What a killed program left
+behind is taken for the servos' own settings, and put back at the end.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hil import fakes
+from hil.config.schema import Config
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError
+from hil.drivers.joint import Joint
+from hil.drivers.servo import Servo
+from hil.drivers.servo_model import Mode
+from hil.drivers.settings import put_back, read_settings
+from hil.drivers.shield import signals_held_back
+from hil.errors import RunFolderError
+from hil.setup import settings_file
+from hil.setup.current_limit import current_limit_ticks
+from hil.setup.others import others_on_the_bus
+from hil.setup.settings_file import Kept
+
+Say = Callable[[str], None]
+
+SETTINGS_NAME = "servo_settings.json"
+"""In the run folder: a copy of what was kept."""
+
+
+REBOOT_S = 0.6
+"""A servo that does not answer at the end may be booting: this long until it is asked once more [s]."""
+
+
+def to_stderr(text: str) -> None:
+    """Tell the user, who may be reading results from standard output."""
+    with suppress(OSError, ValueError):
+        print(f"hil: {text}", file=sys.stderr)
+
+
+@dataclass
+class ServoSession:
+    """An open bus and what its servos were set to. `servo_session` makes them."""
+
+    bus: ServoBus
+    _say: Say
+    _kept: dict[Joint, Kept] = field(default_factory=dict)
+    shared: int = 0
+    """How many blocks inside this one have used the bus."""
+
+    def begin(self, config: Config, folder: Path | None) -> None:
+        """Check who answers and that nobody holds the arm; keep the settings; raises as `ServoBus.open`.
+
+        Nothing is written to a servo before its settings are on the disk.
+        """
+        bus = self.bus
+        bus.check_identity()
+        left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
+        bus.release_held(ours=left)
+        if others := others_on_the_bus(bus):
+            self._say(f"Also on this bus, and left alone: {'; '.join(others)}.")
+        described = {
+            drive: each for joint, each in zip(bus.joints, config.joints, strict=True) for drive in joint.drives
+        }
+        for joint, servo in bus.drives.items():
+            settings = read_settings(servo)
+            if joint in left:
+                settings = _before(left[joint], settings)
+                self._say(
+                    f"{joint.title}: an earlier run was ended before it could put its settings back "
+                    f"({left[joint].since}); this one does."
+                )
+            changed = {"Operating Mode": int(joint.mode)}
+            if joint.mode is Mode.CURRENT:
+                share = described[joint].goal_limit / len(described[joint].ids)
+                changed["Current Limit"] = current_limit_ticks(joint, share)
+            self._keep(joint, settings, changed)
+        if folder is not None:
+            copies = {str(joint.id): kept.settings for joint, kept in self._kept.items()}
+            settings_file.write_durably(folder / SETTINGS_NAME, {"port": bus.port.url, "servos": copies})
+
+    def _keep(self, joint: Joint, settings: dict[str, int], changed: dict[str, int]) -> None:
+        url, model = self.bus.port.url, joint.servo.name
+        try:
+            self._kept[joint] = settings_file.keep(url, joint.id, model, settings, changed)
+        except RunFolderError as error:
+            self._say(
+                f"What {joint} was set to cannot be kept ({error}). Should this program be killed, its Operating Mode "
+                f"{settings['Operating Mode']} and Current Limit have to be put back by hand."
+            )
+            self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
+
+    def end(self) -> None:
+        """Put back what every servo was set to; each that cannot be is named. Never raises DriverError."""
+        failed = self._put_back(self._kept)
+        if failed:
+            clock = self.bus.port.clock
+            clock.wait_until(clock.now() + REBOOT_S)
+            failed = self._put_back(failed)
+        for joint, error in failed.items():
+            self._say(
+                f"{joint.title}: what it was set to could not be put back ({error}) The next hil identify, record, "
+                f"check or setup on this port does it, from {self._kept[joint].path}."
+            )
+
+    def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
+        """Why it did not work, for each of these joints with which it did not."""
+        failed: dict[Joint, DriverError] = {}
+        for joint in joints:
+            try:
+                put_back(self.bus.drives[joint], self._kept[joint].settings)
+            except DriverError as error:
+                failed[joint] = error
+            else:
+                settings_file.forget(self._kept[joint])
+        return failed
+
+
+_outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=None)
+
+
+@contextmanager
+def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
+    """The open bus with every servo in its mode and torque off, prepared for exchanges; settings put back at the end.
+
+    folder: run folder that gets a copy of the settings. say: told what a person has to know of them.
+    Raises as `ServoBus.open`, and RunFolderError.
+    """
+    outer = _outermost.get()
+    if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
+        outer.bus.config = config.bus
+        outer.shared += 1
+        outer.bus.prepare()
+        yield outer.bus
+        return
+    fakes.register_for(config.url)
+    with ServoBus.connect(config.bus) as bus:
+        session = ServoSession(bus, say)
+        token = _outermost.set(session)
+        try:
+            session.begin(config, folder)
+            bus.prepare()
+            yield bus
+        finally:
+            _outermost.reset(token)
+            with signals_held_back():
+                session.end()
+
+
+def has_moved() -> bool:
+    """Whether the arm may hang where an earlier run of the same session has left it, held by friction."""
+    outer = _outermost.get()
+    return outer is not None and outer.shared > 1
+
+
+def left_behind(port: str, joint: Joint) -> Kept | None:
+    """What a program that is gone left to be put back on this joint's servo."""
+    kept = settings_file.load(port, joint.id, joint.servo.name)
+    return kept if kept is not None and kept.is_ours_to_mend else None
+
+
+def recover(servo: Servo, port: str) -> list[str]:
+    """Put back what a program that is gone left behind on a servo; what was done, in words. Raises as `Servo.write`."""
+    kept = settings_file.load(port, servo.id, servo.table.model)
+    if kept is None or not kept.is_ours_to_mend:
+        return []
+    if servo.read("Torque Enable"):
+        servo.write("Torque Enable", 0)
+    written = put_back(servo, _before(kept, read_settings(servo)))
+    settings_file.forget(kept)
+    return [f"{name} {before} -> {after}" for name, (before, after) in written.items()]
+
+
+def _before(kept: Kept, present: dict[str, int]) -> dict[str, int]:
+    """What the servo was set to before the program that was killed; what somebody has changed since then stays."""
+    ours = {name for name, value in kept.changed.items() if present.get(name) == value}
+    if "Operating Mode" not in ours and "Operating Mode" in kept.changed:
+        return {**present, **{name: kept.settings[name] for name in ours if name in kept.settings}}
+    since = {name: value for name, value in present.items() if name in kept.changed and name not in ours}
+    return {**kept.settings, **since}

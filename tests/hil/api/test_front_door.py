@@ -1,0 +1,211 @@
+"""`import hil` does what the command line does: the same files, the same numbers, the same errors."""
+
+import json
+import logging
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hil
+from hil.api.dry_run import dry_run
+from hil.errors import ConfigError, MissingExtra, ResultError, RunFolderError
+from hil.results.result import SettledResult
+from tests.support.command_line import hil as command
+
+ArmFile = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["hil"])
+
+
+def test_identify_gives_what_the_command_writes(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    path = arm_file()
+    heard: list[hil.Progress] = []
+    result = hil.identify(path, out="by_function", on_progress=heard.append)
+    assert capsys.readouterr() == ("", "")
+    assert command("identify", path, "--out", "by_command", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    ours = json.loads(json.dumps(result.to_json()))
+    assert "run" not in ours and result.run == Path("by_function")
+    for each in (told, ours):
+        del each["timing"]["estimation_seconds"]
+    assert ours == told
+    files = {kind: {file.name for file in Path(kind).iterdir()} for kind in ("by_function", "by_command")}
+    assert files["by_function"] == files["by_command"] and "report.html" in files["by_function"]
+    assert isinstance(result, SettledResult) and result.verdict.trust in {"yes", "with care", "no"}
+    assert result.model.gravity_torque([0.0, 0.0]).shape == (2,)
+    fractions = [each.fraction for each in heard if each.fraction is not None]
+    assert fractions == sorted(fractions) and 0.9 < fractions[-1] <= 1.0
+    assert [each.message for each in heard if each.message][-1] == "Estimating"
+    assert any(each.message.startswith("Torque is off") for each in heard)
+
+
+def test_record_then_estimate_is_identify(arm_file: ArmFile, identified_once: Path) -> None:
+    run = hil.record(arm_file(), out="run")
+    assert run.result is None and "not estimated" in repr(run)
+    assert len(run.samples) == run.timing.samples > 1000
+    with pytest.raises(ResultError, match="holds no estimate"):
+        _ = run.model
+    result = hil.estimate(run)
+    known = hil.load_run(identified_once).result
+    assert known is not None and result.parameters == known.parameters
+    again = hil.load_run("run")
+    assert again.result == result and set(again.periods) == {"identify", "held_out"}
+    assert again.events[-1][1].startswith("Torque is off")
+
+
+def test_all_samples_and_csv_files_are_estimated_too(identified: Path, tmp_path: Path) -> None:
+    whole = hil.load_run(identified).result
+    assert isinstance(whole, hil.Identification)
+    found = hil.estimate(identified, all_samples=True)
+    assert isinstance(found, hil.Estimation) and found.run == identified
+    assert isinstance(hil.load_run(identified).result, hil.Estimation)
+    gravity = found.parameters["gravity_1"].value
+    assert gravity == pytest.approx(whole.parameters["gravity_1"].value, rel=0.05)
+    with pytest.raises(ConfigError, match="--config"):
+        hil.estimate("a.csv")
+    with pytest.raises(ValueError, match="not both"):
+        hil.estimate(["a.csv", identified])
+    with pytest.raises(ValueError, match="one run folder"):
+        hil.estimate([identified, identified])
+
+
+def test_a_bundled_name_a_path_and_a_loaded_configuration_are_the_same(arm_file: ArmFile) -> None:
+    assert hil.check("fake_two_link").ready
+    path = arm_file()
+    reports = [hil.check(each) for each in (path, str(path), hil.load_config(path))]
+    assert all(report.ready and report.findings for report in reports)
+    assert "ready" in repr(reports[0]) and "<td>" in reports[0]._repr_html_()
+
+
+def test_a_check_that_fails_says_what(arm_file: ArmFile) -> None:
+    report = hil.check(arm_file(("id = 2", "id = 7")))
+    assert not report.ready and report.problems
+    assert report.to_json()["ready"] is False
+    assert "elbow" in repr(report) and "nothing at 1000000 baud" in repr(report)
+
+
+def test_two_runs_within_a_second_have_folders_of_their_own(arm_file: ArmFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = [hil.record(arm_file()).path for _ in range(2)]
+    assert len({*runs}) == 2 and all(path.parent == Path("runs") for path in runs)
+
+
+def test_errors_are_typed_and_leave_no_folder_behind(arm_file: ArmFile, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        hil.identify("nowhere.toml", out="run")
+    assert not Path("run").exists()
+    with pytest.raises(RunFolderError):
+        hil.load_run("nowhere")
+    with pytest.raises(hil.HilError) as caught:
+        hil.identify(arm_file(("[-3.1, 3.1]", "[-0.5, 0.5]")), out="stopped")
+    assert any("Torque is off" in note for note in caught.value.__notes__)
+
+
+def test_a_callback_that_raises_disturbs_nothing(arm_file: ArmFile, caplog: pytest.LogCaptureFixture) -> None:
+    heard: list[hil.Progress] = []
+
+    def refuse(progress: hil.Progress) -> None:
+        heard.append(progress)
+        if progress.fraction is not None and progress.fraction > 0.3:
+            raise KeyError("enough")
+
+    run = hil.record(arm_file(), out="run", on_progress=refuse)
+    assert len(run.samples) > 1000 and heard[-1].fraction == pytest.approx(0.3, abs=0.05)
+    assert [each.exc_info is not None for each in caplog.records if each.levelname == "ERROR"] == [True]
+
+
+def test_a_dry_run_foretells(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
+    base = (("rest_pose = ", "link_lengths = [0.12, 0.10]\nrest_pose = "),)
+    path = arm_file(*base)
+    rehearsal = hil.dry_run(path, arms=20)
+    code = command("dry-run", path, "--arms", "20", "--json")
+    assert json.loads(capsys.readouterr().out) == rehearsal.to_json()
+    assert code == (0 if rehearsal.is_safe else 1)
+    assert 0.0 <= rehearsal.stop_chance <= 1.0 and min(rehearsal.largest_peak_torque) > 0.0
+    assert "largest safe peak_torque" in repr(rehearsal) and "<table>" in rehearsal._repr_html_()
+
+
+def test_dry_run_can_be_called_whatever_was_imported_before() -> None:
+    for first in ("", "import hil.dry_run.prior", "from hil.dry_run import waves", "hil.dry_run"):
+        call = "try:\n    hil.dry_run('nowhere.toml')\nexcept hil.HilError as error:\n    print(error)"
+        code = f"import hil\n{first}\n{call}"
+        said = subprocess.check_output([sys.executable, "-c", code], text=True)
+        assert said.startswith("nowhere.toml: cannot be read")
+
+
+def test_results_show_themselves(identified_once: Path) -> None:
+    run = hil.load_run(identified_once)
+    result = run.result
+    assert isinstance(result, hil.Identification)
+    for shown in (repr(result), result._repr_html_(), repr(run), run._repr_html_()):
+        assert "inertia_1" in shown and "trust it" in shown
+    assert len(repr(result).splitlines()) < 40
+    assert "<script>" not in run._repr_html_()
+
+
+def test_plots_are_figures_a_notebook_can_show(identified_once: Path) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
+    run = hil.load_run(identified_once)
+    assert isinstance(run.result, hil.Identification)
+    figure = run.result.plot("residual")
+    assert len(figure.axes) == 2
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    assert len(run.result.plot().axes) >= 4
+    assert len(run.plot().axes) == 4
+    with pytest.raises(ValueError, match=r"no picture begins with 'velocity'.*residual_1"):
+        run.result.plot("velocity")
+    assert "matplotlib.pyplot" not in sys.modules
+
+
+def test_without_matplotlib_a_plot_says_what_to_install(identified_once: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    result = hil.load_run(identified_once).result
+    assert result is not None
+    with pytest.raises(MissingExtra, match=r"pip install 'hil\[png\]'"):
+        result.plot()
+
+
+def test_a_result_exports_and_reports(identified: Path, tmp_path: Path) -> None:
+    result = hil.load_run(identified).result
+    assert isinstance(result, hil.Identification)
+    written = result.export("toml", tmp_path / "arm.toml")
+    np.testing.assert_equal(dict(hil.load_model(written.path).values), result.values)
+    assert result.report(tmp_path / "report.html").is_file()
+
+
+def test_import_is_lazy_and_its_names_are_all_there() -> None:
+    code = (
+        "import sys, time; start = time.process_time(); import hil; seconds = time.process_time() - start\n"
+        "assert not {'numpy', 'scipy', 'pydantic', 'typer', 'rich', 'serial'} & set(sys.modules)\n"
+        "for name in hil.__all__: getattr(hil, name)\n"
+        "assert set(hil.__all__) <= set(dir(hil))\n"
+        "print(seconds)"
+    )
+    seconds = float(subprocess.check_output([sys.executable, "-c", code]))
+    assert seconds >= 0.0
+    with pytest.raises(AttributeError, match="no attribute 'identfy'"):
+        _ = hil.identfy  # type: ignore[attr-defined]
+
+
+def test_every_public_function_says_what_it_raises() -> None:
+    for function in (hil.identify, hil.estimate, hil.check, dry_run, hil.load_run):
+        assert "Raises:" in (function.__doc__ or ""), function
+
+
+def test_the_log_is_under_hil_and_silent_unless_asked(
+    arm_file: ArmFile, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert any(isinstance(each, logging.NullHandler) for each in logging.getLogger("hil").handlers)
+    with caplog.at_level(logging.INFO, logger="hil"):
+        hil.identify(arm_file(), out="run")
+    names = {each.name for each in caplog.records}
+    assert names and all(name.startswith("hil.") for name in names)
+    assert any("torque on" in each.message for each in caplog.records)
+    assert capsys.readouterr() == ("", "")

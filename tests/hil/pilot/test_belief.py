@@ -1,0 +1,103 @@
+"""What a run teaches of the arm, moved or not; gains for arms without a stable rest; when to give up."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.config.schema import Config, load_config
+from hil.errors import ExperimentError
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.closed_loop import respond, resting
+from hil.pilot import identify_in_steps
+from hil.pilot.belief import Belief, prior_belief
+from hil.pilot.gains import needs_stabiliser, with_stabiliser
+from hil.pilot.search import pilot_config, with_torque
+from hil.pilot.seen import Seen
+from hil.plan.plan import make_plan
+from hil.plan.stabiliser import feedback_of
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(CONFIGS / "first_time.toml")
+
+
+def commands(config: Config, peak: tuple[float, float]) -> np.ndarray:
+    """Ramp and one period of a pilot (joints, samples) [N m]."""
+    pilot = with_torque(pilot_config(config), np.array(peak))
+    segment = make_plan(pilot).segments[0]
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    return np.ascontiguousarray((np.concatenate((segment.ramp_in, segment.period_current)) * constants).T)
+
+
+def median(belief: Belief, name: str) -> float:
+    return float(np.median([each[name] for each in belief.parameters]))
+
+
+def test_what_an_arm_did_is_learned(config: Config) -> None:
+    truth = prior_belief(config, 60, seed=3).parameters[41]
+    command, pose = commands(config, (0.5, 0.35)), np.array([-1.54, 0.05])
+    position = respond(Physics.of(truth), resting(pose), command, 400.0, feedback_of(config)).position
+    prior = prior_belief(config, 96)
+    belief = prior.after(config, Seen(command, np.round(position / 0.0015) * 0.0015, pose, pose))
+    for name in ("gravity_1", "gravity_2", "inertia_1", "coulomb_1"):
+        assert median(belief, name) == pytest.approx(truth[name], rel=0.12), name
+        assert belief.spread(name) < 0.5 * prior.spread(name), name
+        assert abs(np.log(median(belief, name) / truth[name])) < 4 * belief.spread(name), name
+
+
+def test_a_joint_that_stood_still_asks_for_friction_and_nothing_else(config: Config) -> None:
+    command, pose = commands(config, (0.2, 0.12)), np.array([-1.57, 0.0])
+    seen = Seen(command, np.repeat(pose[:, None], command.shape[1], axis=1), pose, pose)
+    prior = prior_belief(config, 60)
+    belief = prior.after(config, seen)
+    for joint in (1, 2):
+        assert median(belief, f"coulomb_{joint}") > 1.2 * median(prior, f"coulomb_{joint}")
+        assert belief.spread(f"coulomb_{joint}") > 0.1, "how much more, nobody knows"
+        assert median(belief, f"gravity_{joint}") == median(prior, f"gravity_{joint}")
+    assert (np.ptp(belief._motions(config, seen), axis=2) < 0.03).mean() > 0.95
+    assert belief.ensemble().source == "belief" and prior.ensemble().source == "prior"
+
+
+@pytest.mark.parametrize(("gravity", "rest", "needed"), [(9.81, -1.57, False), (0.0, 0.3, True), (9.81, 1.57, True)])
+def test_arms_that_do_not_come_back_are_given_gains_that_hold_them(
+    config: Config, gravity: float, rest: float, needed: bool
+) -> None:
+    arm = config.arm.model_copy(update={"gravity": gravity, "rest_pose": [rest, 0.0]})
+    turned = config.model_copy(update={"arm": arm})
+    belief = prior_belief(turned, 48)
+    assert needs_stabiliser(turned, belief) is needed
+    held = with_stabiliser(turned, belief)
+    assert (held.stabiliser is not None) is needed
+    if not needed:
+        return
+    assert with_stabiliser(held, belief) is held, "gains that somebody gave are kept"
+    push = np.zeros((2, 1600))
+    push[:, :80] = 0.2 * np.array([[2.1], [1.4]])
+    feedback = feedback_of(held)
+    away = []
+    for parameters in belief.parameters:
+        start = resting(np.array([rest, 0.0]) + 0.1)
+        position = respond(Physics.of(parameters), start, push, 400.0, feedback).position
+        away.append(float(np.abs(position[:, -1] - [rest, 0.0]).max()))
+    assert np.mean(np.array(away) < 0.5) > 0.95
+
+
+def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tmp_path: Path) -> None:
+    text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
+    path = tmp_path / "held.toml"
+    for old, new in (("coulomb = 0.050", "coulomb = 9.0"), ("current_limit = 0.8", "current_limit = 0.1")):
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    path.write_text(text, encoding="utf-8")
+    held = load_config(path)
+    said: list[str] = []
+    with pytest.raises(
+        ExperimentError, match=r"Elbow did not move by 12 encoder steps\. Tried: Pilot .*; Pilot 2 "
+    ) as error:
+        identify_in_steps(held, RunFolder.create(tmp_path / "run", held), path, lambda _: None, said.append)
+    assert "current limits allow" in str(error.value) and "stronger servo" in str(error.value)
+    assert any("did not move: friction is larger than that" in line for line in said)

@@ -1,0 +1,364 @@
+"""What servos are set to, before and after: every end of a run, a kill and the next start; other people's servos."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from hil.config.schema import Config, load_config
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
+from hil.errors import HilError
+from hil.experiment.run import run_experiment
+from hil.fakes.bus.faults import Fault
+from hil.fakes.servo.servo import Servo
+from hil.runs.run_folder import RunFolder
+from hil.setup.preflight import Finding, Level, check_arm
+from hil.setup.servo_session import SETTINGS_NAME, servo_session
+from hil.setup.settings_file import settings_path
+from tests.support.command_line import hil
+
+Arm = Callable[..., Config]
+SERVO_2 = 'id = 2\nmodel = "XM430-W350"\nzero_ticks = 2048\n'
+FREE = {"Goal Position", "Realtime Tick"}
+"""A servo writes these itself."""
+
+
+@dataclass
+class Bench:
+    """One fake arm that stays where it is, whoever opens its port; EEPROM writes of every servo, by register."""
+
+    port: Any = None
+    before: dict[int, dict[str, int]] = field(default_factory=dict)
+    eeprom: dict[int, list[str]] = field(default_factory=dict)
+    prepare: Callable[[Any], None] = lambda port: None
+
+    @property
+    def servos(self) -> dict[int, Servo]:
+        return dict(self.port.bus.servos)
+
+    def changed(self) -> list[str]:
+        """Registers that are not as they were when the port was opened first."""
+        return [
+            f"{name} of {servo_id}: {value} -> {self.servos[servo_id].value(name)}"
+            for servo_id, registers in self.before.items()
+            for name, value in registers.items()
+            if self.servos[servo_id].value(name) != value
+        ]
+
+    def take(self, port: Any) -> None:
+        self.port = port
+        self.prepare(port)
+        for servo_id, servo in port.bus.servos.items():
+            table = servo.model.registers.values()
+            self.before[servo_id] = {
+                each.name: servo.value(each.name) for each in table if each.writable and each.name not in FREE
+            }
+            self.eeprom[servo_id] = []
+            self._count(servo, self.eeprom[servo_id])
+
+    def _count(self, servo: Servo, written: list[str]) -> None:
+        store = servo.memory.store
+
+        def counting(register: Any, value: int) -> None:
+            if register.eeprom:
+                written.append(register.name)
+            store(register, value)
+
+        servo.memory.store = counting  # type: ignore[method-assign]
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Every port opened is the same arm's."""
+    made = Bench()
+    opened = serial.serial_for_url
+
+    def again(*args: Any, **kwargs: Any) -> Any:
+        if made.port is None:
+            made.take(opened(*args, **kwargs))
+        elif not made.port.is_open:
+            made.port.open()
+        return made.port
+
+    monkeypatch.setattr(serial, "serial_for_url", again)
+    return made
+
+
+def play(config: Config, folder: Path) -> RunFolder:
+    made = RunFolder.create(folder, config)
+    run_experiment(config, made, config.path, lambda _: None)
+    return made
+
+
+SHORT = ("ramp = 1.0 ", "held_out = false\nsettle_within = 0.5\nramp = 0.2 ")
+
+
+def test_a_run_leaves_every_register_as_it_was(arm: Arm, tmp_path: Path, bench: Bench, state_folder: Path) -> None:
+    run = play(arm(SHORT), tmp_path / "run")
+    assert bench.changed() == []
+    assert all(sorted(set(names)) == ["Current Limit", "Operating Mode"] for names in bench.eeprom.values())
+    assert all(len(names) <= 4 for names in bench.eeprom.values())
+    assert list(state_folder.glob("*.json")) == [], "nothing is left to be put back"
+    kept = json.loads((run.path / SETTINGS_NAME).read_text())["servos"]
+    assert kept["1"]["Operating Mode"] == 3 and kept["1"]["Current Limit"] == 1193
+
+
+def test_settings_are_on_the_disk_before_the_first_write(arm: Arm, tmp_path: Path, bench: Bench) -> None:
+    config = arm(SHORT)
+    files = [settings_path(config.url, joint.id, joint.model) for joint in config.joints]
+    seen: list[bool] = []
+    with servo_session(config):
+        seen += [path.is_file() for path in files]
+        assert any(bench.eeprom.values())
+    assert seen == [True, True] and not any(path.exists() for path in files)
+
+
+@pytest.mark.parametrize("kind", ["silent_servo", "reboot", "overheating", "cable_pulled"])
+def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_start(
+    arm: Arm, tmp_path: Path, bench: Bench, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = arm(SHORT)
+    bench.prepare = lambda port: port.bus.faults.add(Fault(kind=kind, servo=2, at=2.0))
+    with pytest.raises((DriverError, HilError)):
+        play(config, tmp_path / "run")
+    left = bench.changed()
+    if left:
+        assert "could not be put back" in capsys.readouterr().err
+        assert settings_path(config.url, 2, "XM430-W350").is_file()
+        bench.port.bus.faults.clear()
+        found = list(check_arm(config))
+        assert any(each.what == "settings of an earlier run" and each.level is Level.OK for each in found)
+    assert bench.changed() == []
+
+
+class _Gone(BaseException):
+    """The program is no more."""
+
+
+def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = arm(SHORT)
+
+    def kill() -> None:
+        with pytest.raises(TorqueNotOff), servo_session(config) as bus, bus.torque(0.1):
+            write = bench.port.write
+            monkeypatch.setattr(bench.port, "write", _raise)  # nothing leaves a killed program
+            bench.port.clock.wait_until(bench.port.clock.now() + 1.0)
+            raise _Gone
+        monkeypatch.setattr(bench.port, "write", write)
+        bench.port.close()
+
+    kill()
+    assert bench.changed(), "mode and torque are as the killed run left them"
+    play(config, tmp_path / "next")
+    assert "earlier run" in capsys.readouterr().err
+    assert bench.changed() == []
+    kill()
+    levels = [finding.level for finding in check_arm(config)]
+    assert Level.STOP not in levels
+    assert bench.changed() == []
+
+
+def _raise(_: bytes) -> int:
+    raise serial.SerialException("no such program")
+
+
+def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = arm(SHORT)
+    with pytest.raises(PortLost), servo_session(config) as bus:
+        monkeypatch.setattr(bench.port, "write", _raise)
+        bus.exchange([0.0, 0.0])
+    monkeypatch.undo()
+    for servo in bench.servos.values():
+        servo.write(11, bytes((4,)))
+    list(check_arm(config))
+    assert [servo.operating_mode for servo in bench.servos.values()] == [4, 4]
+
+
+def test_a_pilot_writes_each_eeprom_register_twice(tmp_path: Path, bench: Bench) -> None:
+    config = load_config(Path("first_time"))
+    with servo_session(config):
+        for _ in range(3):
+            with servo_session(config) as bus, bus.torque(0.1):
+                bus.exchange([0.0, 0.0])
+    assert bench.changed() == []
+    assert all(names.count(name) <= 2 for names in bench.eeprom.values() for name in names)
+
+
+@pytest.mark.parametrize("mode", [0, 1, 3, 4, 5, 16])
+@pytest.mark.parametrize("model", ["XM430-W350", "XL430-W250", "XL330-M288", "XC330-T288"])
+def test_a_check_leaves_every_register_as_it_was(arm_file: Any, bench: Bench, model: str, mode: int) -> None:
+    path = arm_file()
+    head, fake = path.read_text().replace('"XM430-W350"', f'"{model}"').split("\n[fake]\n")
+    head = head.replace("current_limit = 1.2", "current_limit = 0.5").replace(
+        "current_limit = 0.8", "current_limit = 0.5"
+    )
+    if model == "XL430-W250":
+        head = head.replace("torque_constant", "torque_per_volt").replace("current_limit = 0.5", "voltage_limit = 8.0")
+        head = head.replace("= 1.80", "= 0.125").replace("= 0.15", "= 0.01")
+    path.write_text(f"{head}\n[fake]\n{fake}")
+
+    def set_up(port: Any) -> None:
+        for servo in port.bus.servos.values():
+            servo.write(11, bytes((mode,)))
+            servo.write(100, (300).to_bytes(2, "little"))  # Goal PWM, and a gain of the user's
+            servo.write(84, (777).to_bytes(2, "little"))
+            if "Goal Current" in servo.memory:
+                servo.write(102, (55).to_bytes(2, "little"))
+
+    bench.prepare = set_up
+    found = list(check_arm(load_config(path)))
+    assert any(each.what == "rate" and "possible" in each.found for each in found), found
+    assert bench.changed() == []
+    assert not any(bench.eeprom.values())
+
+
+def stops(config: Config) -> list[Finding]:
+    return [finding for finding in check_arm(config) if finding.level is Level.STOP]
+
+
+def test_a_check_sees_that_goals_are_dropped(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def deaf(port: Any) -> None:
+        monkeypatch.setattr(port.bus._instructions, "_broadcast", {**port.bus._instructions._broadcast, 0x83: _drop})
+
+    bench.prepare = deaf
+    assert {finding.what for finding in stops(arm())} == {"goals"}
+
+
+def _drop(_body: bytes, _now: float) -> None:
+    """A Sync Write that never arrives."""
+
+
+@pytest.mark.parametrize(
+    ("registers", "what"),
+    [
+        ('{ "Startup Configuration" = 1 }', "at switch-on"),
+        ('{ "Drive Mode" = 1 }', "drive mode"),
+        ('{ "PWM Limit" = 100 }', "PWM limit"),
+    ],
+)
+def test_settings_with_which_no_run_may_start_are_refused_by_check_and_run(
+    arm: Arm, tmp_path: Path, registers: str, what: str
+) -> None:
+    config = arm((SERVO_2, f"{SERVO_2}registers = {registers}\n"))
+    assert what in {finding.what for finding in stops(config)}
+    with pytest.raises(WrongSetting):
+        play(config, tmp_path / "run")
+
+
+def test_a_time_based_profile_is_harmless(arm: Arm, tmp_path: Path, bench: Bench) -> None:
+    config = arm(SHORT, (SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 4 }\n'))
+    assert stops(config) == []
+    play(config, tmp_path / "run")
+    assert bench.changed() == []
+
+
+def test_no_supply_is_a_reason_not_to_start(arm: Arm, bench: Bench) -> None:
+    def dead(port: Any) -> None:
+        port.bus.servos[2].memory.set("Present Input Voltage", 0)
+        port.bus.servos[2].memory.set("Min Voltage Limit", 0)
+
+    bench.prepare = dead
+    assert "voltage" in {finding.what for finding in stops(arm())}
+    assert arm().safety.min_voltage == 9.5
+
+
+def hold(port: Any) -> None:
+    for servo in port.bus.servos.values():
+        servo.write(64, b"\x01")  # in position mode, as the fake starts
+
+
+def test_a_held_arm_is_refused_and_stays_held(arm: Arm, tmp_path: Path, bench: Bench) -> None:
+    bench.prepare = hold
+    config = arm(SHORT)
+    with pytest.raises(TorqueHeld, match="take-over"):
+        ServoBus.open(config.bus)
+    with pytest.raises(TorqueHeld, match=r"Joint 'shoulder'.*Joint 'elbow'"):
+        play(config, tmp_path / "run")
+    assert all(servo.torque_enabled for servo in bench.servos.values())
+    assert bench.changed() == []
+
+
+def test_a_held_arm_that_is_taken_over_sinks_slowly(arm: Arm, bench: Bench) -> None:
+    fastest: list[float] = []
+
+    def lifted(port: Any) -> None:
+        plant = port.bus.plant
+        plant.__init__(plant._arm.model_copy(update={"start": (0.0, 0.0)})) if hasattr(plant, "_arm") else None
+        hold(port)
+        advance = plant.advance
+
+        def watched(until: float, current: Any) -> None:
+            advance(until, current)
+            fastest.append(max(map(abs, plant.velocity)))
+
+        plant.advance = watched
+
+    bench.prepare = lifted
+    config = arm(SHORT)
+    taken = config.model_copy(update={"safety": config.safety.model_copy(update={"take_over": True})})
+    with servo_session(taken):
+        assert not any(servo.torque_enabled for servo in bench.servos.values())
+    assert not any(servo.torque_enabled for servo in bench.servos.values())
+    assert max(fastest) < 2.0
+
+
+def test_a_servo_of_somebody_else_keeps_its_torque_and_is_told_of(
+    arm_file: Any, tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def join(port: Any) -> None:
+        port.bus.servos[2].write(64, b"\x01")
+
+    bench.prepare = join
+    text = arm_file(SHORT).read_text()
+    head, fake = text.split("\n[fake]\n")
+    port, shoulder, rest = head.split("[[joints]]")
+    head = f"{port}[[joints]]{shoulder}[arm]{rest.split('[arm]')[1]}"
+    head = head.replace("[-1.5707963, 0.0]", "[-1.5707963]").replace("[0.80, 0.42]", "[0.80]")
+    path = tmp_path / "alone.toml"
+    path.write_text(f"{head}\n[fake]\n{fake}")
+    config = load_config(path)
+    play(config, tmp_path / "run")
+    assert bench.servos[2].torque_enabled
+    assert "ID 2, XM430-W350, torque on" in capsys.readouterr().err
+    assert any("ID 2" in finding.found for finding in check_arm(config) if finding.level is Level.WARNING)
+
+
+def test_a_killed_process_on_a_pty_is_put_back(arm_file: Any, tmp_path: Path) -> None:
+    """Two programs, a real SIGKILL between them, and the fake arm in a third."""
+    path = arm_file()
+    link = tmp_path / "arm"
+    served = subprocess.Popen(
+        [sys.executable, "-m", "hil", "fake", str(path), "--pty", "--link", str(link), "--quiet"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert served.stdout is not None and served.stdout.readline()
+        real = path.with_name("real.toml")
+        real.write_text(path.read_text().split("\n[fake]\n")[0].replace('"fake://"', f'"{link}"'))
+        config = load_config(real)
+        code = (
+            "import os, signal, sys; from pathlib import Path; from hil.config.schema import load_config;"
+            "from hil.setup.servo_session import servo_session\n"
+            "with servo_session(load_config(Path(sys.argv[1]))): os.kill(os.getpid(), signal.SIGKILL)"
+        )
+        killed = subprocess.run([sys.executable, "-c", code, str(real)], check=False, env=dict(os.environ))
+        assert killed.returncode == -9
+        with ServoBus.connect(config.bus) as bus:
+            assert [bus.servo(joint).read("Operating Mode") for joint in bus.joints] == [0, 0]
+        assert hil("check", real) in (0, 1)
+        with ServoBus.connect(config.bus) as bus:
+            assert [bus.servo(joint).read("Operating Mode") for joint in bus.joints] == [3, 3]
+    finally:
+        served.terminate()
+        served.wait()

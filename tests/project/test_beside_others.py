@@ -1,0 +1,84 @@
+"""An installed wheel beside a stranger's own packages `drivers`, `estimator` and `fakes`: each finds its own."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+THEIR_TESTS = """
+import drivers, estimator, fakes
+import hil, hil.drivers, hil.estimator, hil.fakes
+from hil.drivers.packet import encode
+
+def test_theirs_are_theirs():
+    assert drivers.OWNER == estimator.OWNER == fakes.OWNER == "stranger"
+
+def test_ours_are_ours():
+    for package in (hil.drivers, hil.estimator, hil.fakes):
+        assert package.__name__.startswith("hil.") and not hasattr(package, "OWNER")
+
+def test_the_fixture_works(fake_arm):
+    port = fake_arm()
+    assert not port.bus.servos[1].torque_enabled
+"""
+
+
+@pytest.fixture(scope="module", params=["unpacked", pytest.param("installed", marks=pytest.mark.slow)])
+def environment(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """bin/ of a fresh environment that holds the wheel: unpacked beside borrowed dependencies, or installed by pip."""
+    folder = tmp_path_factory.mktemp("environment")
+    binaries = folder / "bin"
+    if request.param == "installed":
+        subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+        subprocess.run(
+            [binaries / "python", "-m", "pip", "install", "--quiet", wheel, "pytest"], check=True, cwd=folder
+        )
+        return binaries
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    packages = folder / "lib" / version / "site-packages"
+    zipfile.ZipFile(wheel).extractall(packages)
+    (packages / "borrowed.pth").write_text(str(Path(np.__file__).parents[1]), encoding="utf-8")
+    for name, module, function in (("pytest", "pytest", "console_main"), ("hil", "hil.cli.app", "main")):
+        script = binaries / name
+        script.write_text(f"#!{binaries / 'python'}\nfrom {module} import {function}\n{function}()\n", encoding="utf-8")
+        script.chmod(0o755)
+    return binaries
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A stranger's project: two packages, a module, and tests of their own."""
+    for name in ("drivers", "fakes"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text('OWNER = "stranger"\n', encoding="utf-8")
+    (tmp_path / "estimator.py").write_text('OWNER = "stranger"\n', encoding="utf-8")
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_theirs.py").write_text(THEIR_TESTS, encoding="utf-8")
+    (tmp_path / "conftest.py").touch()  # plain pytest puts its folder on the path
+    return tmp_path
+
+
+def run(project: Path, *command: str | Path) -> str:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "PYTHON"))}
+    done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_strangers_tests_pass_under_pytest_and_python_m_pytest(environment: Path, project: Path) -> None:
+    for command in ((environment / "pytest",), (environment / "python", "-m", "pytest")):
+        assert "3 passed" in run(project, *command, "-p", "no:cacheprovider")
+
+
+def test_the_command_works_among_them(environment: Path, project: Path) -> None:
+    where = run(project, environment / "python", "-c", "import hil; print(hil.__file__)")
+    assert Path(where.strip()).is_relative_to(environment.parent)
+    for command in ((environment / "hil",), (environment / "python", "-m", "hil")):
+        assert "Ready" in run(project, *command, "check", "fake_two_link")
+    front_door = "import hil, fakes; assert hil.check('fake_two_link').ready and fakes.OWNER == 'stranger'"
+    run(project, environment / "python", "-c", front_door)

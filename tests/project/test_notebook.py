@@ -1,0 +1,81 @@
+"""The notebook in examples/: its cells run without Jupyter, and give what it shows."""
+
+import ast
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil.config.bundled import bundled_configs
+from hil.config.schema import load_config
+from hil.fakes.plants.arm import base_parameters
+from tests.support.paths import ROOT
+
+NOTEBOOK = ROOT / "examples" / "identify_an_arm.ipynb"
+MOST_BYTES = 200_000
+
+
+def code_cells() -> list[dict[str, Any]]:
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    return [cell for cell in cells if cell["cell_type"] == "code"]
+
+
+def run(source: str, names: dict[str, Any]) -> Any:
+    """Run a cell; the value of its last line where that is an expression."""
+    tree = ast.parse(source)
+    last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
+    exec(compile(tree, str(NOTEBOOK), "exec"), names)
+    return None if last is None else eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names)
+
+
+def nothing() -> None:
+    """What a value without such a method shows."""
+
+
+def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for cell in code_cells():
+        value = run("".join(cell["source"]), names)
+        shown = [output["data"] for output in cell["outputs"] if "data" in output]
+        assert len(shown) == (value is not None), cell["source"]
+        if value is None:
+            continue
+        for kind, method in (("text/html", "_repr_html_"), ("image/png", "_repr_png_")):
+            assert (kind in shown[0]) == (getattr(value, method, nothing)() is not None)
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_the_values_it_shows_are_those_of_the_fake_arm() -> None:
+    """Within what any estimator of this project must reach; error bars may change with the estimator."""
+    shown = next(text for text in texts() if "trust it: yes" in text)
+    truth = load_config(bundled_configs()["fake_two_link"]).fake
+    assert truth is not None
+    for name, value in base_parameters(truth.arm).items():
+        found = re.search(rf"^\s*{name}\s+(\S+) \+- ", shown, re.MULTILINE)
+        assert found and float(found[1]) == pytest.approx(value, rel=0.01)
+
+
+def texts() -> list[str]:
+    return ["".join(each["data"]["text/plain"]) for cell in code_cells() for each in cell["outputs"] if "data" in each]
+
+
+def test_it_was_executed_in_order_and_is_small() -> None:
+    text = NOTEBOOK.read_text(encoding="utf-8")
+    assert len(text.encode()) < MOST_BYTES
+    assert [cell["execution_count"] for cell in code_cells()] == list(range(1, len(code_cells()) + 1))
+    assert not [output for cell in code_cells() for output in cell["outputs"] if output["output_type"] == "error"]
+    assert not re.search(r'"/(home|root|tmp|work|Users)/', text), "a path of the machine it was executed on"
+
+
+@pytest.mark.slow
+def test_it_executes_in_a_kernel(tmp_path: Path) -> None:
+    nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed: pip install 'hil[notebook]'")
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed: pip install 'hil[notebook]'")
+    pytest.importorskip("ipykernel", reason="ipykernel is not installed: pip install 'hil[notebook]'")
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert (tmp_path / "run" / "result.json").is_file()
