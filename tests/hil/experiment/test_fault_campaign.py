@@ -23,7 +23,7 @@ FOUND_LATE = frozenset({Kind.SCALE, FaultKind.STUCK_JOINT, FaultKind.STATUS_ERRO
 
 @pytest.mark.parametrize("part", range(PARTS))
 def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
-    outcomes, left_out = campaign(settings()[part::PARTS], INJECTIONS // PARTS, jobs=1)
+    outcomes, left_out = campaign(settings()[part::PARTS], INJECTIONS // PARTS, jobs=1, period=1.0)
     assert all(why.startswith((NOT_STABLE, NOT_SETTLED)) for why in left_out), left_out
     unsafe = [str(each) for each in outcomes if each.verdict.unsafe and not set(each.drawn.kinds) & FOUND_LATE]
     assert not unsafe, "\n\n".join(unsafe)

@@ -174,10 +174,9 @@ def _raise(_: bytes) -> int:
 
 def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     config = arm(SHORT)
-    with pytest.raises(PortLost), servo_session(config) as bus:
-        monkeypatch.setattr(bench.port, "write", _raise)
+    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
+        gone.setattr(bench.port, "write", _raise)
         bus.exchange([0.0, 0.0])
-    monkeypatch.undo()
     for servo in bench.servos.values():
         servo.write(11, bytes((4,)))
     list(check_arm(config))
@@ -186,10 +185,9 @@ def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatc
 
 def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     config = arm(SHORT)
-    with pytest.raises(PortLost), servo_session(config) as bus:
-        monkeypatch.setattr(bench.port, "write", _raise)
+    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
+        gone.setattr(bench.port, "write", _raise)
         bus.exchange([0.0, 0.0])
-    monkeypatch.undo()
     for servo in bench.servos.values():
         servo.write(11, bytes((3,)))
         servo.write(102, (7).to_bytes(2, "little"))
