@@ -46,9 +46,18 @@ class Port:
         self.url = url
         self.baud = baud
         self.latency = adapter_latency(url)
+        self.latency_measured = False
+        """Whether `latency` was measured, because replies come later than this kind of adapter lets one think."""
+        self.echoes = False
+        """Whether the adapter hears what it sends. Set-up work finds out."""
         self._serial = opened
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
         self.is_open = True
+
+    @property
+    def has_baud(self) -> bool:
+        """Whether setting the baud does anything: over TCP the other end has set it."""
+        return not self.url.startswith("socket://")
 
     def wire_time(self, count: int) -> float:
         """Seconds that `count` bytes take on the wire (8 data bits, start and stop)."""

@@ -94,7 +94,7 @@ class Servo:
         if actual != value:
             raise ServoRefused(f"{self.title}: {register} was written as {value} but reads back as {actual}.")
 
-    def write_only(self, register: str, value: int) -> None:
+    def write_only(self, register: str, value: int, attempts: int = _ATTEMPTS) -> None:
         """Write a register whose new value cannot be read back under the old ID or baud; raises as `read`."""
         entry = self.table[register]
         data = list(entry.encode(value))
@@ -103,7 +103,7 @@ class Servo:
             result, error = self._sdk.writeTxRx(self._sdk_port, self.id, entry.address, entry.size, data)
             return None, result, error
 
-        self._try(f"writing {value} to {register}", send)
+        self._try(f"writing {value} to {register}", send, attempts)
 
     def hardware_error(self) -> HardwareError:
         """Why the servo raised its alert bit; raises as `read`."""

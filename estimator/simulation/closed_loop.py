@@ -8,13 +8,13 @@ to first order.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import finer_pieces, pieces_now, step_bent, steps_per_sample
 from hil.estimator.simulation.bristles import first_bend, has_bristles, without_dry_friction
@@ -89,7 +89,7 @@ class Stabilised:
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
     """Commands take effect `command_to_sample` [s] before the sample of the same index: so much less lag."""
-    return Physics(physics.vector, physics.delay, max(physics.lag - command_to_sample, 1e-5))
+    return replace(physics, lag=max(physics.lag - command_to_sample, 1e-5))
 
 
 def resting(pose: Array) -> Array:
@@ -176,4 +176,4 @@ def _loop(
     state[3, 0], state[3, 1], state[4, 0], state[4, 1] = s1, s2, w1, w2
 
 
-respond_compiled: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)
+respond_compiled: Callable[..., None] = compiled(_loop)

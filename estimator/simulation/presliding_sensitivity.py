@@ -8,11 +8,11 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import SLIDING, Physics
 from hil.estimator.simulation.arm import MAX_SUBSTEPS, pieces_now
 from hil.estimator.simulation.bristles import (
@@ -33,6 +33,7 @@ from hil.estimator.simulation.bristles import (
 from hil.estimator.simulation.sensitivity import (
     AT_ONCE,
     DELAY,
+    LAG_DIFFERENCE,
     NOWHERE,
     SLOPES,
     STAGE,
@@ -150,6 +151,8 @@ def _bend(
             level_by[r + at[SATURATION + joint]] = -loaded * cube
             for cause in range(2):
                 level_by[r + at[DELAY + cause]] = loaded * scale * eased * dt[cause, joint]
+            if joint == 1:
+                level_by[r + at[LAG_DIFFERENCE]] = loaded * scale * eased * dt[1, joint]
             b[joint] = way * level + away * left
             bent = way * b[joint] / level
             z = (2 + joint) * WIDE
@@ -243,4 +246,4 @@ def _loop(
 
 
 _bend, _clear, _press, _accelerate = map(fused, (_bend, _clear, _press, _accelerate))
-_advance: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_loop)
+_advance: Callable[..., None] = compiled(_loop, fastmath={"contract"})

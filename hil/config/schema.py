@@ -5,23 +5,36 @@
 
 import math
 import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PositiveFloat,
+    Tag,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from hil import fakes
 from hil.config.bundled import find_config
+from hil.config.chain import MOST_JOINTS, chain_slips
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
 from hil.drivers.bus import BusConfig
-from hil.drivers.joint import Joint
+from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
-from hil.fakes.description import FakeArm, beside
+from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import find_arm
-from hil.toml_errors import describe
+from hil.toml_errors import UNSAID, describe
 
 FAKE_URL = "fake://"
 
@@ -33,6 +46,13 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
+BusId = Annotated[int, Field(ge=0, le=252)]
+_One = TypeVar("_One")
+OneOrList = Annotated[
+    Annotated[_One, Tag(f"{UNSAID}one")] | Annotated[list[_One], Tag(f"{UNSAID}list")],
+    Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
+]
+"""A value, or a list of such; a wrong one is named as what it looks like."""
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -49,9 +69,11 @@ class JointConfig(_Table):
     """`[[joints]]`: one joint, from the base outwards."""
 
     name: str = Field(min_length=1, max_length=20)
-    id: int = Field(ge=0, le=252)
+    servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or those of the two servos of the joint")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
-    direction: Literal[-1, 1] = 1
+    turns: OneOrList[Literal[-1, 1]] = Field(
+        1, alias="direction", description="-1 where the servo turns against the joint; for two servos one each"
+    )
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
     mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
@@ -77,6 +99,36 @@ class JointConfig(_Table):
         if low >= high:
             raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
         return self
+
+    @model_validator(mode="after")
+    def _a_direction_for_each_servo(self) -> Self:
+        if isinstance(self.servos, list) and not 1 <= len(self.servos) <= 2:
+            raise ValueError(f"id has {len(self.servos)} entries: one servo or two move a joint")
+        if len(set(self.ids)) < len(self.ids):
+            raise ValueError(f"id = {list(self.ids)}: each servo needs one of its own")
+        if isinstance(self.turns, list) and len(self.turns) != len(self.ids):
+            raise ValueError(f"direction has {len(self.turns)} entries for {len(self.ids)} servos: one each")
+        return self
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The IDs of its servos, the first one's first."""
+        return tuple(self.servos) if isinstance(self.servos, list) else (self.servos,)
+
+    @property
+    def id(self) -> int:
+        """The ID of its servo, the first where it has two."""
+        return self.ids[0]
+
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """+1 or -1 for each of its servos."""
+        return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
+
+    @property
+    def direction(self) -> int:
+        """+1 or -1, of the first servo."""
+        return self.directions[0]
 
     @model_validator(mode="after")
     def _driven(self) -> Self:
@@ -120,7 +172,16 @@ class JointConfig(_Table):
 
     @property
     def joint(self) -> Joint:
-        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks, self.drive_mode)
+        seconds = tuple(SecondServo(*each) for each in zip(self.ids[1:], self.directions[1:], strict=True))
+        return Joint(
+            self.name,
+            self.id,
+            servo_model(self.model),
+            self.direction,
+            self.zero_ticks,
+            self.drive_mode,
+            seconds=seconds,
+        )
 
 
 class PriorConfig(_Table):
@@ -145,8 +206,14 @@ class ArmConfig(_Table):
     """`[arm]`: what is known of the mechanism."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
-    rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
-    rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+    urdf: str | None = Field(None, description="of an arm in space: a file beside this one; [[joints]] bear its names")
+    base: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+        [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of its base, rad"
+    )
+    rest_pose: list[float] = Field(description="rad: where the arm hangs, or lies, when nothing drives it")
+    rest_tolerance: PositiveFloat = Field(
+        0.5, description="rad from the rest pose allowed at the start: friction may hold an arm far from it"
+    )
     link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
     prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
 
@@ -197,11 +264,19 @@ class ExperimentConfig(_Table):
         return round(self.rate * self.period)
 
 
+class PathConfig(_Table):
+    """`[joint_path]`: of an arm in space, the path that excites it; band's upper end is its highest frequency."""
+
+    centre: list[float] = Field(description="rad per joint: what the path goes around")
+    swing: list[PositiveFloat] = Field(description="rad per joint: how far from there")
+    speed: list[PositiveFloat] = Field(description="rad/s per joint: how fast at most")
+
+
 class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
     friction: Literal["auto"] | Friction = Field(
-        "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
+        "auto", description='"auto" tries all that follows too, and keeps what the motion asks for'
     )
     drive: Drive = "lag"
     presliding: bool = Field(False, description=OPTIONS["presliding"])
@@ -212,6 +287,7 @@ class ModelConfig(_Table):
     saturation: bool = Field(False, description=OPTIONS["saturation"])
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
+    lags: bool = Field(False, description=OPTIONS["lags"])
 
     @property
     def fixed_friction(self) -> Friction:
@@ -220,10 +296,9 @@ class ModelConfig(_Table):
 
     @model_validator(mode="after")
     def _auto_has_no_terms(self) -> Self:
-        if self.friction == "auto" and (self.presliding or self.asymmetry or self.ripple or self.zeros):
-            raise ValueError(
-                'friction = "auto" chooses presliding, asymmetry and ripple itself and leaves zeros out: give none'
-            )
+        given = [option for option in OPTIONS if option != "torque_scale" and getattr(self, option)]
+        if self.friction == "auto" and given:
+            raise ValueError(f'friction = "auto" chooses {", ".join(given)} itself: give none, or a law of friction')
         return self
 
 
@@ -279,9 +354,10 @@ class Config(_Table):
 
     path: Path = Field(exclude=True)
     port: PortConfig
-    joints: list[JointConfig] = Field(min_length=1, max_length=2)
+    joints: list[JointConfig] = Field(min_length=1, max_length=MOST_JOINTS)
     arm: ArmConfig
     experiment: ExperimentConfig
+    joint_path: PathConfig | None = None
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
     stabiliser: StabiliserConfig | None = None
@@ -308,7 +384,7 @@ class Config(_Table):
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
         for key, values in self._per_joint():
             _same_length(key, values, count)
-        slips = list(implausible(self))
+        slips = [*chain_slips(self), *implausible(self)]
         if slips:
             raise ValueError("; ".join(slips))
         if self.experiment.lines is not None:
@@ -316,20 +392,16 @@ class Config(_Table):
             excited = [line for lines in self.experiment.lines for line in lines]
             if len(set(excited)) != len(excited):
                 raise ValueError("experiment.lines: two joints share a line; each joint needs its own")
-        for key in ("id", "name"):
-            values = [getattr(joint, key) for joint in self.joints]
-            if len(set(values)) != count:
-                raise ValueError(f"joints: two joints have the same {key} {values[0]!r}")
+        _all_different("id", [servo_id for joint in self.joints for servo_id in joint.ids])
+        _all_different("name", [joint.name for joint in self.joints])
         for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
             _check_rest_pose(joint, rest)
         if self.experiment.peak_torque is not None:
             for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
                 _check_peak_torque(joint, peak)
         self._check_pilot()
-        if self.model.torque_scale and count != 2:
+        if self.model.torque_scale and count != 2 and not self.is_chain:
             raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
-        if len({joint.drive_mode for joint in self.joints}) != 1:
-            raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
         return self
@@ -339,6 +411,8 @@ class Config(_Table):
         lists = {"experiment.peak_torque": self.experiment.peak_torque, "arm.link_lengths": self.arm.link_lengths}
         if self.stabiliser is not None:
             lists |= {"stabiliser.stiffness": self.stabiliser.stiffness, "stabiliser.damping": self.stabiliser.damping}
+        if self.joint_path is not None:
+            lists |= {f"joint_path.{key}": value for key, value in self.joint_path.model_dump().items()}
         if self.arm.prior is not None:
             guessed = self.arm.prior.model_dump(exclude={"spread", "rough_spread"})
             lists |= {f"arm.prior.{key}": value for key, value in guessed.items()}
@@ -346,12 +420,19 @@ class Config(_Table):
 
     def _check_pilot(self) -> None:
         experiment = self.experiment
+        if self.is_chain:
+            return
         if experiment.pilot and self.arm.link_lengths is None:
             raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
         if experiment.peak_torque is None and self.arm.link_lengths is None:
             raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
         if experiment.design == "optimal" and not experiment.pilot:
             raise ValueError('experiment.design = "optimal" needs pilot = true: it designs on the pilot\'s model')
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether a URDF describes the arm."""
+        return self.arm.urdf is not None
 
     @property
     def url(self) -> str:
@@ -364,7 +445,7 @@ class Config(_Table):
         return BusConfig(
             self.url,
             self.port.baud,
-            tuple(joint.joint for joint in self.joints),
+            tuple(replace(joint.joint, near=rest) for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True)),
             one_write=self.port.one_write,
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
@@ -399,6 +480,9 @@ def parse_config(text: str, path: Path) -> Config:
         raise ConfigError(f"{path}: path is not a known key.")
     if isinstance(values.get("fake"), dict):
         values["fake"] = beside(values["fake"], path.parent)
+    arm = values.get("arm")
+    if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
+        values["arm"] = {**arm, "urdf": str(found_beside(path.parent, arm["urdf"]))}
     try:
         return Config(path=path, **values)
     except ValidationError as error:
@@ -408,6 +492,12 @@ def parse_config(text: str, path: Path) -> Config:
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
     if len(values) != count:
         raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each of [[joints]]")
+
+
+def _all_different(key: str, values: Sequence[int | str]) -> None:
+    again = [value for place, value in enumerate(values) if value in values[:place]]
+    if again:
+        raise ValueError(f"joints: two joints have the same {key} {again[0]!r}")
 
 
 def _check_rest_pose(joint: JointConfig, rest: float) -> None:
