@@ -21,7 +21,7 @@ from benchmarks.fault_campaign.arms import PERIOD_S, Setting
 from benchmarks.fault_campaign.attack import Kind
 from benchmarks.fault_campaign.draw import Drawn, draw
 from benchmarks.fault_campaign.judge import Story, Verdict, describe, judge
-from benchmarks.fault_campaign.middle import Killed, Middle
+from benchmarks.fault_campaign.middle import Killed, Middle, Traffic
 from benchmarks.fault_campaign.protocol_campaign import Bench
 from benchmarks.fault_campaign.witness import Witness
 from hil.cli.app import main
@@ -145,7 +145,8 @@ def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str
         folder = Path(name) / "run"
         code, text = _command("record", str(ready.path), "--out", str(folder))
         port = Bench.port
-        assert port is not None
+        if port is None:  # the command ended before it opened the port
+            return Story(np.empty(0), Traffic(), 0.0, code, text), True, ()
         port.over = True
         ended = port.clock.now()
         port.bus.faults.clear()
