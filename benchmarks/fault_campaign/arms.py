@@ -39,7 +39,7 @@ def make_document(setting: Setting, period: float = PERIOD_S) -> dict[str, Any]:
 
     What is lowered is the experiment's length; limits, torques, models and safety stay as they are shipped.
     """
-    document = _with_absolute_paths(_load(setting.name))
+    document = _load(setting.name)
     experiment: dict[str, Any] = document["experiment"]
     if experiment.pop("pilot", False):
         # A pilot's steps are runs as any other; finding their torques takes the time of hundreds of injections.
@@ -86,15 +86,6 @@ def _inline(value: Any) -> str:
 
 def _load(name: str) -> dict[str, Any]:
     return tomllib.loads((CONFIGS / f"{name}.toml").read_text(encoding="utf-8"))
-
-
-def _with_absolute_paths(value: Any) -> Any:
-    """The document with the URDFs that stand beside the shipped file found from anywhere."""
-    if isinstance(value, dict):
-        return {key: _with_absolute_paths(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_with_absolute_paths(each) for each in value]
-    return str(CONFIGS / value) if isinstance(value, str) and value.endswith(".urdf") else value
 
 
 def _fake_arm(document: dict[str, Any]) -> dict[str, Any]:
