@@ -18,7 +18,7 @@ from hil.cli.verbosity import with_verbosity
 
 app = typer.Typer(
     name="hil",
-    help="Identify the dynamics of Dynamixel servo arms, on the bus or on a fake one.",
+    help="Identify the dynamics of Dynamixel servo arms, on a real bus or a fake one.",
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
@@ -32,7 +32,7 @@ def _root(
     allow_code: Annotated[
         bool,
         typer.Option(
-            "--allow-code", help='Let a file\'s [fake] plant = "module:factory" run any function. Look at it first.'
+            "--allow-code", help='Let a file\'s [fake] plant = "module:factory" run arbitrary code. Read it first.'
         ),
     ] = False,
 ) -> None:

@@ -34,7 +34,7 @@ def _length(config: Config, estimate: Estimate) -> list[str]:
         return []
     return [
         f"coupling * gravity / gravity_2 = {found:.3g} +- {std:.1g} m should be the length of link 1, {length:.3g} m: "
-        "arm.gravity, the plane's tilt or that length is wrong, or the model lacks something."
+        "arm.gravity, the plane's tilt or that length is wrong, or the model is incomplete."
     ]
 
 
