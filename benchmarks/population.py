@@ -1,9 +1,10 @@
 """Any arm: arms drawn at random go the whole way from `hil init`'s file to a verdict, as a person would take them.
 
-    python benchmarks/population.py [--arms N | --seeds A..B] [--jobs N] [--json] [--keep DIR]
+    python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--jobs N] [--json] [--keep DIR]
 
 The distribution stands in benchmarks/population_arms.py. Each arm is identified by `hil identify` in a process of its
-own, in virtual time, and judged against the truth of its fake arm.
+own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto",
+for tests.
 
 finished              share that ended with a result, nobody helping
 beyond_limit          arms that went farther beyond a position limit than hil.dry_run.stopping_distance predicts
@@ -24,12 +25,11 @@ import tempfile
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from population_arms import DrawnArm, draw
 
 from hil.config.schema import Config, parse_config
 from hil.dry_run.ensemble import prior_ensemble
@@ -38,9 +38,15 @@ from hil.estimation.truth import true_parameters
 from hil.plan.plan import make_plan
 from hil.runs.recording import load_samples
 
+try:
+    from benchmarks.population_arms import DrawnArm, draw
+except ImportError:  # run as a script
+    from population_arms import DrawnArm, draw
+
 FINISHED_WITHIN_S = 900.0
 JUDGED = ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb")
 TOLERANCE, DEVIATIONS = 0.02, 3.0
+NOTHING = 1e-9  # N m
 
 
 @dataclass(frozen=True)
@@ -83,9 +89,11 @@ class Outcome:
         )
 
 
-def run(seed: int, folder: Path) -> Outcome:
+def run(seed: int, folder: Path, *, quick: bool = False) -> Outcome:
     """Identify the arm of this seed in a process of its own, and judge what it did."""
     arm = draw(seed)
+    if quick:
+        arm = replace(arm, toml=arm.toml.replace('friction = "auto"  ', 'friction = "stribeck"'))
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "arm.toml"
     path.write_text(arm.toml, encoding="utf-8")
@@ -151,14 +159,14 @@ def _predicted(config: Config, at: np.void) -> float:
 def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, Any]) -> Outcome:
     truth = true_parameters(config)
     assert truth is not None
-    scale = {name.split("_")[0]: max(abs(v) for n, v in truth.items() if n.startswith(name[:7])) for name in truth}
+    friction = min(value for name, value in truth.items() if name.startswith("coulomb"))
     errors = {}
     for name, entry in result["parameters"].items():
         if not name.startswith(JUDGED):
             continue
         true = truth[name] * arm.units
         # An arm that lies flat has no gravity: what is found of it counts against its friction.
-        size = abs(true) if true else arm.units * scale["coulomb"]
+        size = abs(true) if abs(true) > NOTHING else arm.units * friction
         error = entry["value"] - true
         std = entry["std"]
         errors[name] = (error / size, error / std if std else np.inf)
@@ -201,12 +209,12 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def study(seeds: list[int], jobs: int, keep: Path | None, tell: Any = None) -> list[Outcome]:
+def study(seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False) -> list[Outcome]:
     """The outcome of each seed's arm; tell: called with each as it ends."""
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
         folder = keep or Path(temporary)
         outcomes = []
-        for ended in as_completed([pool.submit(run, seed, folder / str(seed)) for seed in seeds]):
+        for ended in as_completed([pool.submit(run, seed, folder / str(seed), quick=quick) for seed in seeds]):
             outcomes.append(ended.result())
             if tell:
                 tell(outcomes[-1])
@@ -225,17 +233,16 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=200)
     parser.add_argument("--seeds", type=_seeds, help="A..B, in place of --arms")
+    parser.add_argument("--quick", action="store_true")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("--keep", type=Path, help="folder for files, run folders and messages")
     options = parser.parse_args()
     seeds = options.seeds or list(range(1000, 1000 + options.arms))
     if not options.json:
         print(machine())
+    stream = sys.stderr if options.json else sys.stdout
     outcomes = study(
-        seeds,
-        options.jobs,
-        options.keep,
-        lambda each: print(each, file=sys.stderr if options.json else sys.stdout, flush=True),
+        seeds, options.jobs, options.keep, lambda each: print(each, file=stream, flush=True), quick=options.quick
     )
     measured = figures(outcomes)
     if options.json:

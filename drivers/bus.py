@@ -1,25 +1,28 @@
 """The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from hil.drivers.control_table import ControlTable, load_control_table, model_names
-from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongSetting
+from hil.drivers.errors import (
+    DriverError,
+    ServoFault,
+    ServoRefused,
+    TorqueNotOff,
+    WrongModel,
+)
 from hil.drivers.exchange import Exchange
 from hil.drivers.hold import let_sink, refuse_held
 from hil.drivers.joint import Joint
 from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
 from hil.drivers.port import Port, open_port
+from hil.drivers.preparation import check_quiet, fault_text, learn_latency, prepare_servo, shared
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
-from hil.drivers.settings import arms_itself
 from hil.drivers.shield import signals_held_back
-from hil.drivers.state import NAN, Converter, State, spans, status_span
-from hil.drivers.sync_read import Span
-
-TIME_BASED_PROFILE = 0x04
-"""Bit of Drive Mode that changes profiles only, which current and PWM mode do not have."""
+from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_span
+from hil.drivers.sync_read import one_each
 
 _PROBES = 3
 """How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
@@ -29,6 +32,9 @@ STATUS_S = 0.035
 
 _SHARE, _MOST_SHARE = 0.6, 0.9
 """Of a cycle that a status may take on the wire; adapter and computer need the rest."""
+
+MOST_STRANGERS = 2
+"""How many instructions of another master may be heard while an experiment runs; a damaged reply can look like one."""
 
 _INTERRUPTS_BORNE = 5
 """How often confirming that a servo is off is begun again after an interrupt."""
@@ -56,12 +62,9 @@ class BusConfig:
     interval: float = 0.0
 
     def __post_init__(self) -> None:
-        modes = {joint.mode for joint in self.joints}
-        if len(modes) != 1:
-            raise ValueError(
-                "One Sync Write drives all joints, so all must be in current mode or all in PWM mode: "
-                + ", ".join(f"{joint} is in {joint.mode.name} mode" for joint in self.joints)
-            )
+        ids = [drive.id for joint in self.joints for drive in joint.drives]
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}: each needs one of its own.")
 
     def is_same_arm(self, other: "BusConfig") -> bool:
         """Whether both are the same servos on the same port."""
@@ -107,11 +110,17 @@ class ServoBus:
         self.port = port
         self.config = config
         self.joints = config.joints
+        self._drives = tuple(drive for joint in self.joints for drive in joint.drives)
+        """One for each servo."""
+        self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
+        self._in_pairs = len(self._drives) > len(self.joints)
         self._servos = {
-            joint: Servo(port, joint.id, load_control_table(joint.servo.name), joint.title) for joint in self.joints
+            drive: Servo(port, drive.id, load_control_table(drive.servo.name), drive.title) for drive in self._drives
         }
+        self._measured = self._drives
+        """The same with the zero of the turn in which they are."""
         self._exchange: Exchange | None = None
-        self._converter = Converter(self.joints, [NAN] * len(self.joints))
+        self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
         self.torque_off_report: TorqueOff | None = None
 
@@ -151,11 +160,24 @@ class ServoBus:
         self.port.close()
 
     def servo(self, joint: Joint) -> Servo:
-        """The joint's servo, for reading and writing registers."""
-        return self._servos[joint]
+        """The joint's servo, the first where it has two, for reading and writing registers."""
+        return self.servos(joint)[0]
+
+    @property
+    def drives(self) -> Mapping[Joint, Servo]:
+        """Every servo, by a joint of its own: those of `Joint.drives`, in their order."""
+        return self._servos
+
+    def servos(self, joint: Joint) -> tuple[Servo, ...]:
+        """All servos of a joint, in the order of its `drives`."""
+        return tuple(self._servos[drive] for drive in joint.drives)
 
     def check_identity(self) -> None:
-        """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel."""
+        """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel.
+
+        The first to answer tells how slow the adapter is, where it is slower than its kind says.
+        """
+        learn_latency(next(iter(self._servos.values())))
         for joint, servo in self._servos.items():
             number = servo.ping()
             if number != servo.table.number:
@@ -191,19 +213,24 @@ class ServoBus:
     def prepare(self) -> None:
         """Bring every servo into its mode with torque off, and prepare the exchange.
 
-        Raises ServoFault, and WrongSetting where a register forbids an experiment and changing it is the user's
-        decision.
+        Raises ServoFault, BusShared where another master is heard, and WrongSetting where a register forbids an
+        experiment and changing it is the user's decision.
         """
         self.port.lower_latency()
+        check_quiet(self.port)
+        ids = {drive.id for drive in self._drives}
         for joint, servo in self._servos.items():
-            _prepare_servo(joint, servo)
+            prepare_servo(joint, servo, ids - {joint.id})
+        self._measured = tuple(
+            joint.within_turn(servo.read("Present Position")) for joint, servo in self._servos.items()
+        )
         supply = [VOLTAGE_UNIT * servo.read("Present Input Voltage") for servo in self._servos.values()]
-        units = [joint.drive_unit(voltage) for joint, voltage in zip(self.joints, supply, strict=True)]
-        self._converter = Converter(self.joints, units)
+        units = [joint.drive_unit(voltage) for joint, voltage in zip(self._drives, supply, strict=True)]
+        self._converter = Converter(self._measured, units)
         one_write = self.config.one_write
         fast = self.config.fast_sync_read and self.knows_fast_sync_read()
         exchange = self.make_exchange(fast=fast, one_write=one_write)
-        nothing = [0] * len(self.joints)
+        nothing = [0] * len(self._drives)
         if fast and all(None in exchange.cycle(nothing).servos for _ in range(_PROBES)):
             exchange = self.make_exchange(fast=False, one_write=one_write)
         self._exchange = exchange
@@ -221,14 +248,17 @@ class ServoBus:
         """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
-        mode = self.joints[0].mode
+        modes = [drive.mode for drive in self._drives]
         return_delay = max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos)
         span, status_every = self._status_turns(tables, return_delay) if status else (None, 0)
         return Exchange(
             self.port,
             [servo.id for servo in servos],
-            tables[0]["Goal Current" if mode is Mode.CURRENT else "Goal PWM"],
-            spans(mode, tables),
+            [
+                table["Goal Current" if mode is Mode.CURRENT else "Goal PWM"]
+                for table, mode in zip(tables, modes, strict=True)
+            ],
+            spans(modes, tables),
             return_delay,
             fast=fast,
             one_write=one_write,
@@ -238,16 +268,17 @@ class ServoBus:
             interval=self.config.interval,
         )
 
-    def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Span | None, int]:
+    def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Spans | None, int]:
         """What the servos tell of themselves and the cycles from one time to the next; None where there is no time."""
-        interval, mode, count = self.config.interval, self.joints[0].mode, len(self.joints)
+        interval, modes, count = self.config.interval, [drive.mode for drive in self._drives], len(self._drives)
         if not interval:
             return None, 0
         # Without a sensor in the motor lost torque shows in Torque Enable first, so that is worth a late sample.
         share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
         for whole in (True, False):
-            span = status_span(mode, tables, whole=whole)
-            taken = self.port.wire_time(28 + 4 * count + count * (11 + span.size))  # goals, request, replies
+            span = status_span(modes, tables, whole=whole)
+            goals = 14 * len(set(modes)) + 3 * count
+            taken = self.port.wire_time(goals + 14 + count + count * (11 + one_each(span, count)[0].size))
             if taken + return_delay * count < share * interval:
                 return span, max(1, round(STATUS_S / interval))
         return None, 0
@@ -260,30 +291,47 @@ class ServoBus:
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Every joint's angle [rad], by set-up reads."""
-        return tuple(joint.angle(servo.read("Present Position")) for joint, servo in self._servos.items())
+        """Every joint's angle [rad], by set-up reads; a joint with two servos has the first one's."""
+        first = [self._of.index(index) for index in range(len(self.joints))]
+        return tuple(
+            self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
+        )
 
     def exchange(self, goals: Sequence[float]) -> State:
         """Send goals, one per joint [A, or V under PWM], and read the arm's state.
 
-        A silent servo is marked missing. Raises PortLost; ValueError for a goal that is no number.
+        A silent servo is marked missing. Raises PortLost; BusShared when another master's instructions are heard again
+        and again; ValueError for a goal that is no number.
         """
+        if self._in_pairs and len(goals) == len(self.joints):
+            goals = [goals[joint] / self._of.count(joint) for joint in self._of]
         ticks = self._converter.ticks(goals)
         exchange = self._exchange or self.prepared
-        return self._converter.state(ticks, exchange.cycle(ticks))
+        state = self._converter.state(ticks, exchange.cycle(ticks))
+        if exchange.strangers > MOST_STRANGERS:
+            raise shared(f"has sent {exchange.strangers} instructions")
+        return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_alerts(self, state: State) -> None:
         """Where a servo raised its alert bit, read the cause; raises ServoFault, which names all of them."""
-        faults = [self._fault(joint) for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
+        raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
+        faults = [text for joint in raised if (text := self._faults(joint))]
         if faults:
             raise ServoFault(" ".join(faults))
 
-    def _fault(self, joint: Joint) -> str:
+    def _faults(self, joint: Joint) -> str:
+        """What is wrong with the servos of a joint that raised its alert."""
+        texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
+        return " ".join(filter(None, texts))
+
+    def _fault(self, drive: Joint, *, alone: bool = True) -> str:
+        """What is wrong with one servo; alone: it is certainly this one."""
         try:
-            cause = describe_error(self._servos[joint].hardware_error())
-        except DriverError as error:
-            cause = f"unknown, it could not be read ({error})"
-        return _fault_text(joint, cause)
+            error = self._servos[drive].hardware_error()
+            cause = describe_error(error)
+        except DriverError as problem:
+            return fault_text(drive, f"unknown, it could not be read ({problem})")
+        return fault_text(drive, cause) if alone or error else ""
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
@@ -366,9 +414,9 @@ class ServoBus:
         """To all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s where one is
         silent. A Sync Write, since what else is on the bus may be held by somebody. Twice, since a packet may be lost.
         """
-        entry = self._servos[self.joints[0]].table["Torque Enable"]
+        entry = self._servos[self._drives[0]].table["Torque Enable"]
         body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
-        body += b"".join(bytes((joint.id, 0)) for joint in self.joints)
+        body += b"".join(bytes((drive.id, 0)) for drive in self._drives)
         # Where this fails, the confirmed writes will say so.
         with suppress(DriverError):
             self.port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
@@ -386,38 +434,6 @@ def _write_surely(servo: Servo, register: str, value: int, interrupts: list[Base
         else:
             return None
     return "It was interrupted again and again."
-
-
-def _prepare_servo(joint: Joint, servo: Servo) -> None:
-    servo.write("Torque Enable", 0)
-    fault = servo.hardware_error()
-    if fault != HardwareError(0):
-        raise ServoFault(_fault_text(joint, describe_error(fault)))
-    drive_mode = servo.read("Drive Mode")
-    if drive_mode & ~TIME_BASED_PROFILE:
-        raise WrongSetting(
-            f"{joint.title}: Drive Mode is {drive_mode}, 0 is needed (no reverse, no torque on by goal). "
-            "Set it to 0 with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
-        )
-    if arms_itself(servo):
-        raise WrongSetting(
-            f"{joint.title}: Startup Configuration turns its torque on by itself whenever it is switched on or "
-            "reboots. Set that register to 0 with DYNAMIXEL Wizard 2.0."
-        )
-    if servo.read("Operating Mode") != joint.mode:
-        servo.write("Operating Mode", joint.mode)
-    if servo.read("Bus Watchdog"):
-        servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
-    # Goal PWM limits the output in current mode too; what another program left there may be nothing.
-    if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
-        servo.write("Goal PWM", servo.read("PWM Limit"))
-
-
-def _fault_text(joint: Joint, cause: str) -> str:
-    return (
-        f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
-        "find the cause, then switch its supply off and on."
-    )
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

@@ -9,6 +9,7 @@ DriverError
 ├── WrongReply          a servo answered with something that is not an answer to the question
 ├── ServoRefused        a servo answered with an error code: access, range, limit
 ├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
+├── BusShared           another program is master of the same bus
 ├── WrongModel          another model, or one whose firmware is too old, answers at this ID
 ├── WrongSetting        a register holds a value with which no experiment may start
 │   └── TorqueHeld      torque is on already: somebody holds or drives the arm
@@ -55,6 +56,10 @@ class ServoRefused(DriverError):
 
 class ServoFault(DriverError):
     """The servo reports a hardware error. Example: overload, after which it stays without torque until rebooted."""
+
+
+class BusShared(DriverError):
+    """Somebody else sends instructions on this bus. Example: a controller board plugged in beside the adapter."""
 
 
 class WrongModel(DriverError):

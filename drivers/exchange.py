@@ -1,5 +1,8 @@
 """The control cycle on the wire: goals out, states in, one write and one bounded read.
 
+Servos in current mode and servos in PWM mode have their goals in different registers: each register has a Sync Write of
+its own, all in the same write.
+
 A Sync Write has no reply, so the group read that follows it leaves in the same write: one transaction of the adapter
 instead of two. All packets are prepared once; a cycle packs the goals and one CRC.
 
@@ -15,7 +18,7 @@ from typing import NamedTuple
 from fastcrc import crc16
 
 from hil.drivers.control_table import Register
-from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
+from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction
 from hil.drivers.port import Port
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
@@ -29,6 +32,7 @@ MOST_PATIENCE_S = 0.02
 """However slow the cycle: a servo that says nothing must not keep the others waiting."""
 
 _NEVER = 1 << 62
+_DOUBTS = 3
 
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
@@ -50,6 +54,7 @@ class Reply(NamedTuple):
 class Exchange:
     """Sync Write of a two-byte goal register and a group read of the servos' state, for a fixed list of servos.
 
+    goal: the register, or one for each servo. spans, status: what is read, each of them for all servos or one for each.
     return_delay: the longest Return Delay Time of the servos [s]. fast: read with Fast Sync Read. one_write: both
     packets leave in one write; else in two. slow_every: cycles from one slow span to the next. status: span in which
     the servos tell their status, every `status_every` cycles; None for never. interval: s from one cycle to the next,
@@ -60,34 +65,40 @@ class Exchange:
         self,
         port: Port,
         ids: Sequence[int],
-        goal: Register,
-        spans: Sequence[Span],
+        goal: Register | Sequence[Register],
+        spans: Sequence[Span | Sequence[Span]],
         return_delay: float,
         *,
         fast: bool = False,
         one_write: bool = True,
         slow_every: int = 100,
-        status: Span | None = None,
+        status: Span | Sequence[Span] | None = None,
         status_every: int = 20,
         interval: float = 0.0,
     ) -> None:
-        if goal.size != 2:
-            raise ValueError(f"{goal.name} has {goal.size} bytes; a goal of 2 bytes is needed.")
+        goals = (goal,) * len(ids) if isinstance(goal, Register) else tuple(goal)
+        for register in goals:
+            if register.size != 2:
+                raise ValueError(f"{register.name} has {register.size} bytes; a goal of 2 bytes is needed.")
         self._port = port
         self._now = port.clock.now
+        self._echoes: bool = getattr(port, "echoes", False)  # set-up work has found out by now
         self.ids = tuple(ids)
         self.fast = fast
         self.one_write = one_write
-        # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
-        self._write = struct.Struct("<12s" + "Bh" * len(self.ids))
-        self._fields: list[bytes | int] = [_front(goal, len(self.ids))]
-        for servo_id in self.ids:
-            self._fields += [servo_id, 0]
+        self.strangers = 0
+        """Instruction packets heard that are not this program's: another one is master of the same bus."""
+        self._write, *self._more_writes = [
+            _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
+            for register in dict.fromkeys(goals)
+        ]
         every = [*spans] if status is None else [*spans, status]
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self._slow_spans = len(spans) - 1
         least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
         self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
+        self._soonest = [0.5 * port.wire_time(self._bytes(read)) for read in self._reads]
+        self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
         self._until_status = self._status_every
         self._slow_every = slow_every
@@ -119,16 +130,17 @@ class Exchange:
         usual = self._until_slow > 0 and self._until_status > 0 and not self._late_possible
         span = 0 if usual else self._other_span()
         read = self._reads[span]
-        fields = self._fields
-        fields[2::2] = goal_ticks
         try:
-            goals = self._write.pack(*fields)
+            goals = self._write.pack(goal_ticks)
+            for write in self._more_writes:
+                goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
-        goals += _pack_crc(_crc(goals))
         timeout = self._timeouts[span]
         before = self._now()
-        if self.one_write:
+        if self._echoes:
+            received = self._ask_behind_echo(goals, read, timeout, before)
+        elif self.one_write:
             received = port.ask(goals + read.request, read.reply_size, timeout, before)
         else:
             port.write(goals)
@@ -138,7 +150,22 @@ class Exchange:
             servos = self._search(read, received, before + timeout)
             if None in servos:
                 self._late_possible, self._lost = True, span
+        elif self._doubts and self._now() - before < self._soonest[span]:
+            servos = self._latest(read, servos, before + timeout)
         return Reply(before, self._now(), span, servos)
+
+    def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
+        """Of answers that came sooner than the wire can carry them: is it an earlier request that they answer?
+
+        A reply that comes twice lies there when the next request is sent, and from then on every answer is one cycle
+        old. Where the true answer follows it is taken. Where none does the far end is no wire (a pty), and after a few
+        such times nothing is doubted any more.
+        """
+        received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
+        if not received:
+            self._doubts -= 1
+            return servos
+        return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self) -> int:
         """The span to read where it is not simply the first: after a loss, in a slow turn, or to learn a status."""
@@ -170,7 +197,19 @@ class Exchange:
                 break
             # Byte by byte: how long a stuffed packet is shows only as it comes.
             received += self._port.read(1, remaining)
+        if not self._echoes:
+            self.strangers += sum(not packet.is_status for packet in Framer().feed(received))
         return answers
+
+    def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
+        """The reply through an adapter that hears itself: what was sent comes back before it."""
+        port, sent = self._port, goals + read.request
+        if self.one_write:
+            received = port.ask(sent, len(sent) + read.reply_size, timeout, start)
+        else:
+            port.write(goals)
+            received = port.ask(read.request, len(sent) + read.reply_size, timeout, start)
+        return received.removeprefix(sent)
 
     def _timeout(self, read: GroupRead, return_delay: float) -> float:
         # Each servo's answer may be stuffed twice.
@@ -178,7 +217,33 @@ class Exchange:
         return wire + return_delay * len(self.ids) + self._port.latency + HOST_S
 
     def _bytes(self, read: GroupRead) -> int:
-        return self._write.size + 2 + len(read.request) + read.reply_size
+        return sum(write.size for write in (self._write, *self._more_writes)) + len(read.request) + read.reply_size
+
+
+class _GoalWrite:
+    """A Sync Write of one goal register to the servos at `places` of all IDs."""
+
+    def __init__(self, goal: Register, ids: Sequence[int], places: Sequence[int]) -> None:
+        # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
+        packet = struct.Struct("<12s" + "Bh" * len(places))
+        self._pack = packet.pack
+        self._count = len(ids)
+        self._fields: list[bytes | int] = [_front(goal, len(places))]
+        for place in places:
+            self._fields += [ids[place], 0]
+        self._places = None if len(places) == len(ids) else tuple(places)
+        self.size = packet.size + 2
+
+    def pack(self, goal_ticks: Sequence[int]) -> bytes:
+        """The packet with these goals, one for each of all servos; raises struct.error where one does not fit."""
+        fields, places = self._fields, self._places
+        if places is not None:
+            if len(goal_ticks) != self._count:
+                raise ValueError(f"{len(goal_ticks)} goals for {self._count} servos")
+            goal_ticks = [goal_ticks[place] for place in places]
+        fields[2::2] = goal_ticks
+        packet = self._pack(*fields)
+        return packet + _pack_crc(_crc(packet))
 
 
 def _front(goal: Register, count: int) -> bytes:

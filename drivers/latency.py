@@ -16,6 +16,9 @@ LOCAL_S = 1e-3
 REMOTE_S = 16e-3
 """Allowed for a port behind a network."""
 
+BLUETOOTH_S = 60e-3
+"""Allowed for a serial port over Bluetooth."""
+
 _SYSFS = Path("/sys")
 
 
@@ -55,4 +58,6 @@ def adapter_latency(url: str, sysfs: Path = _SYSFS) -> float:
     file = latency_timer(url, sysfs)
     if file is not None:
         return read_latency_ms(file) * 1e-3
+    if Path(url).name.startswith("rfcomm"):
+        return BLUETOOTH_S
     return REMOTE_S if "://" in url and not url.startswith("fake://") else LOCAL_S

@@ -46,9 +46,18 @@ class Port:
         self.url = url
         self.baud = baud
         self.latency = adapter_latency(url)
+        self.latency_measured = False
+        """Whether `latency` was measured, because replies come later than this kind of adapter lets one think."""
+        self.echoes = False
+        """Whether the adapter hears what it sends. Set-up work finds out."""
         self._serial = opened
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
         self.is_open = True
+
+    @property
+    def has_baud(self) -> bool:
+        """Whether setting the baud does anything: over TCP the other end has set it."""
+        return not self.url.startswith("socket://")
 
     def wire_time(self, count: int) -> float:
         """Seconds that `count` bytes take on the wire (8 data bits, start and stop)."""
@@ -72,9 +81,22 @@ class Port:
             raise self._lost(error) from error
 
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
-        """`write`, then `read` until `timeout` [s] after `start` [s, on the port's clock]: the control cycle's way."""
+        """`write`, then `read` until `timeout` [s] after `start` [s, on the port's clock]: the control cycle's way.
+
+        What was there before is dropped: a repeated or late answer would answer this request, and each after it one
+        cycle late.
+        """
+        if self.has_input():
+            self.discard_input()
         self.write(data)
         return self.read(count, timeout)
+
+    def has_input(self) -> bool:
+        """Whether bytes have been received and not read."""
+        try:
+            return bool(self._serial.in_waiting)
+        except _FAILURES as error:
+            raise self._lost(error) from error
 
     def discard_input(self) -> None:
         """Throw away what has been received and not read."""
@@ -147,6 +169,8 @@ class DescriptorPort(Port):
         # One Python frame for the whole transaction, and where all goes well three system calls and nothing else:
         # after a wait of a millisecond, with cold caches, every further call costs a microsecond.
         try:
+            if self._wait_ms(0):
+                self.discard_input()
             written = os.write(self._descriptor, data)
             if written < len(data):
                 self._write_rest(data[written:])

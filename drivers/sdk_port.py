@@ -8,7 +8,7 @@ some ms."""
 
 
 class SdkPort:
-    """`dynamixel-sdk` on our open port.
+    """`dynamixel-sdk` on our open port. What an adapter that hears itself gives back of an instruction is left out.
 
     Against its own: reads wait instead of polling, time is the port's clock, and a failure cannot leave the port marked
     as in use, after which torque could never be switched off. Method names are the SDK's.
@@ -17,6 +17,10 @@ class SdkPort:
     def __init__(self, port: Port) -> None:
         self._port = port
         self._deadline = 0.0
+        self._sent = b""
+        """What was written last, as long as it may still come back."""
+        self._held = b""
+        """What was received and may yet be the beginning of that."""
 
     @property
     def is_using(self) -> bool:
@@ -30,15 +34,32 @@ class SdkPort:
         return self._port.baud
 
     def clearPort(self) -> None:  # noqa: N802
+        self._held = b""
         self._port.discard_input()
 
     def writePort(self, packet: list[int]) -> int:  # noqa: N802
-        self._port.write(bytes(packet))
+        self._sent, self._held = bytes(packet), b""
+        self._port.write(self._sent)
         return len(packet)
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
-        remaining = self._deadline - self._port.clock.now()
-        return self._port.read(length, max(0.0, remaining))
+        while self._sent and self._sent.startswith(self._held):
+            # A status and the instruction that it answers begin alike and differ at the eighth byte.
+            if self._held == self._sent:
+                self._port.echoes = True
+                self._sent = self._held = b""
+                break
+            more = self._port.read(min(8, len(self._sent) - len(self._held)), self._remaining)
+            self._held += more
+            if not more:
+                return b""
+        self._sent = b""
+        taken, self._held = self._held[:length], self._held[length:]
+        return taken + self._port.read(length - len(taken), self._remaining) if len(taken) < length else taken
+
+    @property
+    def _remaining(self) -> float:
+        return max(0.0, self._deadline - self._port.clock.now())
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
         # Twice the reply's wire time: once for the instruction before it, once for the reply.

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
+from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 
 from hil.drivers.control_table import ControlTable, Register
 from hil.drivers.errors import NoReply, ServoRefused, WrongReply
-from hil.drivers.packet import ALERT, HardwareError, StatusError
+from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.drivers.port import Port
 from hil.drivers.sdk_port import SdkPort
 
@@ -20,6 +20,16 @@ _T = TypeVar("_T")
 
 _ATTEMPTS = 3
 """How often a set-up exchange is tried before a damaged or missing reply is believed."""
+
+
+_LATE_S = 0.06
+"""How long an answer may be late after which nobody waits for it [s]."""
+
+_DATA = 9
+"""Where the data begin in a status packet."""
+
+_BESIDE_DATA = 4
+"""What LEN counts beside the data: INST, ERR, CRC."""
 
 
 class Servo:
@@ -50,7 +60,27 @@ class Servo:
         """`read` for a register that the model's table leaves out."""
 
         def ask() -> tuple[list[int], int, int]:
-            data, result, error = self._sdk.readTxRx(self._sdk_port, self.id, entry.address, entry.size)
+            # The SDK's own readTxRx takes the first bytes of whatever comes: a late answer to another question too.
+            request = [
+                0,
+                0,
+                0,
+                0,
+                self.id,
+                7,
+                0,
+                Instruction.READ,
+                *_two_bytes(entry.address),
+                *_two_bytes(entry.size),
+                0,
+                0,
+            ]
+            packet, result, error = self._sdk.txRxPacket(self._sdk_port, request)
+            if result != COMM_SUCCESS:
+                return [], result, error
+            data = packet[_DATA : _DATA + (packet[5] | packet[6] << 8) - _BESIDE_DATA]
+            if len(data) != entry.size and not error & ~ALERT:
+                return [], COMM_RX_CORRUPT, error
             return data, result, error
 
         return entry.decode(bytes(self._try(f"reading {entry.name}", ask)))
@@ -64,7 +94,7 @@ class Servo:
         if actual != value:
             raise ServoRefused(f"{self.title}: {register} was written as {value} but reads back as {actual}.")
 
-    def write_only(self, register: str, value: int) -> None:
+    def write_only(self, register: str, value: int, attempts: int = _ATTEMPTS) -> None:
         """Write a register whose new value cannot be read back under the old ID or baud; raises as `read`."""
         entry = self.table[register]
         data = list(entry.encode(value))
@@ -73,7 +103,7 @@ class Servo:
             result, error = self._sdk.writeTxRx(self._sdk_port, self.id, entry.address, entry.size, data)
             return None, result, error
 
-        self._try(f"writing {value} to {register}", send)
+        self._try(f"writing {value} to {register}", send, attempts)
 
     def hardware_error(self) -> HardwareError:
         """Why the servo raised its alert bit; raises as `read`."""
@@ -81,22 +111,35 @@ class Servo:
 
     def _try(self, what: str, action: Callable[[], tuple[_T, int, int]], attempts: int = _ATTEMPTS) -> _T:
         """Run one SDK exchange until it succeeds, at most `attempts` times; turn result codes into exceptions."""
+        late = False
         for _ in range(attempts):
             value, result, error = action()
             if result == COMM_SUCCESS:
                 break
+            late = late or result == COMM_RX_TIMEOUT
+        if late and result == COMM_SUCCESS:
+            # The answers to the questions that seemed lost may be on their way, and would answer the next one.
+            self.port.clock.wait_until(self.port.clock.now() + _LATE_S)
+            self.port.discard_input()
         if result == COMM_RX_TIMEOUT:
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "
                 "and its cable; `hil scan` finds it at another ID or baud."
             )
         if result != COMM_SUCCESS:
-            text = self._sdk.getTxRxResult(result)
-            raise WrongReply(f"{self.title}: {what} failed: {text} Do two servos share ID {self.id}?")
+            text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!. ").lower()
+            raise WrongReply(
+                f"{self.title}: {what} failed: what comes back is damaged, or no answer to it ({text}). Look at "
+                f"its cable and supply, and for a second servo with ID {self.id}."
+            )
         refused = error & ~ALERT
         if refused:
             raise ServoRefused(f"{self.title} refused {what}: {_status_error(refused)}.")
         return value
+
+
+def _two_bytes(value: int) -> tuple[int, int]:
+    return value & 0xFF, value >> 8
 
 
 def describe_error(error: HardwareError) -> str:

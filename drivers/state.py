@@ -1,11 +1,14 @@
 """One sample of the arm in SI units, and how raw answers become it."""
 
-from collections.abc import Sequence
+import functools
+import operator
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from hil.drivers.control_table import ControlTable
 from hil.drivers.exchange import Reply
 from hil.drivers.joint import Joint
+from hil.drivers.packet import ALERT
 from hil.drivers.servo_model import VOLTAGE_UNIT, Mode
 from hil.drivers.sync_read import Answer, Span
 
@@ -62,14 +65,28 @@ class State(NamedTuple):
 _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
 
 
-def spans(mode: Mode, tables: Sequence[ControlTable]) -> tuple[Span, Span, Span]:
-    """What is read in each cycle, and the two longer spans read now and then: with the tick, with voltage and heat."""
-    always = (_DRIVE[mode], "Present Velocity", "Present Position")
+Spans = Span | tuple[Span, ...]
+"""One span for all servos, or where they are driven in different modes one for each."""
+
+
+def spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans, Spans]:
+    """What is read in each cycle, and the two longer spans read now and then: with the tick, with voltage and heat.
+
+    mode: how all servos are driven, or how each is.
+    """
     return (
-        Span.of(tables, always),
-        Span.of(tables, ("Realtime Tick", *always)),
-        Span.of(tables, (*always, "Present Input Voltage", "Present Temperature")),
+        _span(mode, tables, (), ()),
+        _span(mode, tables, ("Realtime Tick",), ()),
+        _span(mode, tables, (), ("Present Input Voltage", "Present Temperature")),
     )
+
+
+def _span(
+    mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], before: tuple[str, ...], behind: tuple[str, ...]
+) -> Spans:
+    modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
+    names = [(*before, _DRIVE[own], "Present Velocity", "Present Position", *behind) for own in modes]
+    return Span.of(tables, names[0]) if len(set(modes)) == 1 else Span.each(tables, names)
 
 
 SLOW_SPANS = 2
@@ -81,14 +98,20 @@ _WHOLE_STATUS = 9
 _DRIVEN = ("Torque Enable", "Hardware Error Status")
 
 
-def status_span(mode: Mode, tables: Sequence[ControlTable], *, whole: bool) -> Span:
+def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, whole: bool) -> Spans:
     """What says whether a servo is still driven and watched, and its state.
 
-    whole: from Torque Enable on; else without what stands in front of Bus Watchdog, which takes half of the bytes.
+    mode: how all servos are driven, or how each is. whole: from Torque Enable on; else without what stands in front of
+    Bus Watchdog, which takes half of the bytes.
     """
+    modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
+    names = [(*_DRIVEN, *_status_names(own)) if whole else _status_names(own) for own in modes]
+    return Span.of(tables, names[0]) if len(set(modes)) == 1 else Span.each(tables, names)
+
+
+def _status_names(mode: Mode) -> tuple[str, ...]:
     goal = "Goal Current" if mode is Mode.CURRENT else "Goal PWM"
-    more = ("Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position")
-    return Span.of(tables, (*_DRIVEN, *more) if whole else more)
+    return "Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position"
 
 
 class Converter:
@@ -175,3 +198,54 @@ def _slow(reply: Reply) -> Slow:
 
 def _column(answers: Sequence[Answer], index: int, unit: float) -> tuple[float, ...]:
     return tuple([NAN if answer is None or len(answer) == 1 else answer[index] * unit for answer in answers])
+
+
+def fold(state: State, of: Sequence[int], count: int) -> State:
+    """The state of joints from that of their servos. of: of each servo, its joint, in rising order; count: joints.
+
+    Currents and goals are sums, angle, velocity and clock the first servo's, the voltage the lowest, the temperature
+    the highest; an error or a loss of one servo is one of the joint.
+    """
+    servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]
+    first = [places[0] for places in servos]
+    slow, status = state.slow, state.status
+    return state._replace(
+        goal_current=tuple([sum(state.goal_current[place] for place in places) for places in servos]),
+        current=tuple([sum(state.current[place] for place in places) for places in servos]),
+        velocity=tuple([state.velocity[place] for place in first]),
+        position=tuple([state.position[place] for place in first]),
+        error=tuple([_joined(state.error[place] for place in places) for places in servos]),
+        missing=tuple([any(state.missing[place] for place in places) for places in servos]),
+        slow=slow
+        and Slow(
+            tuple([slow.tick[place] for place in first]),
+            tuple([min(slow.voltage[place] for place in places) for places in servos]),
+            tuple([max(slow.temperature[place] for place in places) for places in servos]),
+        ),
+        status=status and tuple([_told([status[place] for place in places]) for places in servos]),
+    )
+
+
+def _told(statuses: Sequence[Status | None]) -> Status | None:
+    """What the servos of one joint tell as one: the goal is the sum, what is wrong with one is wrong with it."""
+    told = [status for status in statuses if status is not None]
+    if len(told) < len(statuses):
+        return None
+    torque = [status.torque for status in told if status.torque is not None]
+    errors = [status.hardware_error for status in told if status.hardware_error is not None]
+    return Status(
+        max(status.watchdog for status in told),
+        sum(status.goal for status in told),
+        told[0].tick,
+        all(torque) if torque else None,
+        functools.reduce(operator.or_, errors) if errors else None,
+    )
+
+
+def _joined(errors: Iterable[int]) -> int:
+    """The ERR bytes of one joint's servos as one: the first error number, and whether any has its Alert set."""
+    number = alert = 0
+    for error in errors:
+        alert |= error & ALERT
+        number = number or error & ~ALERT
+    return number | alert

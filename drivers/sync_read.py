@@ -43,6 +43,25 @@ class Span:
         return spans.pop()
 
     @classmethod
+    def each(cls, tables: Sequence[ControlTable], registers: Sequence[Sequence[str]]) -> "tuple[Span, ...]":
+        """One span per table, `registers[i]` of `tables[i]`, all of the same stretch: from the first to the last.
+
+        Raises KeyError where a table has not got one of its registers.
+        """
+        own = [cls._in(table, names) for table, names in zip(tables, registers, strict=True)]
+        start = min(span.address for span in own)
+        end = max(span.address + span.size for span in own)
+        return tuple(
+            cls(
+                span.registers,
+                start,
+                end - start,
+                "x" * (span.address - start) + span.format + "x" * (end - span.address - span.size),
+            )
+            for span in own
+        )
+
+    @classmethod
     def _in(cls, table: ControlTable, registers: Sequence[str]) -> "Span":
         entries = [table[name] for name in registers]
         start = end = entries[0].address
@@ -51,6 +70,14 @@ class Span:
             code += "x" * (entry.address - end) + _FORMATS[entry.size, entry.signed]
             end = entry.address + entry.size
         return cls(tuple(registers), start, end - start, code)
+
+
+def one_each(span: Span | Sequence[Span], count: int) -> tuple[Span, ...]:
+    """A span for each servo. Raises ValueError where they are not of one stretch, with as many registers."""
+    spans = (span,) * count if isinstance(span, Span) else tuple(span)
+    if len(spans) != count or len({(each.address, each.size, len(each.registers)) for each in spans}) != 1:
+        raise ValueError(f"{count} servos read together need spans of one stretch, as many registers in each: {spans}")
+    return spans
 
 
 class GroupRead(Protocol):
@@ -69,11 +96,16 @@ class GroupRead(Protocol):
 
 
 class SyncRead:
-    """Each servo answers with a status packet of its own, in the order of `ids`."""
+    """Each servo answers with a status packet of its own, in the order of `ids`.
 
-    def __init__(self, ids: Sequence[int], span: Span) -> None:
+    span: what is read, for all or one each, which then differ in what of the stretch is looked at (`Span.each`).
+    """
+
+    def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
         self._ids = tuple(ids)
-        self._values = Struct(f"<B{span.format}")
+        spans = one_each(span, len(self._ids))
+        self._values = {servo_id: Struct(f"<B{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
+        span = spans[0]
         self._size = span.size
         self.request = _request(Instruction.SYNC_READ, ids, span)
         # A damaged LEN must not swallow the answers behind it; stuffing adds at most a byte for every three.
@@ -82,7 +114,7 @@ class SyncRead:
         self.reply_size = length * len(self._ids)
         behind_id = (span.size + 4).to_bytes(2, "little") + bytes((Instruction.STATUS,))
         # All answers in one unpacking: per servo the eight bytes up to INST as one number, ERR, the values, the CRC.
-        self._unpack = Struct("<" + f"QB{span.format}H" * len(self._ids)).unpack
+        self._unpack = Struct("<" + "".join(f"QB{own.format}H" for own in spans)).unpack
         width = len(span.registers) + 3
         self._parts = [
             (
@@ -107,16 +139,20 @@ class SyncRead:
         return answers
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
-        found = {}
+        found: dict[int, Answer] = {}
+        latest = -1
         for packet in Framer(longest=self._longest).feed(received):
             if packet.is_status and packet.id in self._ids and (answer := self._answer(packet)):
-                found[packet.id] = answer
+                turn = self._ids.index(packet.id)
+                if turn <= latest:
+                    found.clear()  # they answer in turn: what stands before is left over from an earlier request
+                found[packet.id], latest = answer, turn
         # They answer in turn, so nobody speaks after the last one.
         return [found.get(servo_id) for servo_id in self._ids], self._ids[-1] in found
 
     def _answer(self, packet: Packet) -> Answer:
         if len(packet.data) == self._size:
-            return self._values.unpack(packet.body)
+            return self._values[packet.id].unpack(packet.body)
         # An answer of another length is one to an earlier request, or a refusal.
         return (packet.error,) if packet.error & _ERROR_BITS and not packet.data else None
 
@@ -127,11 +163,13 @@ class FastSyncRead:
     Each CRC is taken over everything from the packet's header on, so the last one vouches for the whole.
     """
 
-    def __init__(self, ids: Sequence[int], span: Span) -> None:
+    def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
         self._ids = tuple(ids)
-        self._values = Struct(f"<Bx{span.format}")
+        spans = one_each(span, len(self._ids))
+        self._values = {servo_id: Struct(f"<Bx{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
+        span = spans[0]
         # All parts in one unpacking: per servo its ERR, ID, values and CRC.
-        self._whole = Struct("<8x" + f"BB{span.format}H" * len(self._ids))
+        self._whole = Struct("<8x" + "".join(f"BB{own.format}H" for own in spans))
         self._width = len(span.registers) + 3
         self.request = _request(Instruction.FAST_SYNC_READ, ids, span)
         part = span.size + 4  # ERR, ID, data, CRC
@@ -167,7 +205,7 @@ class FastSyncRead:
             whole = len(packet) >= end and packet[start + 1] == servo_id
             if not whole or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
                 break
-            answer = self._values.unpack_from(packet, start)
+            answer = self._values[servo_id].unpack_from(packet, start)
             answers.append(answer[:1] if answer[0] & _ERROR_BITS else answer)
         # Behind a servo that is silent or damaged the packet cannot be trusted.
         answers += [None] * (len(self._ids) - len(answers))

@@ -108,6 +108,7 @@ class FakeArm(BaseModel):
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="from the wire to the host's read, for every byte [us]")
     ] = 0.0
+    adapter_echoes: Annotated[bool, Field(description="whether the adapter hears what the host sends")] = False
     servos: Annotated[
         tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")
     ]
@@ -245,6 +246,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         clock,
         joints=fake.joints,
         adapter_latency_us=fake.adapter_latency_us,
+        adapter_echoes=fake.adapter_echoes,
         supply=fake.supply,
         seed=fake.seed,
     )

@@ -24,6 +24,9 @@ from hil.fakes.remote_hand import HandSocket
 OVERRUN_S = 1e-3
 """A reply handed over later than this after it was due counts as a real-time overrun [s]."""
 
+TOO_SLOW_S = 5e-3
+"""When some of the arm's time took the machine longer than itself by more than this, the rest is lost [s]."""
+
 LONGEST_SLEEP_S = 0.05
 """How long the server waits at most before it looks at faults, watchdogs and its own end [s]."""
 
@@ -37,10 +40,14 @@ class LinkError(OSError):
 
 
 class Clock:
-    """The machine's monotonic clock. Nothing here waits on it but the server itself."""
+    """The machine's monotonic clock, less the time that was lost. Nothing here waits on it but the server itself."""
+
+    def __init__(self) -> None:
+        self.lost_s = 0.0
+        """How much time the arm did not live through, because the machine was too slow for it."""
 
     def now(self) -> float:
-        return time.monotonic()
+        return time.monotonic() - self.lost_s
 
     def wait_until(self, deadline: float) -> None:
         """Return at once: bytes are handed over when they are due."""
@@ -55,6 +62,7 @@ class Counts(NamedTuple):
     overruns: int
     faults: int
     late_max_s: float
+    lost_s: float = 0.0
 
 
 class PtyServer:
@@ -67,7 +75,8 @@ class PtyServer:
 
     def __init__(self, description: FakeArm, link: Path | None = None) -> None:
         self.lock = Lock()
-        self.bus: FakeBus = make_bus(description, Clock())
+        self._clock = Clock()
+        self.bus: FakeBus = make_bus(description, self._clock)
         self.path = ""
         self._link = link
         self._master = self._slave = -1
@@ -97,12 +106,13 @@ class PtyServer:
             self._overruns,
             len(bus.faults.happened),
             self._late_max_s,
+            self._clock.lost_s,
         )
 
     def serve(self, watch: Callable[[Counts], None] | None = None, watch_every_s: float = 0.5) -> None:
         """Answer until stopped. `watch` is called now and then with the counts."""
         _wake_up_in_time()
-        now = time.monotonic
+        now = self._clock.now
         next_watch = now() + watch_every_s
         while not self._stopped:
             due = self.bus.next_reply_by
@@ -114,6 +124,7 @@ class PtyServer:
                 readable.append(self._hand)
             ready, _, _ = select.select(readable, [], [], max(0.0, wait))
             with self.lock:
+                began, reached = time.monotonic(), self.bus.advanced_to
                 if self._hand is not None and self._hand in ready:
                     self._hand.answer(self.bus)
                 if self._master in ready:
@@ -123,6 +134,10 @@ class PtyServer:
                 elif not ready:
                     self.bus.advance(now())
                 self._mind_the_cable()
+                # A machine too slow for the arm would answer later and later: rather let the arm live more slowly.
+                taken = time.monotonic() - began
+                lived = self.bus.advanced_to - reached
+                self._clock.lost_s += max(0.0, taken - lived - TOO_SLOW_S)
             if watch is not None and now() >= next_watch:
                 watch(self.counts)
                 next_watch = now() + watch_every_s
@@ -147,7 +162,7 @@ class PtyServer:
 
     def _hand_over(self, due: float) -> None:
         data = self.bus.read(self.bus.in_waiting, 0.0)
-        late = time.monotonic() - due
+        late = self._clock.now() - due
         self._late_max_s = max(self._late_max_s, late)
         self._overruns += late > OVERRUN_S
         if data and self._master >= 0:
@@ -170,9 +185,15 @@ class PtyServer:
         self.path = os.ttyname(self._slave)
         self._hand = HandSocket(self.path)
         if self._link is not None:
-            self._link.unlink(missing_ok=True)
             try:
                 self._link.symlink_to(self.path)
+            except FileExistsError:
+                self._link, taken = None, self._link  # somebody else's: not to be removed at the end either
+                self.close()
+                raise LinkError(
+                    f"{taken} was made by somebody else while the cable was out; it is left as it is. Remove it or "
+                    "choose another --link"
+                ) from None
             except OSError as error:
                 self.close()
                 raise LinkError(f"{self._link}: cannot be made: {error.strerror}") from error

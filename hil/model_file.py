@@ -9,11 +9,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hil.arm_model import ArmModel
+from hil.chain_model import ChainArmModel, Geometry
 from hil.errors import ResultError
 from hil.estimator.models.terms import RIGID_BODY, base_names, extra_names
 from hil.results.json_form import FormError, from_json
-from hil.results.parts import ArmFacts, Quantity
+from hil.results.parts import ArmFacts, ChainFacts, Quantity
 from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
 
 
@@ -68,12 +71,12 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
         saved = from_json(_SavedModel, _read(Path(path)))
     except FormError as error:
         raise _damaged(Path(path), error) from error
-    return _model(saved.arm, {**saved.parameters, **saved.extra}, Path(path))
+    return _model(saved.arm, {**saved.parameters, **saved.extra}, saved.chain, Path(path))
 
 
 def model_of(result: SettledResult, path: Path) -> ArmModel:
     """The model in a result that was read from `path`; raises ResultError."""
-    return _model(result.arm, result.quantities, path)
+    return _model(result.arm, result.quantities, result.chain, path)
 
 
 @dataclass(frozen=True)
@@ -83,12 +86,32 @@ class _SavedModel:
     arm: ArmFacts
     parameters: Mapping[str, Quantity]
     extra: Mapping[str, Quantity] = field(default_factory=dict)
+    chain: ChainFacts | None = None
 
 
-def _model(arm: ArmFacts, found: Mapping[str, Quantity], path: Path) -> ArmModel:
+def _model(arm: ArmFacts, found: Mapping[str, Quantity], chain: ChainFacts | None, path: Path) -> ArmModel:
     values = {name: each.value for name, each in found.items()}
-    _check_terms(values, len(arm.joints), _file(path))
-    return ArmModel(values, {name: each.std for name, each in found.items()}, arm.gravity, arm.rest_pose, arm.joints)
+    stds = {name: each.std for name, each in found.items()}
+    if chain is None:
+        _check_terms(values, len(arm.joints), _file(path))
+        return ArmModel(values, stds, arm.gravity, arm.rest_pose, arm.joints)
+    geometry = Geometry(*(np.array(each) for each in (chain.rotation, chain.translation, chain.axis, chain.gravity)))
+    _check_chain(values, geometry, chain, len(arm.joints), _file(path))
+    return ChainArmModel(values, stds, arm.gravity, arm.rest_pose, arm.joints, geometry, dict(chain.groups))
+
+
+def _check_chain(values: dict[str, float], geometry: Geometry, chain: ChainFacts, joints: int, path: Path) -> None:
+    """The geometry is of as many joints, and every base parameter and friction is there."""
+    shapes = tuple(each.shape for each in (geometry.rotation, geometry.translation, geometry.axis, geometry.gravity))
+    if shapes != ((joints, 3, 3), (joints, 3), (joints, 3), (3,)):
+        raise ResultError(f"{path}: is damaged: the geometry of its {joints} joints has the shapes {shapes}.")
+    friction = {f"{term}_{joint}" for term in ("viscous", "coulomb", "offset") for joint in range(1, joints + 1)}
+    missing = sorted(({*chain.groups} | friction) - values.keys())
+    if missing:
+        raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
+    bad = [name for name, value in values.items() if not math.isfinite(value)]
+    if bad:
+        raise ResultError(f"{path}: {', '.join(bad)} is not a finite number. Run hil estimate again.")
 
 
 def _damaged(path: Path, error: FormError) -> ResultError:

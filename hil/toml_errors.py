@@ -7,6 +7,9 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+UNSAID = "~"
+"""How the names of alternatives begin that pydantic puts into a location and nobody wrote in a file."""
+
 _EXPECTED = {
     "float_type": "must be a number",
     "int_type": "must be a whole number",
@@ -70,6 +73,8 @@ def _key(location: Sequence[str | int]) -> str:
     """`("joints", 1, "id")` as `joints[2].id`: people count joints from one."""
     text = ""
     for part in location:
+        if isinstance(part, str) and part.startswith(UNSAID):
+            continue
         text += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if text else part
     return text
 
@@ -83,8 +88,9 @@ def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
     model: Any = root
     for part in location[:-1]:
         if isinstance(part, str):
-            model = _model_in(model.model_fields[part].annotation)
-    names = [name for name, field in model.model_fields.items() if not field.exclude]
+            fields = {field.alias or name: field for name, field in model.model_fields.items()}
+            model = _model_in(fields[part].annotation)
+    names = [field.alias or name for name, field in model.model_fields.items() if not field.exclude]
     close = difflib.get_close_matches(str(location[-1]), names, n=1)
     return f"did you mean {close[0]}?" if close else f"allowed: {', '.join(names)}"
 

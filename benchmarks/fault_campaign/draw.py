@@ -17,16 +17,17 @@ TOGETHER_S = 0.3
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
+REFUSED, STRANGER = "refused", "stranger"
 
 WORDS = {
-    SILENCE: r"no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response"
+    SILENCE: r"heard nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response"
     r"|repl(y|ies).{0,30}(missing|lost)",
     GARBLED: r"damaged|corrupt|\bCRC|not an answer|not one to the question|garbled|broken packet|incorrect|echo",
     LATE: r"\blate\b|\blater\b|deadlines?\b|latency|too slow",
     CABLE: r"[Pp]ort .{0,80}(failed|closed|lost)|unplugged|cable (is|was)|Is the cable|adapter",
     TORQUE: r"torque (is|was|seems|has been) (off|lost|cut|switched off|gone)|lost (its )?torque|carries|not follow"
-    r"|without torque|goals? .{0,30}(lost|dropped|refused|ignored|not (arrive|reach))|watchdog|Torque Enable",
-    REBOOT: r"reboot|restarted|power.cycle|supply (broke|was interrupted|failed)",
+    r"|goals? .{0,30}(lost|dropped|refused|ignored|not (arrive|reach))|watchdog",
+    REBOOT: r"(was|has|been) (been )?reboot|restarted|power.cycle|supply (broke|was interrupted|failed)",
     HEAT: r"overheat|temperature|degrees C|too hot",
     OVERLOAD: r"overload",
     VOLTAGE: r"voltage|\d V\b",
@@ -35,9 +36,11 @@ WORDS = {
     r"|position.{0,40}(disagree|contradict)",
     LIMIT: r"(position|velocity)[ _]limit",
     SIGN: r"sign of|against its command|wrong way|turned? round",
-    PROGRAM: r"deadlines?\b|the computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
+    PROGRAM: r"deadlines?\b|(the|this) computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
     SIGNAL: r"Ctrl-C|SIGINT|SIGTERM|SIGHUP",
     MODEL: r"any arm|than (the )?model|predicted|not as planned|foreseen|the dry run",
+    REFUSED: r"refus|alert, hardware error: none|answers? with an? error",
+    STRANGER: r"another (program|master)|somebody else|not asked for|collision|other master",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
 }
 """What a message has to say for a cause to count as named."""
@@ -86,6 +89,8 @@ CAUSES: dict[str, frozenset[str]] = {
     FaultKind.STUCK_JOINT: frozenset({STUCK, ENCODER, MODEL}),
     FaultKind.ENCODER_JUMP: frozenset({ENCODER, POSE}),
     FaultKind.CABLE_PULLED: frozenset({CABLE}),
+    FaultKind.STATUS_ERROR: frozenset({REFUSED, SILENCE, TORQUE}),
+    FaultKind.OTHER_MASTER: _BYTES | {STRANGER, LATE},
 }
 """What each fault may rightly be called. Held fast and a dead encoder cannot be told apart from the host's side."""
 

@@ -103,7 +103,7 @@ def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
 def causes_in(text: str) -> set[str]:
     """The causes that a message speaks of; what came before the error, and whether torque is off, are no causes."""
     said = [line for line in text.splitlines() if not re.match(r"Torque is off|TORQUE OFF", line.strip())]
-    return {cause for cause, words in WORDS.items() if any(re.search(words, line) for line in said)}
+    return {cause for cause, words in WORDS.items() if any(re.search(words, line, re.IGNORECASE) for line in said)}
 
 
 Reason = tuple[str, float]

@@ -23,6 +23,7 @@ from typing import Any
 import numba
 
 from hil.estimator.chain.kernels import accelerate, differentiate, invert, move, place, regress
+from hil.estimator.compiled import compiled
 from hil.estimator.simulation.arm import FADED, GAMMA
 
 # Rows of the joints' constants.
@@ -263,4 +264,4 @@ _inner: Any = numba.njit(  # type: ignore[call-overload]
 _left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow = map(
     _inner, (_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow)
 )
-run: Callable[..., bool] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_run_loop)
+run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"})

@@ -23,10 +23,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import Physics, place_of
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
@@ -220,6 +220,4 @@ def _loop(p: Any, bristly: bool, m: Any, state: Any, torque: Any, step: float, p
 bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
     inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
 )
-_simulate: Callable[[Array, bool, Array, Array, Array, float, int, Array], None] = numba.njit(
-    cache=True, nogil=True, error_model="numpy"
-)(_loop)
+_simulate: Callable[[Array, bool, Array, Array, Array, float, int, Array], None] = compiled(_loop)

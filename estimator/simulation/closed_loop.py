@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import finer_pieces, pieces_now, step_bent, steps_per_sample
 from hil.estimator.simulation.bristles import first_bend, has_bristles, without_dry_friction
@@ -176,4 +176,4 @@ def _loop(
     state[3, 0], state[3, 1], state[4, 0], state[4, 1] = s1, s2, w1, w2
 
 
-respond_compiled: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_loop)
+respond_compiled: Callable[..., None] = compiled(_loop)

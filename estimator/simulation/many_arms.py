@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import finer_pieces, steps_per_sample
 from hil.estimator.simulation.bristles import has_bristles, without_dry_friction
@@ -267,6 +268,5 @@ def _positions_loop(
             kept[arm, 1, k] = position[1, k * every]
 
 
-_compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
-_peaks: Callable[..., None] = _compiled(_peaks_loop)
-_positions: Callable[..., None] = _compiled(_positions_loop)
+_peaks: Callable[..., None] = compiled(_peaks_loop)
+_positions: Callable[..., None] = compiled(_positions_loop)

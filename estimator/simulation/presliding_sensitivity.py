@@ -8,11 +8,11 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import SLIDING, Physics
 from hil.estimator.simulation.arm import MAX_SUBSTEPS, pieces_now
 from hil.estimator.simulation.bristles import (
@@ -246,4 +246,4 @@ def _loop(
 
 
 _bend, _clear, _press, _accelerate = map(fused, (_bend, _clear, _press, _accelerate))
-_advance: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_loop)
+_advance: Callable[..., None] = compiled(_loop, fastmath={"contract"})

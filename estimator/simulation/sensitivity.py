@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.arm import (
     ASYMMETRY,
@@ -206,8 +207,9 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     slope[stage, joint] = viscous + level * bent
     left_by = now * NUMBERS + stage * BY_STATE + 5 * joint
     slope_by = left_by + 8 - 3 * joint
-    numbers[left_by], numbers[slope_by] = cycles * turn * passed - cable, cycles * turn * loaded * bent
+    numbers[left_by] = cycles * turn * passed - cable
     numbers[left_by + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
+    numbers[slope_by] = cycles * turn * loaded * bent
     numbers[slope_by + 1] = level_v * bent + level * bent_v
 
 
@@ -409,4 +411,4 @@ fused: Any = numba.njit(  # type: ignore[call-overload]
     no_cfunc_wrapper=True,
 )
 _drive, _arm, arm_step, follow = map(fused, (_drive, _arm, arm_step, follow))
-_advance: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(_loop)
+_advance: Callable[..., None] = compiled(_loop, fastmath={"contract"})

@@ -52,6 +52,7 @@ class FakeBus:
         joints: Sequence[int] | None = None,
         baud: int = 1_000_000,
         adapter_latency_us: float = 0.0,
+        adapter_echoes: bool = False,
         supply: Supply | None = None,
         seed: int = 0,
     ) -> None:
@@ -66,8 +67,10 @@ class FakeBus:
         """When the cable was pulled last."""
         self._servos = tuple(servos)
         self._joints = Joints(servos, plant, joints)
+        self._one_each = self._joints.one_each
         self._supply = supply
         self._wire = Wire(baud, adapter_latency_us * 1e-6)
+        self._echoes = adapter_echoes
         self._receiver = Receiver()
         self._origin = self._now = clock.now()
         self._sent_by = self._now
@@ -112,6 +115,11 @@ class FakeBus:
         return self.clock.now() - self._origin
 
     @property
+    def advanced_to(self) -> float:
+        """The time up to which plant and servos have lived [s on the clock]."""
+        return self._now
+
+    @property
     def collisions(self) -> int:
         """How often host and servos, or two servos, spoke at once."""
         return self._wire.collisions
@@ -135,6 +143,8 @@ class FakeBus:
             receiver.reset()
         byte_s = wire.byte_s
         end_s = self._sent_by = start + len(data) * byte_s
+        if self._echoes:
+            wire.echo(data, start)
         for packet, behind in receiver.feed(data):
             arrived = end_s - behind * byte_s
             if start >= wire.reply_by or not wire.collide(start, arrived):
@@ -214,7 +224,7 @@ class FakeBus:
                 event = True
         if event:
             self._advance_by_events(until)
-        elif self._joints.one_each:
+        elif self._one_each:
             self.plant.advance(until - self._origin, commands)
             self._now = until
         else:
@@ -330,6 +340,9 @@ class FakeBus:
 
     def joints(self) -> States:
         """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
+        if self._one_each:
+            plant = self.plant
+            return plant.position, plant.velocity, plant.current
         return self._joints.states()
 
     def is_moving(self, servo: Servo) -> bool:

@@ -88,6 +88,11 @@ class Wire:
         self.reply_by = max(self.reply_by, end)
         return end
 
+    def echo(self, data: bytes, start: float) -> None:
+        """The host speaks from time `start`, and its adapter hears it."""
+        self._arriving.append(Arriving(data, start + self.byte_s + self._latency_s, self.byte_s))
+        self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
+
     def occupy(self, until: float) -> None:
         """A servo speaks and is not heard."""
         self.reply_by = max(self.reply_by, until)

@@ -11,6 +11,10 @@ from hil.description.urdf import read_urdf, rotation_of
 from hil.fakes.plants.arm import Drive, Finite, NotNegative, Positive
 
 MOST_JOINTS = 7
+PLANAR_ONLY = (
+    *("backlash", "presliding_stiffness", "cogging", "saturation"),
+    *("cold_viscous", "cold_coulomb", "cable_stiffness"),
+)
 
 
 class ChainArm(BaseModel):
@@ -43,8 +47,9 @@ class ChainArm(BaseModel):
             if values is not None and len(values) != count:
                 raise ValueError(f"{key} has {len(values)} entries for {count} joints: give one per joint")
         for name, angle, drive in zip(self.joints, self.start, self.drives, strict=True):
-            if drive.backlash or drive.presliding_stiffness or drive.cogging:
-                raise ValueError(f"drives: {name}: backlash, presliding and cogging are for planar fake arms only")
+            told = [term for term in PLANAR_ONLY if getattr(drive, term)]
+            if told:
+                raise ValueError(f"drives: {told[0]} of {name}: for planar fake arms only; leave it out")
             if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
                 raise ValueError(f"start: {angle:g} rad for joint {name} is beyond its stops {list(drive.stops)}")
         _ = self.description

@@ -89,8 +89,31 @@ def make_chain(arm: ChainArm) -> Plant:
     return SpatialChain(arm)
 
 
+OWN_PLANTS = frozenset({"hil.fakes.plants.independent:make_plant", "hil.fakes.plants.mujoco_plant:make_plant"})
+"""What a description may call without leave. A whitelist: `getattr` of any module here reaches what it imports."""
+
+_leave = {"code": False}
+
+
+def allow_code(allowed: bool = True) -> None:
+    """Let descriptions call any function that can be imported, for the rest of this process; by default they may not.
+
+    Who opens a file whose `plant` names a function runs that function with the file's arguments.
+    """
+    _leave["code"] = allowed
+
+
 def load_plant(name: str, options: Mapping[str, object]) -> Plant:
-    """The plant that `module:factory` makes from `options`; raises PlantError."""
+    """The plant that `module:factory` makes from `options`; raises PlantError.
+
+    Outside `OWN_PLANTS` only after `allow_code`.
+    """
+    if name not in OWN_PLANTS and not _leave["code"]:
+        raise PlantError(
+            f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Look at it; '
+            "if you trust the file, say --allow-code, or hil.fakes.allow_code() in Python. Without it a file may name "
+            f"{' and '.join(sorted(OWN_PLANTS))} only"
+        )
     module_name, _, factory_name = name.partition(":")
     try:
         factory = getattr(importlib.import_module(module_name), factory_name)

@@ -170,7 +170,7 @@ class Servo(Powered):
         """The Bus Watchdog's time is over: stop the motor and refuse goals until 0 is written to the register."""
         memory = self.memory
         memory.set("Bus Watchdog", WATCHDOG_TRIPPED)
-        for name in ("Goal Current", "Goal PWM", "Goal Velocity"):
+        for name in ("Goal Current", "Goal PWM", "Goal Velocity", "Profile Velocity", "Profile Acceleration"):
             memory.set(name, 0)
         self._hold_position()
         self._derive()

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hil import fakes
 from hil.api.experiment import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, ignore
 from hil.results.display import html_table
@@ -63,6 +62,5 @@ def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckRepor
         ConfigError: the configuration is wrong.
     """
     checked, shown = loaded(config)
-    fakes.register_for(checked.url)
     on_progress(Progress("check", "Looking"))
     return CheckReport(shown, tuple(check_arm(checked)))

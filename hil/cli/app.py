@@ -5,13 +5,14 @@ The modules imported here only say what a subcommand takes; those that do the wo
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Annotated, NoReturn
 
 import typer
 
 from hil import __version__
-from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema
+from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
 from hil.cli.errors import exit_code, message
 from hil.cli.verbosity import with_verbosity
 
@@ -28,7 +29,14 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True)
 def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    allow_code: Annotated[
+        bool,
+        typer.Option(
+            "--allow-code", help='Let a file\'s [fake] plant = "module:factory" run any function. Look at it first.'
+        ),
+    ] = False,
 ) -> None:
+    del allow_code  # main has seen to it, wherever it stood
     if version:
         print(f"hil {__version__}")
         raise typer.Exit
@@ -48,6 +56,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "runs": (runs.runs, "runs"),
     "note": (runs.note, 'runs/20261121-153000-fake_two_link --text "new gearbox"'),
     "diff": (runs.diff, "runs/before runs/after --png wear.png"),
+    "study": (study.study, "studies/seeds.toml --workers 2"),
     "compare": (data.compare, "runs/20261121-153000-fake_two_link"),
     "calibrate": (data.calibrate, "runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147"),
     "fake": (fake_command.fake, "koch --pty --link /tmp/arm"),
@@ -56,6 +65,27 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
 }
 """Every subcommand by name, with the arguments of its example."""
 
+ALLOW_CODE = "--allow-code"
+
+
+@contextmanager
+def _code_as_asked() -> Iterator[None]:
+    """Every subcommand takes --allow-code, since every one may open a file whose [fake] table names a function."""
+    words = sys.argv[1:]
+    end = words.index("--") if "--" in words else len(words)
+    asked = ALLOW_CODE in words[:end]
+    if asked:
+        from hil.fakes import allow_code
+
+        sys.argv[1:] = [word for word in words[:end] if word != ALLOW_CODE] + words[end:]
+        allow_code()
+    try:
+        yield
+    finally:
+        if asked:
+            allow_code(False)
+
+
 for _name, (_command, _example) in COMMANDS.items():
     app.command(_name, epilog=f"Example: hil {_name} {_example}")(with_verbosity(_command))
 
@@ -63,7 +93,8 @@ for _name, (_command, _example) in COMMANDS.items():
 def main() -> NoReturn:
     """Run the command line; a foreseen error becomes its message on standard error and its exit code."""
     try:
-        app()
+        with _code_as_asked():
+            app()
     except Exception as error:
         code = exit_code(error)
         if code is None:

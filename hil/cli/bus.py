@@ -43,8 +43,8 @@ def scan(
     terminal = Terminal(quiet=json_only)
     opened = open_port(port_url(port), bauds[0])
     try:
-        with terminal.busy(f"Asking {len(bauds)} baud rates"):
-            heard = list(scanning.scan(opened, bauds))
+        with terminal.scanning() as watch:
+            heard = list(scanning.scan(opened, bauds, watch))
     finally:
         opened.close()
     print(json.dumps(scanned(heard))) if json_only else print_scan(heard, port)
@@ -74,10 +74,13 @@ def setup(
     return_delay_us: Annotated[
         int | None, typer.Option("--return-delay-us", min=0, max=508, help="0 is wanted.")
     ] = None,
+    secondary_id: Annotated[
+        int | None, typer.Option("--secondary-id", min=0, max=255, help="255 is none, which is wanted.")
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Answer every question with yes.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Set a servo's ID, baud or return delay: a question before each write to EEPROM, each write read back."""
+    """Set a servo's ID, baud, return delay or Secondary ID: a question before each write, each write read back."""
     from hil.cli.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
@@ -95,7 +98,14 @@ def setup(
         if written := recover(servo, opened.url):
             print(f"What an earlier run could not put back is put back: {', '.join(written)}.", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
-        changes = set_up(servo, confirm, new_id=new_id, new_baud=new_baud, return_delay_us=return_delay_us)
+        changes = set_up(
+            servo,
+            confirm,
+            new_id=new_id,
+            new_baud=new_baud,
+            return_delay_us=return_delay_us,
+            secondary_id=secondary_id,
+        )
     finally:
         opened.close()
     print(json.dumps(changed(changes))) if json_only else print_changes(changes)

@@ -71,7 +71,7 @@ def serve_fake(
             server.serve(None if quiet else status.show, watch_every_s=0.5 if sys.stderr.isatty() else 10.0)
             if not quiet:
                 status.end(server.counts)
-        except PlantError as error:
+        except (LinkError, PlantError) as error:
             raise ConfigError(str(error)) from error
         finally:
             for number, handler in former.items():
@@ -101,6 +101,7 @@ def _totals(counts: Counts) -> str:
     return (
         f"{counts.damaged} damaged, {counts.collisions} collisions, {counts.faults} faults, "
         f"{counts.overruns} late by more than 1 ms (worst {1e3 * counts.late_max_s:.1f} ms)"
+        + (f", {counts.lost_s:.1f} s slower than real time" if counts.lost_s >= 0.1 else "")
     )
 
 

@@ -17,6 +17,7 @@ def init(
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: take what an empty answer means.")] = False,
 ) -> None:
     """Scan the bus, ask what it cannot tell, write a commented TOML file. Nothing is written to the servos."""
+    from hil.cli.terminal import Terminal
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
@@ -32,8 +33,8 @@ def init(
     bauds = tuple(baud or BAUD_RATES)
     opened = open_port(url, bauds[0])
     try:
-        typer.echo("Asking who is on the bus ...", err=True)
-        heard = list(scan(opened, bauds))
+        with Terminal(quiet=False).scanning() as watch:
+            heard = list(scan(opened, bauds, watch))
         answers = interview(opened, url, heard, _default if yes else _prompt, _say)
     finally:
         opened.close()

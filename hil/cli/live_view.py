@@ -34,7 +34,7 @@ class LiveView:
             low, high = joint.position_limit
             unit = joint.drive_mode.goal_unit
             table.add_row(
-                joint.name,
+                Text(joint.name),
                 *self._gauge(state.position[index], low, high),
                 "rad",
                 *self._gauge(state.current[index], -joint.goal_limit, joint.goal_limit),

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from hil.config.schema import Config
@@ -47,7 +48,7 @@ def _parameters(result: SettledResult) -> Table:
     # Narrow enough for 80 columns, so that no figure is cut.
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.title, table.title_justify, table.title_style = (
-        f"{result.joints}-joint arm, {result.config}",
+        f"{result.joints}-joint arm, {escape(str(result.config))}",
         "left",
         "",
     )
@@ -56,10 +57,10 @@ def _parameters(result: SettledResult) -> Table:
     for heading in ("value", "std", *(("truth", "error %", "in std.") if truth else ())):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, entry in result.parameters.items():
-        table.add_row(name, entry.unit, *_numbers(entry, truth.get(name) if truth else None))
+        table.add_row(escape(name), escape(entry.unit), *_numbers(entry, truth.get(name) if truth else None))
     table.add_row()
     for name, entry in result.extra.items():
-        table.add_row(name, entry.unit, f"{entry.value:.5g}", f"{entry.std:.1e}")
+        table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
     table.add_row()
     return table
 

@@ -85,6 +85,7 @@ def diff(
 
 def _print_difference(difference: "Difference") -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
@@ -95,7 +96,7 @@ def _print_difference(difference: "Difference") -> None:
     for change in difference.changes:
         percent = "-" if change.percent is None else f"{change.percent:+.2f}"
         shown = (f"{change.before:.5g}", f"{change.after:.5g}", percent, f"{change.z:+.1f}")
-        table.add_row(change.name, *shown, "changed" if change.changed else "")
+        table.add_row(escape(change.name), *shown, "changed" if change.changed else "")
     console = Console(highlight=False)
     console.print(table)
     for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):

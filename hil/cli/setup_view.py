@@ -79,7 +79,7 @@ def print_findings(findings: Sequence[Finding], config: Path) -> None:
     if stops:
         console.print(f"\n{stops} to mend before an experiment can start, {warnings} to think about.")
     else:
-        console.print(f"\nReady, {warnings} to think about. Next: hil identify {config}")
+        console.print(f"\nReady, {warnings} to think about. Next: hil identify {escape(str(config))}")
 
 
 def changed(changes: Sequence[Change]) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def changed(changes: Sequence[Change]) -> dict[str, Any]:
 
 def print_changes(changes: Sequence[Change]) -> None:
     if not changes:
-        print("Nothing was asked for: give --new-id, --new-baud or --return-delay-us.")
+        print("Nothing was asked for: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
     for change in changes:
         if change.written:
             print(f"{change.register}: {change.before} -> {change.after}, read back.")

@@ -16,6 +16,8 @@ from hil.config.schema import Config, load_config
 from hil.experiment.stream import Progress as StreamProgress
 from hil.experiment.stream import Watch
 from hil.runs.recording import Phase
+from hil.setup.scan import Asking
+from hil.setup.scan import Watch as ScanWatch
 
 _PHASES = {
     Phase.REST: "resting",
@@ -62,6 +64,22 @@ class Terminal:
                     showing.enter_context(self.busy(report.message))
 
             yield follow
+
+    @contextmanager
+    def scanning(self) -> Iterator[ScanWatch]:
+        """Servos as they answer, and on a terminal below them what is asked and how long it will take."""
+        if self.console.quiet:
+            yield lambda _: None
+            return
+        with self.console.status("Asking ...") as status:
+
+            def watch(asking: Asking) -> None:
+                if asking.servo is not None:
+                    servo_id, model = asking.servo
+                    self.say(f"{asking.baud} baud, ID {servo_id}: {model}")
+                status.update(f"Asking at {asking.baud} baud, about {asking.left_s:.0f} s left")
+
+            yield watch
 
     @contextmanager
     def streaming(self, config: Config) -> Iterator[Watch]:

@@ -5,25 +5,41 @@
 
 import math
 import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PositiveFloat,
+    Tag,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from hil import fakes
 from hil.config.bundled import find_config
+from hil.config.chain import MOST_JOINTS, chain_slips
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
 from hil.drivers.bus import BusConfig
-from hil.drivers.joint import Joint
+from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
 from hil.errors import ConfigError
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
-from hil.fakes.description import FakeArm, beside
+from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import find_arm
-from hil.toml_errors import describe
+from hil.toml_errors import UNSAID, describe
 
 FAKE_URL = "fake://"
+
+DRIFT = 5.0
+"""Times experiment.settle_within."""
 
 SLOW_INTERVAL_S = 0.25
 """From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
@@ -33,6 +49,13 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
+BusId = Annotated[int, Field(ge=0, le=252)]
+_One = TypeVar("_One")
+OneOrList = Annotated[
+    Annotated[_One, Tag(f"{UNSAID}one")] | Annotated[list[_One], Tag(f"{UNSAID}list")],
+    Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
+]
+"""A value, or a list of such; a wrong one is named as what it looks like."""
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
@@ -49,9 +72,11 @@ class JointConfig(_Table):
     """`[[joints]]`: one joint, from the base outwards."""
 
     name: str = Field(min_length=1, max_length=20)
-    id: int = Field(ge=0, le=252)
+    servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or those of the two servos of the joint")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
-    direction: Literal[-1, 1] = 1
+    turns: OneOrList[Literal[-1, 1]] = Field(
+        1, alias="direction", description="-1 where the servo turns against the joint; for two servos one each"
+    )
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
     mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
@@ -63,12 +88,50 @@ class JointConfig(_Table):
     current_limit: PositiveFloat | None = Field(None, le=30, description="A")
     voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
 
+    @field_validator("name")
+    @classmethod
+    def _printable(cls, name: str) -> str:
+        """A name goes into terminals, XML, HTML and CSV: no control character, line break or half of a surrogate."""
+        if bad := [each for each in name if not each.isprintable()]:
+            raise ValueError(f"{name!a}: {bad[0]!a} is not a character that can be printed")
+        return name
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.position_limit
         if low >= high:
             raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
         return self
+
+    @model_validator(mode="after")
+    def _a_direction_for_each_servo(self) -> Self:
+        if isinstance(self.servos, list) and not 1 <= len(self.servos) <= 2:
+            raise ValueError(f"id has {len(self.servos)} entries: one servo or two move a joint")
+        if len(set(self.ids)) < len(self.ids):
+            raise ValueError(f"id = {list(self.ids)}: each servo needs one of its own")
+        if isinstance(self.turns, list) and len(self.turns) != len(self.ids):
+            raise ValueError(f"direction has {len(self.turns)} entries for {len(self.ids)} servos: one each")
+        return self
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The IDs of its servos, the first one's first."""
+        return tuple(self.servos) if isinstance(self.servos, list) else (self.servos,)
+
+    @property
+    def id(self) -> int:
+        """The ID of its servo, the first where it has two."""
+        return self.ids[0]
+
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """+1 or -1 for each of its servos."""
+        return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
+
+    @property
+    def direction(self) -> int:
+        """+1 or -1, of the first servo."""
+        return self.directions[0]
 
     @model_validator(mode="after")
     def _driven(self) -> Self:
@@ -112,7 +175,16 @@ class JointConfig(_Table):
 
     @property
     def joint(self) -> Joint:
-        return Joint(self.name, self.id, servo_model(self.model), self.direction, self.zero_ticks, self.drive_mode)
+        seconds = tuple(SecondServo(*each) for each in zip(self.ids[1:], self.directions[1:], strict=True))
+        return Joint(
+            self.name,
+            self.id,
+            servo_model(self.model),
+            self.direction,
+            self.zero_ticks,
+            self.drive_mode,
+            seconds=seconds,
+        )
 
 
 class PriorConfig(_Table):
@@ -137,8 +209,14 @@ class ArmConfig(_Table):
     """`[arm]`: what is known of the mechanism."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
-    rest_pose: list[float] = Field(description="rad: where the arm hangs when nothing drives it")
-    rest_tolerance: PositiveFloat = Field(0.25, description="rad from the rest pose allowed at the start")
+    urdf: str | None = Field(None, description="of an arm in space: a file beside this one; [[joints]] bear its names")
+    base: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+        [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of its base, rad"
+    )
+    rest_pose: list[float] = Field(description="rad: where the arm hangs, or lies, when nothing drives it")
+    rest_tolerance: PositiveFloat = Field(
+        0.5, description="rad from the rest pose allowed at the start: friction may hold an arm far from it"
+    )
     link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
     prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
 
@@ -157,9 +235,6 @@ class ExperimentConfig(_Table):
     ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
     settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
-    drift_within: float = Field(
-        0.05, ge=0, lt=1, description="the same, of a motion that still drifts after max_settling_periods"
-    )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="settled periods used")
     held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")
@@ -184,9 +259,22 @@ class ExperimentConfig(_Table):
         return self
 
     @property
+    def drift_within(self) -> float:
+        """As settle_within, of a motion that after max_settling_periods only drifts, as while grease warms."""
+        return DRIFT * self.settle_within
+
+    @property
     def samples(self) -> int:
         """Samples in a period."""
         return round(self.rate * self.period)
+
+
+class PathConfig(_Table):
+    """`[joint_path]`: of an arm in space, the path that excites it; band's upper end is its highest frequency."""
+
+    centre: list[float] = Field(description="rad per joint: what the path goes around")
+    swing: list[PositiveFloat] = Field(description="rad per joint: how far from there")
+    speed: list[PositiveFloat] = Field(description="rad/s per joint: how fast at most")
 
 
 class ModelConfig(_Table):
@@ -271,9 +359,10 @@ class Config(_Table):
 
     path: Path = Field(exclude=True)
     port: PortConfig
-    joints: list[JointConfig] = Field(min_length=1, max_length=2)
+    joints: list[JointConfig] = Field(min_length=1, max_length=MOST_JOINTS)
     arm: ArmConfig
     experiment: ExperimentConfig
+    joint_path: PathConfig | None = None
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
     stabiliser: StabiliserConfig | None = None
@@ -300,7 +389,7 @@ class Config(_Table):
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
         for key, values in self._per_joint():
             _same_length(key, values, count)
-        slips = list(implausible(self))
+        slips = [*chain_slips(self), *implausible(self)]
         if slips:
             raise ValueError("; ".join(slips))
         if self.experiment.lines is not None:
@@ -308,20 +397,16 @@ class Config(_Table):
             excited = [line for lines in self.experiment.lines for line in lines]
             if len(set(excited)) != len(excited):
                 raise ValueError("experiment.lines: two joints share a line; each joint needs its own")
-        for key in ("id", "name"):
-            values = [getattr(joint, key) for joint in self.joints]
-            if len(set(values)) != count:
-                raise ValueError(f"joints: two joints have the same {key} {values[0]!r}")
+        _all_different("id", [servo_id for joint in self.joints for servo_id in joint.ids])
+        _all_different("name", [joint.name for joint in self.joints])
         for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
             _check_rest_pose(joint, rest)
         if self.experiment.peak_torque is not None:
             for joint, peak in zip(self.joints, self.experiment.peak_torque, strict=True):
                 _check_peak_torque(joint, peak)
         self._check_pilot()
-        if self.model.torque_scale and count != 2:
+        if self.model.torque_scale and count != 2 and not self.is_chain:
             raise ValueError("model.torque_scale compares two joints' torque constants: it needs two [[joints]]")
-        if len({joint.drive_mode for joint in self.joints}) != 1:
-            raise ValueError("joints: all in current mode or all in pwm mode; one packet carries the goals of all")
         if self.port.url == FAKE_URL and self.fake is None:
             raise ValueError('port.url = "fake://" needs a [fake] table that describes the fake arm')
         return self
@@ -331,6 +416,8 @@ class Config(_Table):
         lists = {"experiment.peak_torque": self.experiment.peak_torque, "arm.link_lengths": self.arm.link_lengths}
         if self.stabiliser is not None:
             lists |= {"stabiliser.stiffness": self.stabiliser.stiffness, "stabiliser.damping": self.stabiliser.damping}
+        if self.joint_path is not None:
+            lists |= {f"joint_path.{key}": value for key, value in self.joint_path.model_dump().items()}
         if self.arm.prior is not None:
             guessed = self.arm.prior.model_dump(exclude={"spread", "rough_spread"})
             lists |= {f"arm.prior.{key}": value for key, value in guessed.items()}
@@ -338,12 +425,19 @@ class Config(_Table):
 
     def _check_pilot(self) -> None:
         experiment = self.experiment
+        if self.is_chain:
+            return
         if experiment.pilot and self.arm.link_lengths is None:
             raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
         if experiment.peak_torque is None and self.arm.link_lengths is None:
             raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
         if experiment.design == "optimal" and not experiment.pilot:
             raise ValueError('experiment.design = "optimal" needs pilot = true: it designs on the pilot\'s model')
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether a URDF describes the arm."""
+        return self.arm.urdf is not None
 
     @property
     def url(self) -> str:
@@ -356,7 +450,7 @@ class Config(_Table):
         return BusConfig(
             self.url,
             self.port.baud,
-            tuple(joint.joint for joint in self.joints),
+            tuple(replace(joint.joint, near=rest) for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True)),
             one_write=self.port.one_write,
             fast_sync_read=self.port.fast_sync_read,
             slow_every=max(1, round(SLOW_INTERVAL_S * self.experiment.rate)),
@@ -391,6 +485,9 @@ def parse_config(text: str, path: Path) -> Config:
         raise ConfigError(f"{path}: path is not a known key.")
     if isinstance(values.get("fake"), dict):
         values["fake"] = beside(values["fake"], path.parent)
+    arm = values.get("arm")
+    if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
+        values["arm"] = {**arm, "urdf": str(found_beside(path.parent, arm["urdf"]))}
     try:
         return Config(path=path, **values)
     except ValidationError as error:
@@ -400,6 +497,12 @@ def parse_config(text: str, path: Path) -> Config:
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
     if len(values) != count:
         raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each of [[joints]]")
+
+
+def _all_different(key: str, values: Sequence[int | str]) -> None:
+    again = [value for place, value in enumerate(values) if value in values[:place]]
+    if again:
+        raise ValueError(f"joints: two joints have the same {key} {again[0]!r}")
 
 
 def _check_rest_pose(joint: JointConfig, rest: float) -> None:
@@ -433,7 +536,7 @@ def _url_of(port: str) -> str:
     if "://" in port:
         return port
     config = find_config(Path(port))
-    if config.suffix == ".toml":
+    if config.suffix == ".toml" or config.is_file():
         return load_config(config).url
     arm = find_arm(port)
     return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port

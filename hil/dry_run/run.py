@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.dry_run.amplitude import largest_amplitude
 from hil.dry_run.ensemble import Ensemble, prior_ensemble, result_ensemble
@@ -23,6 +24,7 @@ def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos
 
     Raises ConfigError, ResultError, RunFolderError, ExperimentError; with `servos`, DriverError.
     """
+    only_planar(config, "a dry run")
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
     plan = None if config.experiment.peak_torque is None else make_plan(config)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from hil.config.schema import Config
@@ -95,7 +96,8 @@ def _prediction_json(config: Config, prediction: Prediction) -> dict[str, Any]:
 
 def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
     table = Table(
-        title=f"Dry run of {config.path.name}, {run.arms} arms drawn from the {run.source}", title_justify="left"
+        title=f"Dry run of {escape(config.path.name)}, {run.arms} arms drawn from the {run.source}",
+        title_justify="left",
     )
     for heading in ("joint", "predicted peak", "unit"):
         table.add_column(heading)
@@ -106,7 +108,7 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
         for row, (name, unit) in enumerate(quantities_of(config)):
             numbers = (median[row, index], quantile[row, index], prediction.limits[row, index])
             cells = [f"{value:.3g}" for value in numbers] + [_percent(chance[row, index])]
-            table.add_row(joint.name if row == 0 else "", name, unit, *cells)
+            table.add_row(escape(joint.name) if row == 0 else "", name, unit, *cells)
         table.add_section()
     return table
 

@@ -11,8 +11,11 @@ from hil.dry_run.amplitude import with_peaks
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.excitation.optimal_design import Limits, Problem, design_optimal, smoothed
 from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.many_arms import ManyArms
 from hil.plan.plan import Plan, Segment, period_current
 from hil.plan.stabiliser import feedback_of
+
+_EVERY = 4  # samples looked at
 
 
 def roomy_plan(config: Config, physics: Physics) -> Plan:
@@ -25,9 +28,21 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     plan = with_peaks(config, _torque_limits(config))
     segments = []
     for segment in plan.segments:
-        waves = [problem.scaled(wave, np.ones(len(config.joints))) for wave in _turned(segment.multisine)]
-        segments.append(_with_wave(config, segment, max(waves, key=lambda wave: _range_used(problem, wave))))
+        wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
+        best = max(_turned(wave), key=lambda each: _evenness(problem, each))
+        segments.append(_with_wave(config, segment, best))
     return replace(plan, segments=tuple(segments))
+
+
+def _evenness(problem: Problem, wave: Multisine) -> float:
+    """Range covered over what as much of the way to the nearer limit could cover, the worse joint's; 1 at best."""
+    ones = np.ones((1, wave.joints))
+    arms = ManyArms([problem.physics], ones, problem.pose[None], problem.feedback)
+    position = arms.positions(np.tile(wave.torque, 2), wave.rate, _EVERY)[0]
+    low, high = position.min(axis=1), position.max(axis=1)
+    limits, pose = problem.limits, problem.pose
+    share = np.maximum((low - pose) / (limits.low - pose), (high - pose) / (limits.high - pose))
+    return float(((high - low) / (limits.high - limits.low) / np.maximum(share, 1e-3)).min())
 
 
 def _turned(wave: Multisine) -> list[Multisine]:
@@ -80,13 +95,6 @@ def _plain_segment(config: Config, seed: int) -> Segment:
 
 def _with_wave(config: Config, segment: Segment, wave: Multisine) -> Segment:
     return replace(segment, multisine=wave, period_current=period_current(config, wave))
-
-
-def _range_used(problem: Problem, wave: Multisine) -> float:
-    """Share of the allowed positions that the motion covers, the worst joint's."""
-    covered = np.ptp(problem.positions(wave), axis=1)
-    allowed = problem.limits.high - problem.limits.low
-    return float((covered / allowed).min())
 
 
 def _torque_limits(config: Config) -> NDArray[np.float64]:

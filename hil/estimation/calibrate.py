@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.estimation.model_from_config import wanted_model
@@ -62,6 +63,7 @@ class CalibrationResult:
 def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -> CalibrationResult:
     """The torque constants; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
     config, other = without.load_config(), with_mass.load_config()
+    only_planar(config, "a calibration by a known mass")
     _same_arm(config, other)
     if config.arm.gravity == 0.0:
         raise ConfigError("arm.gravity = 0: nothing pulls at the mass; calibrate in a vertical plane.")

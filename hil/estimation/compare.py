@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.estimation.model_from_config import wanted_model
@@ -63,6 +64,7 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
     Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
+    only_planar(config, "a comparison with other methods")
     samples = load_samples(run.samples_path, len(config.joints))
     period = settled_period(config, facts, samples, IDENTIFY)
     held_out = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hil.config.csv_columns import CURRENT_UNITS, POSITION_UNITS, TIME_UNITS, TORQUE_UNITS, Columns
 from hil.errors import CsvError
 from hil.estimator.data.recording import Recording
+from hil.runs.file_size import MOST_CSV_BYTES
 
 Values = NDArray[np.float64]
 
@@ -37,6 +38,8 @@ def _torque(path: Path, read: dict[str, Values], columns: Columns) -> Values:
 
 def _read(path: Path) -> dict[str, Values]:
     try:
+        if path.stat().st_size > MOST_CSV_BYTES:
+            raise CsvError(f"{path}: is larger than {MOST_CSV_BYTES // 2**20} MB, the most that is read. Split it.")
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file)
             header = [name.strip() for name in next(reader, [])]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.plausibility import doubts
@@ -37,6 +38,8 @@ log = logging.getLogger(__name__)
 def estimate_run(run: RunFolder) -> SettledResult:
     """Estimate from the recording in `run` and write its result.json; the result. Raises HilError, EstimationError."""
     config, facts = run.load_config(), run.load_facts()
+    if config.is_chain:
+        return estimate_chain_run(run, config, facts)
     samples = load_samples(run.samples_path, len(config.joints))
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hil.config.chain import only_planar
 from hil.config.csv_columns import load_csv_config
 from hil.config.schema import ModelConfig
 from hil.errors import ConfigError
@@ -52,6 +53,7 @@ def estimate_csv(paths: Sequence[Path], config_path: Path) -> ShootingResult:
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
     """The result of all samples of a run whose motion never became periodic, or that was stopped before it did."""
     config, facts = run.load_config(), run.load_facts()
+    only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     recording = Recording(

@@ -24,6 +24,9 @@ WIDENED = 1.5
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
+_FRICTIONS = 8.0
+"""Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
+an alarm."""
 _TILT_SHARE = 0.2  # of gravity, in a direction that the angles' zero does not expect
 _STILL_RAD_S = 0.06
 
@@ -39,7 +42,9 @@ class ModelWatch:
         largest = np.array([constant * goal for constant, goal in zip(self._constants, planned, strict=True)])
         mean, covariance = _known(config, largest, arms)
         interval = 1.0 / config.experiment.rate
-        self._observer = MomentumObserver(mean, covariance, largest, interval)
+        # A pilot's torque is hardly more than dry friction, and what that does near standstill is not in the model.
+        dry = [_FRICTIONS * mean.get(f"coulomb_{number}", 0.0) for number in range(1, len(largest) + 1)]
+        self._observer = MomentumObserver(mean, covariance, np.maximum(largest, dry), interval)
         self._names = [joint.joint.title for joint in config.joints]
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
@@ -55,15 +60,15 @@ class ModelWatch:
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint >= 0:
-            self._raise(joint, torque[joint], state)
+            self._raise(joint, state)
 
-    def _raise(self, joint: int, torque: float, state: State) -> None:
+    def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
             said = (
-                f"{name} stands still under {torque:+.3f} N m, which would move any arm that fits what is known and "
-                "was seen of this one. Something holds it, it is stuck, or its encoder is frozen."
+                f"{name} stands still although {abs(lacking):.3f} N m drive it, which would move any arm that fits "
+                "what is known and was seen of this one. Something holds it, it is stuck, or its encoder is frozen."
             )
         else:
             said = (

@@ -11,12 +11,14 @@ from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import DriverError, ServoFault, TorqueNotOff, WrongSetting
 from hil.drivers.latency import command_to_set, latency_timer
 from hil.drivers.state import State
+from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
-from hil.plan.plan import Plan, make_plan
+from hil.plan.chain_plan import plan_of
+from hil.plan.plan import Plan
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
@@ -36,14 +38,25 @@ _PATIENCE_S = 0.2
 
 _MOVED = 2.0
 
+_LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
+"""How long the next run waits for an arm to come to rest, how often it looks, and how little may change in between."""
 
-def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watch, plan: Plan | None = None) -> str:
+
+def run_experiment(
+    config: Config,
+    run: RunFolder,
+    shown_path: Path,
+    watch: Watch,
+    plan: Plan | None = None,
+    arms: Ensemble | None = None,
+) -> str:
     """Play the configuration's experiment and record it in `run`; the sentence about torque at the end.
 
-    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`.
+    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`. arms: what
+    is known of the arm, by default its prior.
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
-    plan = make_plan(config) if plan is None else plan
+    plan = plan_of(config) if plan is None else plan
     fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
@@ -53,12 +66,14 @@ def run_experiment(config: Config, run: RunFolder, shown_path: Path, watch: Watc
 
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
+        if has_moved():
+            _wait_for_rest(bus)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
             # Signals are only noted from before torque comes on until the servos are as they were.
             with stop.only_noted(), servo_limits(config, bus, note):
-                _play(config, plan, bus, recorder, stop, shown, note)
+                _play(config, plan, bus, recorder, stop, shown, note, arms)
             torque = str(bus.torque_off_report)
             note(torque)
             with suppress(RunFolderError):  # the recording holds all of it
@@ -77,10 +92,17 @@ def _check_still_wanted(stop: StopRequest, torque: str) -> None:
 
 
 def _play(
-    config: Config, plan: Plan, bus: ServoBus, recorder: Recorder, stop: StopRequest, watch: Watch, note: Note
+    config: Config,
+    plan: Plan,
+    bus: ServoBus,
+    recorder: Recorder,
+    stop: StopRequest,
+    watch: Watch,
+    note: Note,
+    arms: Ensemble | None,
 ) -> None:
     """Torque on, stream, torque off; whatever stops it is kept among the events."""
-    stream = Stream(bus, plan, config, recorder, stop, watch, note)
+    stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     try:
         # In this order: what _on_time does takes longer than the watchdog waits.
         with _on_time(bus.port.clock, note), bus.torque(config.safety.watchdog):
@@ -141,12 +163,32 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms on the wire alone at "
             f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
         )
+    slowest = bus.port.latency + wire
+    if slowest <= 1 / rate:
+        return
     file = latency_timer(bus.port.url)
-    if file is not None and bus.port.latency + wire > 1 / rate:
+    if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which leaves "
-            f"{1 / (bus.port.latency + wire):.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+            f"{1 / slowest:.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
         )
+    if bus.port.latency_measured:
+        raise WrongSetting(
+            f"experiment.rate = {rate:g}: replies lie {bus.port.latency * 1e3:.0f} ms in this adapter, as measured, "
+            f"which leaves {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short latency."
+        )
+
+
+def _wait_for_rest(bus: ServoBus) -> None:
+    """A run that ended early leaves the arm swinging: wait for it, at most _LONGEST_REST_S."""
+    clock = bus.port.clock
+    former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S
+    while clock.now() < end:
+        clock.wait_until(clock.now() + _REST_EVERY_S)
+        latest = bus.read_positions()
+        if all(abs(now - before) < _REST_WITHIN_RAD for now, before in zip(latest, former, strict=True)):
+            return
+        former = latest
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:

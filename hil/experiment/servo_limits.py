@@ -28,30 +28,32 @@ def servo_limits(config: Config, bus: ServoBus, note: Callable[[str], None]) -> 
 
 
 def _lower(config: Config, bus: ServoBus, joint: Joint, limit: float, note: Callable[[str], None]) -> None:
-    needed = current_limit_ticks(joint, limit)
-    servo = bus.servo(joint)
-    present = servo.read("Current Limit")
-    if present < needed:
-        raise WrongSetting(
-            f"{joint.title}: its Current Limit is {present}, but current_limit = {limit:g} A needs {needed}; larger "
-            "goals would be refused without a word. Set current_limit to "
-            f"{present * abs(joint.drive_unit(0.0)):.3g} or less, or "
-            "raise the register with DYNAMIXEL Wizard 2.0."
-        )
-    if present > needed and config.safety.write_current_limit:
-        servo.write("Current Limit", needed)
-        note(f"{joint}: Current Limit {present} -> {needed} until the end")
+    servos = bus.servos(joint)
+    needed = current_limit_ticks(joint, limit / len(servos))  # they share the goal
+    for servo in servos:
+        present = servo.read("Current Limit")
+        if present < needed:
+            raise WrongSetting(
+                f"{servo.title}: its Current Limit is {present}, but current_limit = {limit:g} A needs {needed}; "
+                "larger goals would be refused without a word. Set current_limit to "
+                f"{present * len(servos) * abs(joint.drive_unit(0.0)):.3g} or less, or "
+                "raise the register with DYNAMIXEL Wizard 2.0."
+            )
+        if present > needed and config.safety.write_current_limit:
+            servo.write("Current Limit", needed)
+            note(f"{servo.title}: Current Limit {present} -> {needed} until the end")
 
 
 def _check_pwm_limit(bus: ServoBus, joint: Joint, limit: float) -> None:
-    """PWM Limit bounds the voltage in current mode too: it must drive `limit` [A] through a motor at rest."""
-    servo = bus.servo(joint)
-    pwm = servo.read("PWM Limit")
-    volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * pwm / FULL_PWM_TICKS
-    needed = limit * joint.servo.resistance
-    if volts < needed:
-        raise WrongSetting(
-            f"{joint.title}: its PWM Limit is {pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply; current_limit = "
-            f"{limit:g} A needs {needed:.1f} V, so the motor would not carry what it is told. Raise PWM Limit with "
-            "DYNAMIXEL Wizard 2.0, or lower current_limit."
-        )
+    """PWM Limit bounds the voltage in current mode too: it must drive `limit` [A] through motors at rest."""
+    servos = bus.servos(joint)
+    needed = limit / len(servos) * joint.servo.resistance
+    for servo in servos:
+        pwm = servo.read("PWM Limit")
+        volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * pwm / FULL_PWM_TICKS
+        if volts < needed:
+            raise WrongSetting(
+                f"{servo.title}: its PWM Limit is {pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply; "
+                f"current_limit = {limit:g} A needs {needed:.1f} V, so the motor would not carry what it is told. "
+                "Raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
+            )

@@ -17,6 +17,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
+from hil.dry_run.ensemble import Ensemble
 from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.experiment.guard import Guard
 from hil.experiment.model_watch import ModelWatch
@@ -49,11 +50,20 @@ class Stream:
     """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
 
     watch: called about 20 times a second with the progress. note: called with each event worth keeping. Neither may
-    block. Make it before torque is on: it works out all that can be worked out beforehand.
+    block. arms: what is known of the arm, by default its prior. Make it before torque is on: it works out all that can
+    be worked out beforehand.
     """
 
     def __init__(
-        self, bus: ServoBus, plan: Plan, config: Config, recorder: Recorder, stop: StopRequest, watch: Watch, note: Note
+        self,
+        bus: ServoBus,
+        plan: Plan,
+        config: Config,
+        recorder: Recorder,
+        stop: StopRequest,
+        watch: Watch,
+        note: Note,
+        arms: Ensemble | None = None,
     ) -> None:
         self._bus = bus
         self._clock = bus.port.clock
@@ -62,7 +72,7 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._guard = Guard(config, planned)
-        self._model = ModelWatch(config, planned)
+        self._model = ModelWatch(config, planned, arms)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -132,8 +142,8 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} of what only "
-            "drifts. Look for play, a dragging cable or a slipping joint; or raise "
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} of what only drifts. Look for play, a "
+            "dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 

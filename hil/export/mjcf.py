@@ -4,6 +4,8 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from hil.arm_model import ArmModel
+from hil.chain_model import ChainArmModel
+from hil.export.chain_files import export_chain_mjcf
 from hil.export.left_out import left_out
 from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text
@@ -15,6 +17,8 @@ _CARRIED = ("armature", "offset", "lag")
 def export_mjcf(source: Source, path: Path) -> list[str]:
     """Write `path`; what MJCF has no place for. Raises ExportError when no physical masses exist."""
     model = source.model
+    if isinstance(model, ChainArmModel):
+        return export_chain_mjcf(source, model, path)
     links = distribute(model, source.link_length)
     left = left_out(model, _CARRIED)
     root = ET.Element("mujoco", model="arm")

@@ -7,7 +7,19 @@ from typing import Any
 from hil import strict_json
 from hil.export.source import Source, write_text
 
-_KEPT = ("schema", "method", "config", "joints", "arm", "parameters", "extra", "covariance", "fit", "validation")
+_KEPT = (
+    "schema",
+    "method",
+    "config",
+    "joints",
+    "arm",
+    "chain",
+    "parameters",
+    "extra",
+    "covariance",
+    "fit",
+    "validation",
+)
 
 
 def export_json(source: Source, path: Path) -> list[str]:

@@ -4,6 +4,8 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from hil.arm_model import ArmModel
+from hil.chain_model import ChainArmModel
+from hil.export.chain_files import export_chain_urdf
 from hil.export.left_out import left_out, torque_constants
 from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text
@@ -15,6 +17,8 @@ STANDARD_GRAVITY = 9.81
 def export_urdf(source: Source, path: Path) -> list[str]:
     """Write `path`; what URDF has no place for. Raises ExportError when no physical masses exist."""
     model = source.model
+    if isinstance(model, ChainArmModel):
+        return export_chain_urdf(source, model, path)
     links = distribute(model, source.link_length)
     left = [*left_out(model), *torque_constants(model)]
     if model.gravity not in (0.0, STANDARD_GRAVITY):

@@ -80,9 +80,11 @@ class Belief:
     def ensemble(self, farther: float = 1.0) -> Ensemble:
         """For a dry run; farther: range of motion that will be simulated over the one that was seen."""
         belief = self if not self.learned else self._widened(_LEAST_SPREAD * (1.0 + np.log2(max(1.0, farther))))
-        physics = tuple(Physics.of(values) for values in belief.parameters)
-        joints = 2 if any(name.endswith("_2") for name in self.names) else 1
-        return Ensemble(physics, np.ones((len(physics), joints)), "belief" if self.learned else "prior")
+        parameters = belief.parameters
+        joints = 2 if "torque_scale_2" in parameters[0] else 1
+        scale = np.array([[1.0, each.pop("torque_scale_2", 1.0)][:joints] for each in parameters])
+        physics = tuple(Physics.of(each) for each in parameters)
+        return Ensemble(physics, scale, "belief" if self.learned else "prior")
 
     def after(self, config: Config, seen: Seen) -> "Belief":
         """What is thought after `seen`."""

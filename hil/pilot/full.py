@@ -47,7 +47,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         number += 1
         chosen = with_torque(config, found.peak_torque)
         run.write_played(chosen)
-        played = search.player.play(chosen, run, "Full run", found)
+        played = search.play(chosen, run, "Full run", found)
         search.learn(chosen, played)
         if played.error is None:
             return played

@@ -14,8 +14,7 @@ Array = NDArray[np.float64]
 
 _FREQUENCY = 0.7  # Hz, of each joint on its spring alone
 _DAMPING_RATIO = 0.35
-_OUTWEIGHS = 1.3  # times gravity's pull away from the pose
-_SURE = 0.95  # of the arms
+_OUTWEIGHS = 1.3  # times gravity's pull away from the pose in the arm that it pulls most
 _FRICTIONS_PER_RADIAN = 1.5
 _TORQUE_SHARE = 0.35  # of the torque limit at a radian, at most, beyond what gravity needs
 
@@ -35,7 +34,7 @@ def with_stabiliser(config: Config, belief: Belief) -> Config:
 def proposed(config: Config, belief: Belief) -> StabiliserConfig:
     """Gains for the arms of `belief`."""
     parameters = belief.parameters
-    away = np.quantile([_pull_away(config, each) for each in parameters], _SURE, axis=0)
+    away = np.max([_pull_away(config, each) for each in parameters], axis=0)
     inertia = np.median([_inertia(config, each) for each in parameters], axis=0)
     friction, viscous = (np.median(_per_joint(config, parameters, name), axis=0) for name in ("coulomb", "viscous"))
     limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])

@@ -85,7 +85,7 @@ class Search:
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
-        self.pose = played.seen.pose
+        self.pose = played.seen.end
         swing = played.seen.swing
         self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
 
@@ -171,8 +171,15 @@ class Search:
 
     def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
         played_config = with_torque(config, found.peak_torque)
-        played = self.player.play(played_config, self.run.below(folder, played_config), name, found)
+        # Settled or not, its first period teaches; an arm that is ramped out comes to rest, one that is cut off swings.
+        calm = Amplitude(replace(found.plan, settle_within=np.inf), found.peak_torque, found.prediction)
+        played = self.play(played_config, self.run.below(folder, played_config), name, calm)
         self.learn(played_config, played)
+
+    def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
+        """Play one run, for the arms that could be this one, from where the last one left it."""
+        arms = self.belief.ensemble(self._farther)
+        return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 
     def _waves(self, config: Config) -> Plan:
         arm = Physics.of(self.belief.middle)
@@ -214,6 +221,11 @@ def pilot_config(config: Config) -> Config:
         low, high = experiment.band
         update |= {"period": period, "band": [max(low, 1 / period), high]}
     return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
+
+
+def _from_anywhere(config: Config) -> Config:
+    """The configuration for an arm that was in its rest pose when the search began, and is where friction left it."""
+    return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_tolerance": 2 * np.pi})})
 
 
 def only_first(found: Amplitude) -> Amplitude:

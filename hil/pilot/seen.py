@@ -17,12 +17,13 @@ _FEWEST = 40  # samples from which anything is learned
 @dataclass(frozen=True)
 class Seen:
     """command: torque without the stabiliser's (joints, samples) [N m]; position: (joints, samples) [rad], NaN where a
-    reply was missing; pose: where the arm stood before (joints,) [rad].
+    reply was missing; pose: where the arm stood before, end: where it was last (joints,) [rad].
     """
 
     command: Array
     position: Array
     pose: Array
+    end: Array
 
     @property
     def swing(self) -> Array:
@@ -47,7 +48,7 @@ def seen_of(config: Config, samples: NDArray[np.void], periods: int = 1) -> Seen
     pose = _last_finite(samples["position"][before])
     if not np.isfinite(pose).all() or not np.isfinite(position).any(axis=1).all():
         return None
-    return Seen(np.ascontiguousarray(command), position, pose)
+    return Seen(np.ascontiguousarray(command), position, pose, _last_finite(samples["position"]))
 
 
 def _last_finite(position: Array) -> Array:

@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
+from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
+from hil.pilot.belief import MOVED_STEPS
 from hil.pilot.seen import Seen, seen_of
 from hil.results.parts import PlayedStep
 from hil.runs.recording import load_samples
@@ -72,7 +74,7 @@ class Played:
     @property
     def passed_limit(self) -> bool:
         """Whether the guard stopped it at a limit of the motion."""
-        return isinstance(self.error, SafetyStop)
+        return isinstance(self.error, SafetyStop) and self.error.cause is not Cause.UNEXPECTED
 
 
 @dataclass(frozen=True)
@@ -83,16 +85,16 @@ class Player:
     watch: Watch
     say: Say
 
-    def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
-        """Run one step, compare, tell.
+    def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
+        """Run one step on an arm that could be any of `arms`, compare, tell.
 
         Raises what a run raises, but for what tells of the arm alone: a limit passed, no motion, no steady motion.
         """
         torque, error = "", None
         try:
-            torque = run_experiment(config, folder, self.shown_path, self.watch, found.plan)
+            torque = run_experiment(config, folder, self.shown_path, self.watch, found.plan, arms)
         except ExperimentError as stopped:
-            if not tells_of_the_arm(stopped):
+            if not (tells_of_the_arm(stopped) or _stood_still(config, folder, stopped)):
                 raise
             torque, error = " ".join(getattr(stopped, "__notes__", [])), stopped
         samples = load_samples(folder.samples_path, len(config.joints))
@@ -114,6 +116,15 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
     if isinstance(error, SafetyStop):
         return error.cause in (Cause.POSITION, Cause.VELOCITY)
     return isinstance(error, NotSettled | DidNotMove)
+
+
+def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> bool:
+    """Whether all that was unexpected is a joint that has not moved at all: friction is larger than was thought."""
+    if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED:
+        return False
+    position = load_samples(folder.samples_path, len(config.joints))["position"]
+    step = np.array([joint.joint.servo.position_unit for joint in config.joints])
+    return bool((np.nanmax(position, axis=0) - np.nanmin(position, axis=0) <= MOVED_STEPS * step).any())
 
 
 def _list(values: Array) -> str:

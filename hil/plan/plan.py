@@ -104,14 +104,14 @@ def period_current(config: Config, multisine: Multisine) -> NDArray[np.float64]:
 
 
 def make_plan(config: Config) -> Plan:
-    """Design the excitation of a configuration; the same seed gives the same plan."""
+    """Design the multisines of a planar arm; the same seed gives the same plan."""
     experiment = config.experiment
     roles = ROLES if experiment.held_out else (IDENTIFY,)
     return Plan(
         rate=experiment.rate,
         segments=tuple(_segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
         rest_samples=max(1, round(experiment.rest * experiment.rate)),
-        end_samples=_whole_windows(config.safety.rest_time, experiment.rate),
+        end_samples=end_samples(config),
         brake_samples=round(config.safety.damp_time * experiment.rate),
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
@@ -125,9 +125,11 @@ def rest_window(rate: float) -> int:
     return max(1, round(0.2 * rate))
 
 
-def _whole_windows(seconds: float, rate: float) -> int:
+def end_samples(config: Config) -> int:
+    """Samples that coming to rest may take: whole windows."""
+    rate = config.experiment.rate
     window = rest_window(rate)
-    return window * max(1, math.ceil(seconds * rate / window))
+    return window * max(1, math.ceil(config.safety.rest_time * rate / window))
 
 
 def _lines(config: Config) -> Sequence[Sequence[int]]:

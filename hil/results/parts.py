@@ -11,6 +11,7 @@ from hil.results.json_form import Spread
 
 __all__ = [
     "ArmFacts",
+    "ChainFacts",
     "Confounded",
     "Covariance",
     "Fit",
@@ -250,6 +251,27 @@ class ArmFacts:
     gravity: float
     rest_pose: PerJoint
     joints: tuple[JointFacts, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainFacts:
+    """Of an arm in space: what its URDF says, which its base parameters are relative to.
+
+    urdf: the file's name, beside the configuration. rotation, translation [m], axis: of each joint's frame in that of
+    the link before, and its axis in its own. gravity: in the base's frame [m/s^2]. groups: what each base parameter is
+    made of. from_prior: those of which the recording shows little, so that they are the URDF's. held: the URDF's joints
+    that are taken as fixed. doubts: what is odd about its inertias.
+    """
+
+    urdf: str
+    rotation: tuple[tuple[PerJoint, ...], ...]
+    translation: tuple[PerJoint, ...]
+    axis: tuple[PerJoint, ...]
+    gravity: PerJoint
+    groups: Mapping[str, str] = field(default_factory=dict)
+    from_prior: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

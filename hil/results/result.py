@@ -13,6 +13,7 @@ model_choice with friction = "auto": the models tried, the one chosen, what it g
 timing       how the stream kept its ticks, and how long the estimation took
 arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, mode, limits, torque per
              goal [N m/A, or N m/V in pwm mode]
+chain        only of an arm in space: its geometry, and what each base parameter is made of
 truth        only on a fake arm: the base parameters it was built with
 physical     masses, centres and inertias, where [known] says something
 stabiliser   what it gave of the torque, where there was one
@@ -28,6 +29,7 @@ from hil.results.display import as_html, as_text
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.parts import (
     ArmFacts,
+    ChainFacts,
     Covariance,
     Fit,
     ModelChoice,
@@ -70,6 +72,7 @@ class Result:
     model_choice: ModelChoice | None = None
     timing: Timing
     arm: ArmFacts | None = None
+    chain: ChainFacts | None = None
     truth: Mapping[str, float] | None = None
     physical: Physical | None = None
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import RunFolderError
+from hil.runs.file_size import check_archive
 
 FILE_NAME = "period.npz"
 _ARRAYS = ("torque", "position", "predicted")
@@ -62,6 +63,7 @@ def load_periods(run: Path) -> dict[str, PlayedPeriod]:
     if not path.is_file():
         return {}
     try:
+        check_archive(path)
         with np.load(path, allow_pickle=False) as file:
             roles = [name.removesuffix("_rate") for name in file.files if name.endswith("_rate")]
             return {

@@ -89,6 +89,8 @@ class RunFolder:
             if any(path.iterdir()):
                 raise RunFolderError(f"Run folder {path} is not empty; name another with --out, or remove it.")
             run.config_path.write_bytes(config.path.read_bytes())
+            for urdf in _urdfs(config):
+                (path / urdf.name).write_bytes(urdf.read_bytes())
         except OSError as error:
             raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
         return run
@@ -250,6 +252,13 @@ class RunFolder:
     def write_result(self, result: Result) -> None:
         """Write result.json. Raises RunFolderError."""
         write_json(self.result_path, result.to_json())
+
+
+def _urdfs(config: Config) -> set[Path]:
+    """Files that the configuration names; a configuration finds one of them beside itself, whatever folder it names."""
+    chain = None if config.fake is None else config.fake.chain
+    named = [config.arm.urdf, None if chain is None else chain.urdf]
+    return {Path(each) for each in named if each is not None}
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

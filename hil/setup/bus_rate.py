@@ -58,7 +58,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
 
     Every tenth exchange is one of the slow turns, so that their length counts.
     """
-    goals = [bus.servo(joint).read(goal_register(joint)) for joint in bus.joints]
+    goals = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     reads = (True, False) if bus.knows_fast_sync_read() else (False,)
     ways = [_measure(bus, goals, fast=fast, one_write=one_write) for fast in reads for one_write in (True, False)]
     configured = bus.config.one_write, bus.config.fast_sync_read and reads[0]
@@ -72,18 +72,18 @@ def goal_register(joint: Joint) -> str:
 
 
 def goals_taken(bus: ServoBus) -> list[Joint]:
-    """The joints whose servos take goals from a Sync Write: each is told another goal than it has, asked for it, and
-    given back the one that it had. Only with torque off. Raises DriverError.
+    """The joints, one for each servo, that take goals from a Sync Write: each is told another goal than it has, asked
+    for it, and given back the one that it had. Only with torque off. Raises DriverError.
     """
-    before = [bus.servo(joint).read(goal_register(joint)) for joint in bus.joints]
+    before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     other = [goal - 1 if goal > 0 else goal + 1 for goal in before]
     taken = []
     try:
         fast = bus.config.fast_sync_read and bus.knows_fast_sync_read()
         bus.make_exchange(fast=fast, one_write=bus.config.one_write).cycle(other)
-        for joint, goal in zip(bus.joints, other, strict=True):
-            if bus.servo(joint).read(goal_register(joint)) == goal:
-                taken.append(joint)
+        for (drive, servo), goal in zip(bus.drives.items(), other, strict=True):
+            if servo.read(goal_register(drive)) == goal:
+                taken.append(drive)
     finally:
         _give_back(bus, before)
     return taken
@@ -92,10 +92,10 @@ def goals_taken(bus: ServoBus) -> list[Joint]:
 def _give_back(bus: ServoBus, goals: Sequence[int]) -> None:
     """To every servo that can still be reached; raises the first DriverError after all were tried."""
     failures: list[DriverError] = []
-    for joint, goal in zip(bus.joints, goals, strict=True):
+    for (drive, servo), goal in zip(bus.drives.items(), goals, strict=True):
         try:
-            if bus.servo(joint).read(goal_register(joint)) != goal:
-                bus.servo(joint).write(goal_register(joint), goal)
+            if servo.read(goal_register(drive)) != goal:
+                servo.write(goal_register(drive), goal)
         except DriverError as error:
             failures.append(error)
     if failures:

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import Mode, Published, servo_model
+from hil.drivers.servo_prior import stall_torque
 
 STANDARD_GRAVITY = 9.81
 _OF_STALL = 0.3  # of the stall current or the supply: what the guard allows at first
+_USUAL_STALL = 4.1  # N m, of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 _RATES = (400, 200, 100, 50, 20)
 
@@ -43,6 +45,12 @@ class ArmAnswers:
     joints: tuple[JointAnswers, ...]
     gravity: float
     head: str
+
+
+def usual_length(model: str) -> float:
+    """Length of a link that a servo of this model usually carries [m], for who has not measured it."""
+    stall: float = stall_torque(servo_model(model))
+    return float(round(0.13 * (stall / _USUAL_STALL) ** 0.4, 2))
 
 
 def arm_toml(arm: ArmAnswers) -> str:

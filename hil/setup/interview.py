@@ -8,7 +8,7 @@ from hil.drivers.port import Port
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import SERVO_MODELS, servo_model
 from hil.errors import ExperimentError
-from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers
+from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers, usual_length
 from hil.setup.scan import Found, Heard
 
 Ask = Callable[[str, str], str]
@@ -18,6 +18,16 @@ Say = Callable[[str], None]
 _NAMES = ("shoulder", "elbow")
 _MOVED_TICKS = 30
 _MOST_SWING = 175.0  # degrees
+_MOST_TILT = 85.0  # degrees; beyond, an arm is as good as flat
+_LENGTHS_MM = (10.0, 2000.0)
+HANGING, UPRIGHT, FLAT = "hanging", "upright", "flat"
+_REST = {HANGING: -math.pi / 2, UPRIGHT: math.pi / 2, FLAT: 0.0}
+"""The first joint's angle at rest [rad]."""
+_POSE = {
+    HANGING: "Let the arm hang at rest, and press Enter",
+    UPRIGHT: "Hold the arm upright and straight, and press Enter",
+    FLAT: "Lay the arm straight, in the middle of where it may go, and press Enter",
+}
 
 
 def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) -> ArmAnswers:
@@ -30,21 +40,33 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         if servo.read("Torque Enable"):
             raise ExperimentError(f"{servo.title} holds its torque. Switch its supply off and on, then start again.")
     names = [_name(number, found, ask) for number, found in enumerate(chosen)]
-    vertical = _yes("Does the arm move in a vertical plane, so that it hangs down by itself?", ask, say)
+    stance = _stance(ask, say)
+    tilt = (
+        0.0
+        if stance == FLAT
+        else math.radians(
+            _number("By how many degrees is its plane tilted against the vertical", "0", (0.0, _MOST_TILT), ask, say)
+        )
+    )
     directions = [_direction(servo, name, ask, say) for servo, name in zip(handles, names, strict=True)]
-    ask("Let the arm hang at rest, or lay it straight if it moves in a horizontal plane, and press Enter", "")
+    ask(_POSE[stance], "")
     joints = []
     for number, (servo, found, name) in enumerate(zip(handles, chosen, names, strict=True)):
-        rest = -math.pi / 2 if vertical and number == 0 else 0.0
+        rest = _REST[stance] if number == 0 else 0.0
         unit = directions[number] * servo_model(str(found.model)).position_unit
         zero = servo.read("Present Position") - round(rest / unit)
-        swing = _swing(name, ask, say)
-        joints.append(JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing))
+        beyond = "the tip" if number == len(chosen) - 1 else names[number + 1]
+        usual = f"{1e3 * usual_length(str(found.model)):.0f}"
+        length = 1e-3 * _number(f"Length from {name} to {beyond} in mm", usual, _LENGTHS_MM, ask, say)
+        question = f"How far may {name} swing from there to either side, in degrees"
+        swing = math.radians(_number(question, "90", (5.0, _MOST_SWING), ask, say))
+        joints.append(JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing, length))
     head = (
         "Written by hil init. Before the first run: read each line, then `hil check` this file.\n"
-        "NOT yet run on this arm: limits and torques are careful guesses from the servos' models."
+        "NOT yet run on this arm: limits are careful guesses from the servos' models."
     )
-    return ArmAnswers(url, baud, tuple(joints), STANDARD_GRAVITY if vertical else 0.0, head)
+    gravity = 0.0 if stance == FLAT else round(STANDARD_GRAVITY * math.cos(tilt), 3)
+    return ArmAnswers(url, baud, tuple(joints), gravity, head)
 
 
 def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
@@ -92,21 +114,24 @@ def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     return 1 if moved > 0 else -1
 
 
-def _swing(name: str, ask: Ask, say: Say) -> float:
+def _stance(ask: Ask, say: Say) -> str:
+    """Which way up the arm is."""
+    question = "Is the arm hanging (it comes to rest by itself), upright (it would fall over) or flat (horizontal)"
     while True:
-        answer = ask(f"How far may {name} swing from there to either side, in degrees", "90")
+        answer = ask(question, HANGING).lower()
+        if answer in _REST:
+            return answer
+        say(f"{answer!r}: answer {', '.join(_REST)}")
+
+
+def _number(question: str, usual: str, bounds: tuple[float, float], ask: Ask, say: Say) -> float:
+    low, high = bounds
+    while True:
+        answer = ask(question, usual)
         try:
-            degrees = float(answer)
+            number = float(answer)
         except ValueError:
-            degrees = math.nan
-        if 5 <= degrees <= _MOST_SWING:
-            return math.radians(degrees)
-        say(f"{answer!r}: give a number of degrees from 5 to {_MOST_SWING:g}")
-
-
-def _yes(question: str, ask: Ask, say: Say) -> bool:
-    while True:
-        answer = ask(f"{question} (yes or no)", "yes").lower()
-        if answer in ("y", "yes", "n", "no"):
-            return answer.startswith("y")
-        say(f"{answer!r}: answer yes or no")
+            number = math.nan
+        if low <= number <= high:
+            return number
+        say(f"{answer!r}: give a number from {low:g} to {high:g}")

@@ -4,13 +4,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hil import fakes
 from hil.config.schema import Config, JointConfig
-from hil.drivers.bus import TIME_BASED_PROFILE, ServoBus
+from hil.drivers.bus import ServoBus
 from hil.drivers.control_table import model_names
-from hil.drivers.errors import DriverError, NoReply, PortLost, PortNotOpened
+from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNotOpened
 from hil.drivers.joint import Joint
 from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
-from hil.drivers.packet import HardwareError
+from hil.drivers.packet import MAX_ID, HardwareError
+from hil.drivers.preparation import TIME_BASED_PROFILE, check_quiet
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
 from hil.drivers.settings import WATCHDOG_TRIPPED, arms_itself
@@ -43,6 +45,7 @@ class Finding:
 
 def check_arm(config: Config) -> Iterator[Finding]:
     """Look at port, servos, pose and rate, in this order; what cannot be looked at is a STOP, never an exception."""
+    fakes.register_for(config.url)
     try:
         bus = ServoBus.connect(config.bus)
     except PortNotOpened as error:
@@ -54,9 +57,10 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield from _others(config, bus)
         all_well = True
         for joint_config, joint in zip(config.joints, bus.joints, strict=True):
-            for finding in _servo(config, joint_config, joint, bus.servo(joint)):
-                all_well &= finding.level is not Level.STOP
-                yield finding
+            for drive, servo in zip(joint.drives, bus.servos(joint), strict=True):
+                for finding in _servo(config, joint_config, drive, servo):
+                    all_well &= finding.level is not Level.STOP
+                    yield finding
         if not all_well:
             yield Finding(Level.STOP, "bus", "rate", "not measured", "Fix the servo problems above first.")
             return
@@ -82,6 +86,14 @@ def _latency_timer(bus: ServoBus) -> Finding:
 
 def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
     """Servos beside the arm's: nothing is ever sent to them, but whoever drives them should know."""
+    try:
+        check_quiet(bus.port)
+    except BusShared as error:
+        yield Finding(Level.STOP, config.port.url, "other masters", "another one speaks", str(error))
+        return
+    except DriverError as error:
+        yield Finding(Level.WARNING, config.port.url, "other masters", "not listened for", str(error))
+        return
     try:
         found = others_on_the_bus(bus)
     except DriverError as error:
@@ -184,6 +196,18 @@ def _drive_mode(_config: Config, _joint_config: JointConfig, _joint: Joint, serv
     return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), mend)
 
 
+def _secondary_id(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
+    secondary = servo.read("Secondary(Shadow) ID")
+    others = {servo_id for each in config.joints for servo_id in each.ids} - {joint.id}
+    none = secondary > MAX_ID
+    mend = (
+        f"It does what is told to that ID too, EEPROM aside. Type: hil setup {_port(config)} --id {joint.id} "
+        "--secondary-id 255"
+    )
+    level = Level.STOP if secondary in others else Level.WARNING
+    return _graded(none, "secondary ID", "none" if none else str(secondary), mend, level)
+
+
 def _startup(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     armed = arms_itself(servo)
     mend = (
@@ -213,23 +237,29 @@ def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo
     return _graded(config.port.baud >= 1_000_000, "baud", found, mend, Level.WARNING)
 
 
+def _share(joint_config: JointConfig) -> float:
+    """Of the joint's limit, what one of its servos gives [A or V]."""
+    return joint_config.goal_limit / len(joint_config.ids)
+
+
 def _drive_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     if joint.mode is Mode.PWM:
         volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * servo.read("PWM Limit") / FULL_PWM_TICKS
         mend = f"Lower voltage_limit in the configuration, or raise the servo's PWM Limit (at most {FULL_PWM_TICKS})."
-        return _graded(joint_config.goal_limit <= volts, "voltage limit", f"{volts:.1f} V at this supply", mend)
+        return _graded(_share(joint_config) <= volts, "voltage limit", f"{volts:.1f} V at this supply", mend)
     amperes = servo.read("Current Limit") * abs(joint.drive_unit(0.0))
     mend = (
         f"The configuration's current_limit is {joint_config.goal_limit:g} A: lower it, or raise the servo's Current "
         "Limit with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(joint_config.goal_limit <= amperes, "current limit", f"{amperes:.3f} A", mend)
+    return _graded(_share(joint_config) <= amperes, "current limit", f"{amperes:.3f} A", mend)
 
 
 def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     pwm = servo.read("PWM Limit")
     volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * pwm / FULL_PWM_TICKS
-    needed = joint_config.goal_limit * joint.servo.resistance if joint.mode is Mode.CURRENT else joint_config.goal_limit
+    share = _share(joint_config)
+    needed = share * joint.servo.resistance if joint.mode is Mode.CURRENT else share
     found = f"{pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply"
     mend = (
         f"It bounds the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
@@ -269,8 +299,11 @@ def _temperature(_config: Config, _joint_config: JointConfig, _joint: Joint, ser
 
 def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     ticks = servo.read("Present Position")
-    angle = joint.angle(ticks)
-    rest = config.arm.rest_pose[[each.id for each in config.joints].index(joint.id)]
+    index = [joint.id in each.ids for each in config.joints].index(True)
+    if joint.id != config.joints[index].id:
+        return Level.OK, "pose", f"the first servo's counts (ID {config.joints[index].id})", ""
+    angle = joint.within_turn(ticks).angle(ticks)
+    rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
     mend = (
         f"arm.rest_pose says {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "
@@ -285,6 +318,7 @@ _LOOKS: tuple[_Look, ...] = (
     _hardware_error,
     _torque,
     _drive_mode,
+    _secondary_id,
     _mode,
     _baud,
     _return_delay,
@@ -304,10 +338,10 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
     except DriverError as error:
         yield Finding(Level.STOP, "bus", "goals", "not tried", str(error))
         return
-    for joint in bus.joints:
+    for joint, servo in bus.drives.items():
         if joint in taken:
             continue
-        tripped = bus.servo(joint).read("Bus Watchdog") == WATCHDOG_TRIPPED
+        tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
         if tripped:
             yield Finding(
                 Level.OK, str(joint), "goals", "refused until its tripped Bus Watchdog is cleared, as a run does"

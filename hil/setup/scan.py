@@ -18,6 +18,7 @@ from hil.drivers.servo_model import BAUD_RATES, VOLTAGE_UNIT
 _SLOT_S = 3e-3
 """How long one ID may take to answer a broadcast ping; dynamixel-sdk allows the same."""
 
+_PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 
@@ -45,40 +46,72 @@ class Heard(NamedTuple):
     trouble: str
 
 
+class Asking(NamedTuple):
+    """A scan that goes on: the baud it is at, the time left [s], and the servo that has just answered, if it was one.
+
+    servo: ID, and model or model number.
+    """
+
+    baud: int
+    left_s: float
+    servo: tuple[int, str] | None = None
+
+
+Watch = Callable[[Asking], None]
+
+
 def serial_ports() -> list[tuple[str, str]]:
     """Device and description of every serial port of this machine that has hardware behind it."""
     return [(port.device, port.description) for port in list_ports.comports() if port.hwid != "n/a"]
 
 
-def scan(
-    port: Port, bauds: Sequence[int] = BAUD_RATES, progress: Callable[[int], None] = lambda _: None
-) -> Iterator[Heard]:
-    """Ask at each baud rate in turn; raises PortLost. progress: called with each baud before it is tried.
+def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _: None) -> Iterator[Heard]:
+    """Ask at each baud rate in turn; raises PortLost. watch: called while it waits, and with each servo that answers.
 
-    Rates that the adapter cannot do are given with their trouble said.
+    Rates that the adapter cannot do are given with their trouble said. Over TCP, where the other end sets the baud,
+    the first alone is tried.
     """
-    for baud in bauds:
-        progress(baud)
+    if not port.has_baud:
+        bauds = bauds[:1]
+    for place, baud in enumerate(bauds):
+        behind_s = sum(_listening_s(port, later) for later in bauds[place + 1 :])
         try:
             port.set_baud(baud)
         except PortNotOpened as error:
             yield Heard(baud, (), str(error))
             continue
-        yield listen(port)
+        yield listen(port, watch=_with_more(behind_s, watch))
 
 
-def listen(port: Port, patience: float = _SLOT_S * (MAX_ID + 1)) -> Heard:
-    """Who answers a broadcast ping at the port's present baud within `patience` [s]; raises PortLost."""
+def _with_more(behind_s: float, watch: Watch) -> Watch:
+    """The same watcher, told of the time beyond this baud too."""
+    return lambda asking: watch(asking._replace(left_s=asking.left_s + behind_s))
+
+
+def _listening_s(port: Port, baud: int) -> float:
+    """How long one baud is listened to [s], as long as nobody answers."""
+    return _PATIENCE_S + port.latency + _STATUS_BYTES * 10 / baud
+
+
+def listen(port: Port, patience: float = _PATIENCE_S, watch: Watch = lambda _: None) -> Heard:
+    """Who answers a broadcast ping at the port's present baud within `patience` [s]; raises PortLost.
+
+    watch: called while it waits, and with each servo that answers.
+    """
     framer = Framer()
     answers = {}
     port.discard_input()
     port.write(encode(BROADCAST_ID, Instruction.PING))
     deadline = port.clock.now() + patience + port.latency + port.wire_time(_STATUS_BYTES)
     while (remaining := deadline - port.clock.now()) > 0:
+        watch(Asking(port.baud, remaining))
         for packet in framer.feed(port.read(_STATUS_BYTES, min(remaining, 0.05))):
             if packet.is_status and len(packet.data) == 3:
                 answers[packet.id] = packet.data
                 deadline += port.wire_time(_STATUS_BYTES)
+                number = packet.data[0] | packet.data[1] << 8
+                model = model_names().get(number, f"model number {number}")
+                watch(Asking(port.baud, deadline - port.clock.now(), (packet.id, model)))
     servos = tuple(_describe(port, servo_id, data) for servo_id, data in sorted(answers.items()))
     damaged = framer.bad_crc or framer.noise_bytes + framer.pending > _STATUS_BYTES
     return Heard(port.baud, servos, "damaged answers: two servos with the same ID, or a bad cable" if damaged else "")

@@ -60,12 +60,14 @@ class ServoSession:
         """
         bus = self.bus
         bus.check_identity()
-        left = {joint: kept for joint in bus.joints if (kept := left_behind(bus.port.url, joint)) is not None}
+        left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
         bus.release_held(ours=left)
         if others := others_on_the_bus(bus):
             self._say(f"Also on this bus, and left alone: {'; '.join(others)}.")
-        for joint, described in zip(bus.joints, config.joints, strict=True):
-            servo = bus.servo(joint)
+        described = {
+            drive: each for joint, each in zip(bus.joints, config.joints, strict=True) for drive in joint.drives
+        }
+        for joint, servo in bus.drives.items():
             settings = read_settings(servo)
             if joint in left:
                 settings = _before(left[joint], settings)
@@ -75,7 +77,8 @@ class ServoSession:
                 )
             changed = {"Operating Mode": int(joint.mode)}
             if joint.mode is Mode.CURRENT:
-                changed["Current Limit"] = current_limit_ticks(joint, described.goal_limit)
+                share = described[joint].goal_limit / len(described[joint].ids)
+                changed["Current Limit"] = current_limit_ticks(joint, share)
             self._keep(joint, settings, changed)
         if folder is not None:
             copies = {str(joint.id): kept.settings for joint, kept in self._kept.items()}
@@ -110,7 +113,7 @@ class ServoSession:
         failed: dict[Joint, DriverError] = {}
         for joint in joints:
             try:
-                put_back(self.bus.servo(joint), self._kept[joint].settings)
+                put_back(self.bus.drives[joint], self._kept[joint].settings)
             except DriverError as error:
                 failed[joint] = error
             else:

@@ -1,10 +1,11 @@
 """Set up one servo: ID, baud rate, return delay. Every write to EEPROM is asked for first and read back after."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import DriverError, NoReply, ServoRefused, WrongModel, WrongSetting
+from hil.drivers.errors import NoReply, ServoRefused, WrongModel, WrongReply, WrongSetting
 from hil.drivers.port import Port
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import BAUD_RATES
@@ -12,6 +13,7 @@ from hil.drivers.servo_model import BAUD_RATES
 Confirm = Callable[[str], bool]
 
 RETURN_DELAY_UNIT_US = 2
+_ATTEMPTS = 3
 _PING_ONLY = load_control_table("XM430-W350")
 # Model Number, ID and the like stand at the same addresses in every X-series table.
 
@@ -38,16 +40,25 @@ def open_servo(port: Port, servo_id: int) -> Servo:
 
 
 def set_up(
-    servo: Servo, confirm: Confirm, *, new_id: int | None, new_baud: int | None, return_delay_us: int | None
+    servo: Servo,
+    confirm: Confirm,
+    *,
+    new_id: int | None = None,
+    new_baud: int | None = None,
+    return_delay_us: int | None = None,
+    secondary_id: int | None = None,
 ) -> list[Change]:
     """Make the changes that are asked for and differ from what is there, each after `confirm` said yes to its question.
 
     Raises ServoRefused where a register does not read back as written, WrongSetting where the new ID is taken, and
-    what `Servo.read` raises. The port is left at the servo's new baud.
+    what `Servo.read` raises. The port is left at the baud at which the servo was last heard. A status that gets lost
+    when ID or baud changes is no failure: the servo is looked for at both.
     """
     changes = []
     if return_delay_us is not None:
         changes.append(_set_return_delay(servo, confirm, return_delay_us))
+    if secondary_id is not None:
+        changes.append(_set_secondary_id(servo, confirm, secondary_id))
     if new_id is not None:
         change, servo = _set_id(servo, confirm, new_id)
         changes.append(change)
@@ -66,42 +77,80 @@ def _set_return_delay(servo: Servo, confirm: Confirm, delay_us: int) -> Change:
     return Change(name, before, after, written)
 
 
+def _set_secondary_id(servo: Servo, confirm: Confirm, secondary: int) -> Change:
+    name = "Secondary(Shadow) ID"
+    before = servo.read(name)
+    written = before != secondary and confirm(f"{servo.title}: change its {name} from {before} to {secondary}?")
+    if written:
+        servo.write(name, secondary)
+    return Change(name, before, secondary, written)
+
+
 def _set_id(servo: Servo, confirm: Confirm, new_id: int) -> tuple[Change, Servo]:
     if new_id == servo.id:
         return Change("ID", new_id, new_id, False), servo
     renamed = Servo(servo.port, new_id, servo.table)
-    if _somebody_at(renamed):
+    if _answers(renamed):
         raise WrongSetting(f"ID {new_id} is taken: another servo answers there. Two servos with one ID talk at once.")
     if not confirm(f"{servo.title}: change its ID from {servo.id} to {new_id}?"):
         return Change("ID", servo.id, new_id, False), servo
-    servo.write_only("ID", new_id)
-    _verify(renamed, "ID", new_id)
-    return Change("ID", servo.id, new_id, True), renamed
+    for _ in range(_ATTEMPTS):
+        _write_blind(servo, "ID", new_id)
+        if _answers(renamed):
+            _verify(renamed, "ID", new_id)
+            return Change("ID", servo.id, new_id, True), renamed
+        if not _answers(servo):
+            raise NoReply(
+                f"{servo.title} was told to take ID {new_id} and answers neither there nor at ID {servo.id}, at "
+                f"{servo.port.baud} baud on {servo.port.url}. Check its supply and its cable; `hil scan` finds it."
+            )
+    raise NoReply(f"{servo.title} still has its old ID {servo.id}: it was told {_ATTEMPTS} times to take {new_id}.")
 
 
 def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
     name, port, former = "Baud Rate", servo.port, servo.port.baud
     before, after = servo.read(name), BAUD_RATES.index(baud)
     question = f"{servo.title}: change its baud from {former} to {baud}? All servos on one bus need the same."
-    if before == after or not confirm(question):
+    if before == after:
         return Change(name, before, after, False)
     # First whether the adapter can do it at all: a servo at a baud that nobody here speaks is lost.
     port.set_baud(baud)
-    port.set_baud(former)
-    servo.write_only(name, after)
-    port.set_baud(baud)
     try:
-        _verify(servo, name, after)
-    except DriverError:
+        taken = _answers(servo)
+    finally:
         port.set_baud(former)
-        raise
-    return Change(name, before, after, True)
+    if taken:
+        raise WrongSetting(
+            f"At {baud} baud another servo answers to ID {servo.id}. Two servos with one ID talk at once: give one of "
+            "them another ID first."
+        )
+    if not confirm(question):
+        return Change(name, before, after, False)
+    for _ in range(_ATTEMPTS):
+        _write_blind(servo, name, after)
+        port.set_baud(baud)
+        if _answers(servo):
+            _verify(servo, name, after)
+            return Change(name, before, after, True)
+        port.set_baud(former)
+        if not _answers(servo):
+            raise NoReply(
+                f"{servo.title} was told to change from {former} to {baud} baud and answers at neither, on {port.url}. "
+                "Check its supply and its cable; `hil scan` finds it."
+            )
+    raise NoReply(f"{servo.title} is still at {former} baud: it was told {_ATTEMPTS} times to change to {baud}.")
 
 
-def _somebody_at(servo: Servo) -> bool:
+def _write_blind(servo: Servo, register: str, value: int) -> None:
+    """Write a register whose status may be lost: where the servo is then, whoever called looks for."""
+    with suppress(NoReply, WrongReply):
+        servo.write_only(register, value, attempts=1)
+
+
+def _answers(servo: Servo) -> bool:
     try:
-        servo.ping(attempts=2)
-    except NoReply:
+        servo.ping()
+    except (NoReply, WrongReply):
         return False
     return True
 

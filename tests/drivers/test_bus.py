@@ -225,6 +225,6 @@ def test_a_servo_without_current_mode_is_not_driven_by_current() -> None:
         Joint("elbow", 2, servo_model("XL430-W250"))
 
 
-def test_one_bus_is_driven_one_way() -> None:
-    with pytest.raises(ValueError, match="all must be in current mode or all in PWM mode"):
-        BusConfig("fake://", 1_000_000, (JOINTS[0], pwm("elbow", 2, 0)))
+def test_ids_of_one_bus_differ() -> None:
+    with pytest.raises(ValueError, match="IDs are 1, 1"):
+        BusConfig("fake://", 1_000_000, (JOINTS[0], pwm("elbow", 1, 0)))

@@ -41,6 +41,9 @@ class Wire(Port):
         self.written.append(data)
         self.waiting += self.answers.pop(0) if self.answers else b""
 
+    def has_input(self) -> bool:
+        return bool(self.waiting)
+
     def read(self, count: int, timeout: float) -> bytes:
         taken, self.waiting = self.waiting[:count], self.waiting[count:]
         self.time += timeout if len(taken) < count else 1e-5

@@ -15,9 +15,10 @@ TWO_SIDED_95 = 1.96
 def parameters(data: RunData) -> Section:
     """Always there."""
     result = data.result
-    tables = [_table(result.parameters, result.truth or {}, "Base parameters")]
+    groups = {} if result.chain is None else result.chain.groups
+    tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]
     if result.extra:
-        tables.append(_table(result.extra, {}, "What the model needed beside them"))
+        tables.append(_table(result.extra, {}, {}, "What the model needed beside them"))
     words = (
         "The interval is what the noise of this one recording leaves open. It holds neither the error of the torque "
         "constants, with which all values of a joint scale, nor what the model lacks.",
@@ -25,16 +26,19 @@ def parameters(data: RunData) -> Section:
     return Section("parameters", "Parameters", words, tuple(tables))
 
 
-def _table(entries: Mapping[str, Quantity], truth: Mapping[str, float], caption: str) -> Table:
+def _table(
+    entries: Mapping[str, Quantity], truth: Mapping[str, float], groups: Mapping[str, str], caption: str
+) -> Table:
+    """groups: what base parameters of an arm in space are made of, by name."""
     head = ("parameter", "what it is", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
-    return Table(head, tuple(_row(name, entry, truth) for name, entry in entries.items()), 3, caption, 1)
+    return Table(head, tuple(_row(name, entry, truth, groups) for name, entry in entries.items()), 3, caption, 1)
 
 
-def _row(name: str, entry: Quantity, truth: Mapping[str, float]) -> tuple[str, ...]:
+def _row(name: str, entry: Quantity, truth: Mapping[str, float], groups: Mapping[str, str]) -> tuple[str, ...]:
     value, std = entry.value, entry.std
     known = (number(truth[name]) if name in truth else "",) if truth else ()
     unit = "" if entry.unit == "1" else entry.unit.replace("^2", "²")
-    meaning = term_of(name).meaning
+    meaning = groups.get(name) or term_of(name).meaning
     if not math.isfinite(std):
         return (name, meaning, unit, number(value), "not determined", "", *known)
     relative = percent(std / abs(value)) if value else ""

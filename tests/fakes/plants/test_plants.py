@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,6 +11,7 @@ import pytest
 import serial
 from pydantic import ValidationError
 
+from hil import fakes
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
 from hil.fakes.plants.arm import Arm, base_parameters
@@ -181,16 +182,29 @@ def fails() -> None:
 
 
 @pytest.fixture(autouse=True)
-def plants(monkeypatch: pytest.MonkeyPatch) -> None:
+def plants(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     module = ModuleType("plants_of_others")
     for name in ("Good", "Nan", "TwoNumbers", "Lame", "fails"):
         setattr(module, name, globals()[name])
     monkeypatch.setitem(sys.modules, "plants_of_others", module)
+    fakes.allow_code()
+    yield
+    fakes.allow_code(False)
 
 
 def described(plant: str, **options: Any) -> FakeArm:
     servo = {"id": 1, "model": "XM430-W350", "zero_ticks": 0}
     return FakeArm.model_validate({"servos": [servo], "plant": plant, "plant_options": options})
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["plants_of_others:Good", "os:system", "hil.fakes.plants.plant:load_plant", "hil.fakes.plants.mujoco_plant:Path"],
+)
+def test_a_file_runs_no_code_of_its_own_without_leave(name: str) -> None:
+    fakes.allow_code(False)
+    with pytest.raises(PlantError, match="--allow-code"):
+        load_plant(name, {"command": "false"})
 
 
 def test_another_plant() -> None:

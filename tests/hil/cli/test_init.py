@@ -3,6 +3,7 @@
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,8 @@ def test_defaults_make_a_file_that_runs(arm_file: ArmFile, capsys: pytest.Captur
     config = load_config(Path("mine.toml"))
     assert [(joint.id, joint.model) for joint in config.joints] == [(1, "XM430-W350"), (2, "XM430-W350")]
     assert [joint.zero_ticks for joint in config.joints] == pytest.approx([3072, 2048], abs=2)
+    assert config.experiment.pilot and config.experiment.peak_torque is None and config.model.friction == "auto"
+    assert config.arm.link_lengths == [0.13, 0.13], "what a servo like this usually carries"
     assert "NOT yet run on this arm" in Path("mine.toml").read_text(encoding="utf-8")
     assert hil("check", "mine.toml") == 0
     assert hil("init", arm_file(), "--yes", "--out", "mine.toml") == 2
@@ -43,7 +46,8 @@ def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> Non
     answers = {
         "IDs of the arm's": ["7", "1 1", "2"],
         "Name of the joint": ["wrist"],
-        "Does the arm move": ["perhaps", "no"],
+        "Is the arm hanging": ["perhaps", "flat"],
+        "Length from wrist to the tip": ["0", "85"],
         "How far may wrist": ["far", "720", "45"],
     }
     said: list[str] = []
@@ -62,16 +66,39 @@ def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> Non
     assert (joint.id, joint.name, joint.rest) == (2, "wrist", 0.0)
     assert joint.zero_ticks == pytest.approx(2048, abs=2)
     assert joint.swing == pytest.approx(math.pi / 4)
-    assert arm.gravity == 0.0
+    assert arm.gravity == 0.0 and joint.length == pytest.approx(0.085)
     assert [text.split(":")[0] for text in said] == [
         "'7'",
         "'1 1'",
         "'perhaps'",
         "wrist did not move",
+        "'0'",
         "'far'",
         "'720'",
     ]
     assert parse_config(arm_toml(arm), Path("x.toml")).joints[0].position_limit == pytest.approx([-0.79, 0.79])
+
+
+@pytest.mark.parametrize(
+    ("stance", "tilt", "rest", "gravity"),
+    [("hanging", "60", -math.pi / 2, 4.905), ("upright", "0", math.pi / 2, 9.81), ("flat", "no question", 0.0, 0.0)],
+)
+def test_which_way_up_the_arm_is_says_rest_and_gravity(
+    arm_file: ArmFile, stance: str, tilt: str, rest: float, gravity: float
+) -> None:
+    answers = {"Is the arm hanging": stance, "By how many degrees is its plane": tilt}
+
+    def ask(question: str, usual: str) -> str:
+        return next((given for start, given in answers.items() if question.startswith(start)), usual)
+
+    port = open_port(port_url(str(arm_file())), 1_000_000)
+    try:
+        arm = interview(port, "fake://", list(scan(port, (1_000_000,))), ask, lambda _: None)
+    finally:
+        port.close()
+    config = parse_config(arm_toml(replace(arm, url="/dev/ttyUSB0")), Path("x.toml"))
+    assert config.arm.gravity == pytest.approx(gravity) and config.arm.rest_pose == pytest.approx([rest, 0.0], abs=1e-4)
+    assert config.stabiliser is None, "the pilot proposes one where it is needed"
 
 
 def test_a_bus_that_makes_no_arm_is_said(arm_file: ArmFile) -> None:

@@ -15,8 +15,9 @@ from hil.config.schema import Config
 from hil.drivers.errors import NoReply, WrongSetting
 from hil.drivers.port import Port, open_port
 from hil.fakes.bus.bus import FakeBus
+from hil.fakes.bus.faults import Fault
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.scan import scan
+from hil.setup.scan import Asking, scan
 from hil.setup.servo_settings import open_servo, set_up
 
 Arm = Callable[..., Config]
@@ -248,3 +249,92 @@ def test_setup_command_asks(arm_file: ArmFile) -> None:
     assert json.loads(invoke(*words, "--yes", "--json").stdout)["changes"][0]["written"] is True
     assert invoke(*words, "--json").exit_code == 2
     assert invoke("setup", arm_file(), "--id", 2, "--new-baud", 12345).exit_code == 2
+
+
+@pytest.mark.parametrize("kind", ["lost_reply", "corrupted_reply", "lost_instruction", "truncated_reply"])
+@pytest.mark.parametrize("place", range(14))
+def test_one_lost_packet_loses_no_servo(port: Callable[..., Port], kind: str, place: int) -> None:
+    """Whatever packet of the whole work it is; the status of the change itself is the one that used to hurt."""
+    opened = port()
+    servo = open_servo(opened, 2)
+    bus = opened._serial.bus
+    strikes, count = bus.faults.strikes, iter(range(10_000))
+    bus.faults.strikes = lambda *given: next(count) == place and strikes(*given)
+    bus.faults.add(Fault(kind=kind))
+    changes = set_up(servo, lambda _: True, new_id=9, new_baud=57_600)
+    bus.faults.clear()
+    bus.faults.strikes = strikes
+    assert [change.written for change in changes] == [True, True]
+    assert opened.baud == 57_600
+    assert open_servo(opened, 9).read("Baud Rate") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"new_id": 9}, "answers neither there nor at ID 2"),
+        ({"new_baud": 57_600}, "from 1000000 to 57600 baud and answers at neither"),
+    ],
+)
+def test_a_servo_that_is_gone_is_said_to_be_at_neither(
+    port: Callable[..., Port], change: dict[str, int], said: str
+) -> None:
+    opened = port()
+    servo = open_servo(opened, 2)
+
+    def unplug(_: str) -> bool:
+        opened._serial.bus.faults.add(Fault(kind="silent_servo", servo=2))
+        return True
+
+    with pytest.raises(NoReply, match=said):
+        set_up(servo, unplug, **change)
+    assert opened.baud == 1_000_000
+
+
+def test_a_servo_that_keeps_its_id_is_said_to(port: Callable[..., Port], monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = port()
+    servo = open_servo(opened, 2)
+    monkeypatch.setattr(type(servo), "write_only", lambda *_, **__: None)
+    with pytest.raises(NoReply, match="still has its old ID 2"):
+        set_up(servo, lambda _: True, new_id=9)
+    with pytest.raises(NoReply, match="still at 1000000 baud"):
+        set_up(servo, lambda _: True, new_baud=57_600)
+    assert opened.baud == 1_000_000
+
+
+def test_a_baud_at_which_the_id_is_taken_is_refused(port: Callable[..., Port]) -> None:
+    opened = port()
+    set_up(open_servo(opened, 2), lambda _: True, new_baud=57_600)
+    opened.set_baud(1_000_000)
+    renamed = open_servo(opened, 1)
+    opened._serial.bus.servos[1].write(7, bytes((2,)))
+    renamed = open_servo(opened, 2)
+    with pytest.raises(WrongSetting, match="At 57600 baud another servo answers to ID 2"):
+        set_up(renamed, lambda _: True, new_baud=57_600)
+    assert opened.baud == 1_000_000
+
+
+def test_a_secondary_id_is_taken_away(port: Callable[..., Port]) -> None:
+    opened = port()
+    (given,) = set_up(open_servo(opened, 2), lambda _: True, secondary_id=1)
+    assert given.written
+    assert opened._serial.bus.servos[2].shadow_id == 1
+    set_up(open_servo(opened, 2), lambda _: True, secondary_id=255)
+    assert opened._serial.bus.servos[2].shadow_id is None
+
+
+def test_a_scan_tells_of_servos_as_they_answer_and_how_long_it_will_take(port: Callable[..., Port]) -> None:
+    told: list[Asking] = []
+    list(scan(port(), (1_000_000, 57_600), told.append))
+    assert [asking.servo for asking in told if asking.servo] == [(1, "XM430-W350"), (2, "XM430-W350")]
+    left = [asking.left_s for asking in told if asking.servo is None]
+    assert left == sorted(left, reverse=True)
+    assert 1.4 < left[0] < 1.8
+    first = next(place for place, asking in enumerate(told) if asking.servo)
+    assert told[first].left_s > 1.4
+
+
+def test_scan_over_tcp_asks_once(port: Callable[..., Port]) -> None:
+    opened = port()
+    opened.url = "socket://bench:4000"
+    assert [heard.baud for heard in scan(opened, (1_000_000, 57_600))] == [1_000_000]

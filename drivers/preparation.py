@@ -1,0 +1,115 @@
+"""What is done before the control cycle: the adapter's delay, a quiet bus, each servo in its mode without torque."""
+
+from contextlib import suppress
+
+from hil.drivers.errors import BusShared, NoReply, ServoFault, WrongReply, WrongSetting
+from hil.drivers.joint import Joint
+from hil.drivers.packet import Framer, HardwareError
+from hil.drivers.port import Port
+from hil.drivers.servo import Servo, describe_error
+from hil.drivers.servo_model import Mode
+from hil.drivers.settings import arms_itself
+
+LISTEN_S = 0.05
+"""How long the bus must be quiet before this program speaks on it for good [s]."""
+
+SLOWEST_S = 0.1
+"""The slowest adapter that is waited for [s]."""
+
+_TRIPS = 5
+_PING_BYTES = 24  # on the wire: the ping and its status
+_STATUS_BYTES = 14
+_MARGIN = 1.25
+_MOST_HEARD_BYTES = 4096
+_SLOWER_THAN_KNOWN_S = 1.5e-3
+
+TIME_BASED_PROFILE = 0x04
+"""Bit of Drive Mode that changes profiles only, which current and PWM mode do not have."""
+
+
+def learn_latency(servo: Servo) -> None:
+    """Wait longer for every reply from here on where this servo's come late, as over Bluetooth or a network.
+
+    The port's `latency` is raised to what is measured where that is more than its kind of adapter should take.
+    """
+    port, usual = servo.port, servo.port.latency
+    trips = _trips(servo)
+    if not trips and port.read(_STATUS_BYTES, SLOWEST_S):  # nothing, but then something
+        port.discard_input()
+        port.latency = SLOWEST_S
+        trips = _trips(servo)
+    taken = min(trips, default=0.0) - port.wire_time(_PING_BYTES)
+    # Where nobody answers, whoever asks next says what is wrong.
+    port.latency_measured = taken >= usual + _SLOWER_THAN_KNOWN_S
+    port.latency = _MARGIN * taken if port.latency_measured else usual
+
+
+def _trips(servo: Servo) -> list[float]:
+    """How long some pings took [s], up to the first that had no answer."""
+    clock, trips = servo.port.clock, []
+    with suppress(NoReply, WrongReply):
+        for _ in range(_TRIPS):
+            start = clock.now()
+            servo.ping(attempts=1)
+            trips.append(clock.now() - start)
+    return trips
+
+
+def check_quiet(port: Port) -> None:
+    """Raise BusShared when somebody else's instructions are heard."""
+    port.discard_input()
+    heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
+    asked = sorted({packet.id for packet in heard if not packet.is_status})
+    if asked:
+        raise shared(f"asks ID {', '.join(map(str, asked))}")
+
+
+def shared(what: str) -> BusShared:
+    """The error of a bus on which another master does something."""
+    return BusShared(
+        f"Another master {what} on this bus. Two masters talk into each other's packets, and its goals would move the "
+        "arm too: end that program, or unplug that controller."
+    )
+
+
+def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
+    """Torque off, no fault, settings with which an experiment may start, and the joint's mode.
+
+    others: the IDs of the arm's other servos. Raises ServoFault, WrongSetting, and what `Servo.write` raises.
+    """
+    servo.write("Torque Enable", 0)
+    fault = servo.hardware_error()
+    if fault != HardwareError(0):
+        raise ServoFault(fault_text(joint, describe_error(fault)))
+    drive_mode = servo.read("Drive Mode")
+    if drive_mode & ~TIME_BASED_PROFILE:
+        raise WrongSetting(
+            f"{joint.title}: Drive Mode is {drive_mode}, 0 is needed (no reverse, no torque on by goal). "
+            "Set it to 0 with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
+        )
+    secondary = servo.read("Secondary(Shadow) ID")
+    if secondary in others:
+        raise WrongSetting(
+            f"{joint.title}: its Secondary ID is {secondary}, so it does what is told to that servo too. Give it none: "
+            f"hil setup {servo.port.url} --id {joint.id} --secondary-id 255."
+        )
+    if arms_itself(servo):
+        raise WrongSetting(
+            f"{joint.title}: Startup Configuration turns its torque on by itself whenever it is switched on or "
+            "reboots. Set that register to 0 with DYNAMIXEL Wizard 2.0."
+        )
+    if servo.read("Operating Mode") != joint.mode:
+        servo.write("Operating Mode", joint.mode)
+    if servo.read("Bus Watchdog"):
+        servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    # Goal PWM limits the output in current mode too; what another program left there may be nothing.
+    if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
+        servo.write("Goal PWM", servo.read("PWM Limit"))
+
+
+def fault_text(joint: Joint, cause: str) -> str:
+    """What to say of a servo that raised its alert."""
+    return (
+        f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
+        "find the cause, then switch its supply off and on."
+    )

@@ -1,0 +1,94 @@
+"""Links of real mass that move like identified base parameters, as near as possible to those of a description.
+
+Each link is the exponential map of ten numbers (log-Cholesky; Rucker and Wensing, IEEE Robotics and Automation Letters
+7 (2022) 8250): its pseudo-inertia is U U' with U upper triangular of positive diagonal, so that every one of them has a
+distribution of mass. Base parameters fix sums of these only; what they leave open is drawn weakly to the description.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.dynamics import TERMS
+
+PULL = 0.03  # of one logarithm, against one standard error of a base parameter
+LEAST_MASS = 1e-4  # kg
+LEAST_SPREAD = 1e-3  # m: radius of gyration of a link that the description makes a point
+LEAST_ROTOR = 1e-7  # kg m^2
+_UPPER = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+
+
+@dataclass(frozen=True)
+class PhysicalLinks:
+    """Links that some distribution of mass has."""
+
+    links: Array
+    """In the order of LINK_TERMS (joints, 10) [SI]."""
+    armature: Array
+    """(joints,) [kg m^2]."""
+    misfit: float
+    """Largest distance of a base parameter from the identified one, in its standard errors."""
+
+
+def nearest_links(base: BaseParameters, value: Array, std: Array, described: Array, armature: Array) -> PhysicalLinks:
+    """Links nearest to `described` (joints, 10) and rotors nearest to `armature` (joints,) [kg m^2] whose base
+    parameters are `value` (base parameters,) within `std`."""
+    joints = base.chain.joints
+    floor = np.maximum(std, 1e-6 * np.abs(value).max())
+    start = np.concatenate((*(_coordinates(row) for row in described), np.log(np.maximum(armature, LEAST_ROTOR))))
+
+    def parameters(x: Array) -> Array:
+        links = np.stack([_link(row) for row in x[: 10 * joints].reshape(joints, 10)])
+        return np.column_stack((links, np.exp(x[10 * joints :])))
+
+    def misfit(x: Array) -> Array:
+        away: Array = (base.of_all(parameters(x).reshape(-1)) - value) / floor
+        return away
+
+    def residual(x: Array) -> Array:
+        return np.concatenate((misfit(x), PULL * (x - start) / scale))
+
+    scale = np.concatenate((np.tile(_scales(), joints), np.ones(joints)))
+    found = least_squares(residual, start, x_scale=scale, max_nfev=200)
+    table = parameters(found.x)
+    assert table.shape == (joints, TERMS)
+    return PhysicalLinks(table[:, :-1], table[:, -1], float(np.abs(misfit(found.x)).max()))
+
+
+def _link(x: Array) -> Array:
+    """Parameters (10,) of coordinates (10,): logarithms of the diagonal of U, then what is above it."""
+    U = np.diag(np.exp(x[:4]))
+    for k, (row, column) in enumerate(_UPPER):
+        # The first moment is U_34 and the like times the root of the mass: coordinates are then in metres.
+        U[row, column] = x[4 + k] * (U[3, 3] if column == 3 else 1.0)
+    pseudo = U @ U.T
+    second, moment, mass = pseudo[:3, :3], pseudo[:3, 3], pseudo[3, 3]
+    inertia = np.trace(second) * np.eye(3) - second
+    return np.array([mass, *moment, *inertia[np.triu_indices(3)]])
+
+
+def _coordinates(link: Array) -> Array:
+    """The same back, of a link that is physical or made so."""
+    mass = max(float(link[0]), LEAST_MASS)
+    centre = link[1:4] / mass if link[0] > LEAST_MASS else np.zeros(3)
+    inertia = np.zeros((3, 3))
+    inertia[np.triu_indices(3)] = link[4:]
+    inertia = inertia + np.triu(inertia, 1).T
+    about = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    second = 0.5 * np.trace(about) * np.eye(3) - about
+    size, turned = np.linalg.eigh(second)
+    second = turned @ np.diag(np.maximum(size, mass * LEAST_SPREAD**2)) @ turned.T
+    # Upper triangular factor: a Cholesky factor read from the other end.
+    lower = np.linalg.cholesky(second[::-1, ::-1])
+    U = lower[::-1, ::-1]
+    return np.array(
+        [*np.log(np.diag(U)), 0.5 * np.log(mass), U[0, 1], U[0, 2], centre[0], U[1, 2], centre[1], centre[2]]
+    )
+
+
+def _scales() -> Array:
+    """What counts as one step of each coordinate: a factor e of a spread or a root of mass; centimetres of centre."""
+    return np.array([1.0, 1.0, 1.0, 1.0, 0.003, 0.003, 0.02, 0.003, 0.02, 0.02])

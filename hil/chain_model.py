@@ -1,0 +1,106 @@
+"""An identified arm in space as a model to use; see `hil.arm_model`. Needs numpy only.
+
+Newton and Euler's equations with the base parameters in the place of the links' own: what is not among them is zero,
+which moves alike. A mass of zero is therefore no statement about a link.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hil.arm_model import ArmModel, Array
+
+_INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where the joints are: of each joint's frame, rotation (3, 3) and translation (3,) [m] in that of the link before
+    at angle zero, and its axis in its own; gravity in the base's frame (3,) [m/s^2]."""
+
+    rotation: Array
+    translation: Array
+    axis: Array
+    gravity: Array
+
+
+@dataclass(frozen=True)
+class ChainArmModel(ArmModel):
+    """The dynamics of an identified arm in space.
+
+    `values` holds its base parameters; `groups` says what each of them is made of.
+    """
+
+    geometry: Geometry
+    groups: dict[str, str]
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """Mass matrices (..., joints, joints) [kg m^2] in the poses q (..., joints) [rad]."""
+        (q,) = self._motion(q=q)
+        angles = np.moveaxis(q, -1, 0)
+        columns = []
+        for joint in range(len(self.joints)):
+            unit = np.zeros_like(angles)
+            unit[joint] = 1.0
+            columns.append(self._torque(angles, np.zeros_like(angles), unit, np.zeros(3)))
+        return np.asarray(np.moveaxis(np.stack(columns), (0, 1), (-1, -2)))
+
+    def _rigid_body(self, q: Array, dq: Array, ddq: Array) -> Array:
+        return self._torque(q, dq, ddq, self.geometry.gravity)
+
+    def _gravity(self, q: Array) -> Array:
+        nothing = np.zeros_like(q)
+        return self._torque(q, nothing, nothing, self.geometry.gravity)
+
+    def _torque(self, q: Array, dq: Array, ddq: Array, gravity: Array) -> Array:
+        """Joints first; vectors have their three components last."""
+        count, shape = len(q), q.shape[1:]
+        turn, place = np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3))
+        spin, spun = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+        moved = np.broadcast_to(-gravity, (*shape, 3))
+        axes, places, forces, moments = [], [], [], []
+        for i in range(count):
+            step = turn @ self.geometry.translation[i]
+            moved = moved + np.cross(spun, step) + np.cross(spin, np.cross(spin, step))
+            place = place + step
+            turn = turn @ self.geometry.rotation[i]
+            axis = turn @ self.geometry.axis[i]
+            speed = axis * dq[i][..., None]
+            spun = spun + axis * ddq[i][..., None] + np.cross(spin, speed)
+            spin = spin + speed
+            turn = turn @ _rotations(self.geometry.axis[i], q[i] + self.values.get(f"zero_{i + 1}", 0.0))
+            mass, first, inertia = self._link(i + 1)
+            moment = turn @ first
+            about = turn @ inertia @ np.swapaxes(turn, -1, -2)
+            forces.append(mass * moved + np.cross(spun, moment) + np.cross(spin, np.cross(spin, moment)))
+            turned = (about @ spin[..., None])[..., 0]
+            moments.append(np.cross(moment, moved) + (about @ spun[..., None])[..., 0] + np.cross(spin, turned))
+            axes.append(axis)
+            places.append(place)
+        torque = np.empty_like(q)
+        force, total = np.zeros((*shape, 3)), np.zeros((*shape, 3))
+        for i in reversed(range(count)):
+            if i + 1 < count:
+                total = total + np.cross(places[i + 1] - places[i], force)
+            force, total = force + forces[i], total + moments[i]
+            torque[i] = np.sum(axes[i] * total, axis=-1) + self.values.get(f"armature_{i + 1}", 0.0) * ddq[i]
+        return torque
+
+    def _link(self, number: int) -> tuple[float, Array, Array]:
+        """Mass [kg], first moment (3,) [kg m] and inertia about the frame's origin (3, 3) [kg m^2]."""
+        values = self.values
+        first = np.array([values.get(f"moment_{each}_{number}", 0.0) for each in "xyz"])
+        inertia = np.zeros((3, 3))
+        for name, row, column in _INERTIA:
+            inertia[row, column] = inertia[column, row] = values.get(f"inertia_{name}_{number}", 0.0)
+        return values.get(f"mass_{number}", 0.0), first, inertia
+
+
+def _rotations(axis: Array, angle: Array) -> Array:
+    """Rotations (..., 3, 3) about an axis (3,) by angles (...,)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    turned: Array = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
+    return turned

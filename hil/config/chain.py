@@ -1,0 +1,95 @@
+"""What a configuration of an arm in space must have, and what its URDF says of it."""
+
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hil.description.arm import ArmDescription, ArmFileError
+from hil.description.urdf import read_urdf
+from hil.errors import ConfigError
+
+if TYPE_CHECKING:
+    from hil.config.schema import Config
+
+MOST_JOINTS = 7
+_PLANAR = 2
+_OPTIONS = ("presliding", "asymmetry", "ripple", "saturation", "cable", "encoder")
+
+
+def described_arm(config: "Config") -> ArmDescription:
+    """The arm of `[arm] urdf` with the joints of the configuration; raises ArmFileError."""
+    assert config.arm.urdf is not None
+    return _read(config.arm.urdf, tuple(joint.name for joint in config.joints), _changed(config.arm.urdf))
+
+
+def only_planar(config: "Config", what: str) -> None:
+    """Raise ConfigError for an arm in space: `what` needs a planar arm."""
+    if config.is_chain:
+        raise ConfigError(
+            f"{config.path}: {what} is for planar arms only yet: this one has arm.urdf. `hil identify` works on its "
+            "fake arm, `hil estimate`, `hil report` and `hil export` on its runs."
+        )
+
+
+def chain_slips(config: "Config") -> Iterator[str]:
+    """One sentence for each thing that is missing or does not fit; nothing for a planar arm without a URDF."""
+    if config.arm.urdf is None:
+        if len(config.joints) > _PLANAR:
+            yield (
+                f"joints: {len(config.joints)} of them make an arm in space: say where they are with arm.urdf; without "
+                "it an arm has one or two"
+            )
+        if config.joint_path is not None:
+            yield "joint_path: only an arm with arm.urdf follows a path; a planar arm has experiment.peak_torque"
+        return
+    try:
+        described_arm(config)
+    except ArmFileError as error:
+        yield f"arm.urdf: {error}"
+        return
+    fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
+    if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
+        yield f"arm.urdf and fake.chain.urdf are two files of one name, {fake.name}, and a run keeps both: rename one"
+    if config.stabiliser is None:
+        yield "stabiliser is missing: an arm in space cannot hang still, so a spring and a damper must hold its path"
+    if config.experiment.pilot:
+        yield "experiment.pilot = true: only planar arms have a pilot yet; set it to false and give [joint_path]"
+    if config.known is not None:
+        yield "known: only of planar arms; the masses of a URDF are its own"
+    told = [option for option in _OPTIONS if getattr(config.model, option)]
+    if told:
+        yield f"model.{told[0]} = true: only planar arms have that term yet; leave it out"
+    if config.model.friction == "auto":
+        yield 'model.friction = "auto": only for planar arms yet; choose "coulomb", "stribeck" or "stribeck_load"'
+    yield from _path_slips(config)
+
+
+def _path_slips(config: "Config") -> Iterator[str]:
+    if config.joint_path is None:
+        return
+    if config.experiment.band is None:
+        yield "experiment.lines: an arm in space follows a path, whose highest frequency is the end of experiment.band"
+    parts = zip(config.joints, *config.joint_path.model_dump().values(), strict=False)
+    for joint, centre, swing, speed in parts:
+        low, high = joint.position_limit
+        if centre - swing < low or centre + swing > high:
+            yield (
+                f"joint_path: {joint.name!r} goes from {centre - swing:g} to {centre + swing:g} rad, outside its "
+                f"position_limit [{low:g}, {high:g}]"
+            )
+        if speed > joint.velocity_limit:
+            yield f"joint_path.speed: {speed:g} rad/s of {joint.name!r}: its velocity_limit is {joint.velocity_limit:g}"
+
+
+def _changed(path: str) -> float:
+    """When the file was last written, so that a changed one is read anew."""
+    try:
+        return Path(path).stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+@lru_cache(maxsize=8)
+def _read(path: str, joints: tuple[str, ...], _changed_at: float) -> ArmDescription:
+    return read_urdf(Path(path), joints)

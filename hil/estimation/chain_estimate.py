@@ -1,0 +1,154 @@
+"""From the run folder of an arm in space to its result: both stages, and the check on a path that was not used."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.chain import described_arm
+from hil.config.schema import Config
+from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
+from hil.estimation.settled_period import settled_period
+from hil.estimation.settled_warnings import warnings_of
+from hil.estimator.chain.identify import ChainEstimate, identify_chain
+from hil.estimator.chain.model import ChainModel
+from hil.estimator.chain.prediction import predict
+from hil.fakes.plants.arm import armature
+from hil.plan.chain_plan import KnownChain, known_chain
+from hil.plan.plan import HELD_OUT, IDENTIFY
+from hil.results.parts import ChainFacts, Covariance, Quantity, RunTiming, SettledFit, Validation, Verdict
+from hil.results.result import SettledResult
+from hil.runs.period_file import PlayedPeriod, save_periods
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFacts, RunFolder
+from hil.runs.timing import timing
+
+EXPLAINED = 1.2  # times the encoder's rounding: a residual up to here leaves nothing to explain
+PREDICTED = 0.01  # of the motion: a held-out path foretold this well says that the model is right
+WRONG = 0.05  # and beyond this, that it is not
+
+
+def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> SettledResult:
+    """Estimate from the recording in `run` and write its result.json; raises HilError, EstimationError."""
+    samples = load_samples(run.samples_path, len(config.joints))
+    started = time.perf_counter()
+    known = known_chain(config)
+    model = wanted_chain_model(config, known)
+    period = settled_period(config, facts, samples, IDENTIFY)
+    estimate = identify_chain(period, model, known.prior)
+    played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+    if HELD_OUT in facts.segments:
+        other = settled_period(config, facts, samples, HELD_OUT)
+        predicted = predict(model, estimate.parameters, other)
+        played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
+    held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
+    over_floor = estimate.residual_steps / QUANTISATION_FLOOR_TICKS
+    seconds = round(time.perf_counter() - started, 3)
+    linear = len(model.linear_names)
+    result = SettledResult(
+        method="settled period, least squares on Fourier lines, then maximum likelihood of each position as foreseen "
+        f"from the past, the arm drawn to the measured path at {estimate.softness:g} Hz; {model.description}",
+        config=facts.config,
+        joints=len(config.joints),
+        parameters=_quantities(estimate, 0, linear),
+        extra=_quantities(estimate, linear, len(estimate.names)),
+        covariance=Covariance(estimate.names, tuple(map(tuple, estimate.covariance.tolist()))),
+        fit=SettledFit(
+            residual_rms_ticks=tuple(estimate.residual_steps.tolist()),
+            quantisation_floor_ticks=round(QUANTISATION_FLOOR_TICKS, 4),
+            samples_per_period=period.samples,
+            periods=period.periods,
+            model=model.description,
+            outliers=estimate.outliers,
+            correlation_time=estimate.correlation_time,
+        ),
+        validation=Validation(
+            held_out_rms=None if held_out is None else tuple(map(float, held_out)),
+            residual_over_floor=tuple(over_floor.tolist()),
+        ),
+        verdict=_verdict(config, estimate, known, held_out),
+        warnings=tuple(warnings_of(config, facts, samples, period)),
+        timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
+        arm=arm_facts(config),
+        chain=_facts(config, estimate, known),
+        truth=true_chain_parameters(config, known),
+    )
+    save_periods(run.path, played)
+    run.write_result(result)
+    return result
+
+
+def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
+    """The model that the configuration asks for."""
+    wanted = config.model
+    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale)
+
+
+def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:
+    """What an identification of the fake arm should find, by name [SI]; None on a real arm or another plant."""
+    chain = None if config.fake is None else config.fake.chain
+    if not config.is_fake or chain is None:
+        return None
+    rotors = [armature(drive) for drive in chain.drives]
+    every = np.column_stack((np.stack([body.parameters for body in chain.bodies]), rotors)).reshape(-1)
+    truth = dict(zip(known.base.names, known.base.of_all(every).tolist(), strict=True))
+    for quantity in ("viscous", "coulomb", "offset"):
+        for joint, drive in enumerate(chain.drives, start=1):
+            truth[f"{quantity}_{joint}"] = getattr(drive, quantity)
+    return truth
+
+
+def _facts(config: Config, estimate: ChainEstimate, known: KnownChain) -> ChainFacts:
+    arm, chain = described_arm(config), known.base.chain
+    return ChainFacts(
+        urdf=Path(config.arm.urdf or "").name,
+        rotation=tuple(tuple(map(tuple, each)) for each in chain.rotation.tolist()),
+        translation=tuple(map(tuple, chain.translation.tolist())),
+        axis=tuple(map(tuple, chain.axis.tolist())),
+        gravity=tuple(chain.gravity.tolist()),
+        groups=dict(zip(known.base.names, known.base.groups, strict=True)),
+        from_prior=estimate.from_prior,
+        held=arm.held,
+        doubts=arm.doubts,
+    )
+
+
+def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quantity]:
+    return {
+        estimate.names[index]: Quantity(float(estimate.value[index]), float(estimate.std[index]), estimate.units[index])
+        for index in range(start, end)
+    }
+
+
+def _verdict(
+    config: Config, estimate: ChainEstimate, known: KnownChain, held_out: NDArray[np.float64] | None
+) -> Verdict:
+    """Whether to trust it, the base parameter of which the recording shows least, and why."""
+    count = known.base.count
+    certain = estimate.std[:count] / known.prior.std
+    weakest = known.base.names[int(np.argmax(certain))]
+    over = estimate.residual_steps / QUANTISATION_FLOOR_TICKS
+    worst = config.joints[int(np.argmax(over))].name
+    sentences = [
+        f"The residual is {over.max():.2f} times what the encoder's rounding leaves, at {worst}: "
+        + ("nothing is left to explain." if over.max() <= EXPLAINED else "the model lacks something.")
+    ]
+    trust = "yes" if over.max() <= EXPLAINED else "with care"
+    if held_out is None:
+        sentences.append("No other path was played, so that nothing says how well it foretells.")
+        trust = "with care"
+    else:
+        error = float(np.max(held_out))
+        joint = config.joints[int(np.argmax(held_out))].name
+        sentences.append(
+            f"A path that was not used is foretold within {100 * error:.2f} % of its motion, {joint} worst."
+        )
+        trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
+    if estimate.from_prior:
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(
+            f"The recording shows little of {', '.join(estimate.from_prior)}: these are the URDF's. Swing farther and "
+            "faster ([joint_path]) to see them, or leave them, since they hardly move the arm."
+        )
+    return Verdict(trust, weakest, tuple(sentences))

@@ -1,0 +1,108 @@
+"""URDF and MJCF of an identified arm in space.
+
+The URDF is the one it was identified with: names, frames, limits and meshes stay, inertias, damping and friction of the
+arm's joints change. The MJCF is written from its geometry.
+"""
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from hil import __version__
+from hil.chain_model import ChainArmModel
+from hil.description.arm import Body
+from hil.description.urdf import parse_urdf
+from hil.export.chain_links import ChainLinks, chain_links
+from hil.export.source import Source, write_text
+from hil.export.xml_text import comment, numbers, to_text
+
+
+def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
+    """Write `path`; what URDF has no place for. Raises ExportError."""
+    found = chain_links(source, model)
+    root = parse_urdf(found.path)
+    links = {element.get("name"): element for element in root.findall("link")}
+    joints = {element.get("name"): element for element in root.findall("joint")}
+    for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
+        link = links[joint.link]
+        _replace_inertial(link, body)
+        if joint.fixed:
+            comment(link, f"with {', '.join(joint.fixed)}, which are fixed to it and have no inertia of their own")
+            for name in joint.fixed:
+                _remove(links[name], "inertial")
+        dynamics = joints[joint.name].find("dynamics")
+        if dynamics is None:
+            dynamics = ET.SubElement(joints[joint.name], "dynamics")
+        dynamics.set("damping", numbers(model.values[f"viscous_{index + 1}"]))
+        dynamics.set("friction", numbers(model.values[f"coulomb_{index + 1}"]))
+    rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
+    left = [*rotors, *found.left_out]
+    _describe(root, model, found, left)
+    write_text(path, to_text(root))
+    return left
+
+
+def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
+    """Write `path`; what MJCF has no place for. Raises ExportError."""
+    found = chain_links(source, model)
+    root = ET.Element("mujoco", model=found.path.stem)
+    left = ["the URDF's meshes, limits of effort and fixed frames", *found.left_out]
+    _describe(root, model, found, left)
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    ET.SubElement(root, "option", gravity=numbers(*model.geometry.gravity), timestep="0.001", integrator="implicitfast")
+    parent = ET.SubElement(root, "worldbody")
+    for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
+        number = index + 1
+        place = {"pos": numbers(*joint.translation), "quat": numbers(*_quaternion(joint.rotation))}
+        parent = ET.SubElement(parent, "body", {"name": joint.link, **place})
+        ET.SubElement(
+            parent,
+            "joint",
+            name=joint.name,
+            type="hinge",
+            axis=numbers(*joint.axis),
+            range=numbers(*model.joints[index].position_limit),
+            armature=numbers(found.armature[index]),
+            damping=numbers(model.values[f"viscous_{number}"]),
+            frictionloss=numbers(model.values[f"coulomb_{number}"]),
+        )
+        i = body.inertia
+        full = numbers(i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])
+        ET.SubElement(parent, "inertial", pos=numbers(*body.centre), mass=numbers(body.mass), fullinertia=full)
+    write_text(path, to_text(root))
+    return left
+
+
+def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: list[str]) -> None:
+    """At the head of the file: where it is from, what was identified and what was kept."""
+    words = [
+        f"Inertias, damping and friction identified by hil {__version__}; all else is of {found.path.name}.",
+        "One of many sets of links that move alike, the nearest to that file's: only these sums were measured:",
+        *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
+        *(f"No place in this format for {sentence}" for sentence in left),
+    ]
+    for position, text in enumerate(words):
+        root.insert(position, ET.Comment(f" {text.replace('--', '- -')} "))
+
+
+def _replace_inertial(link: ET.Element, body: Body) -> None:
+    _remove(link, "inertial")
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=numbers(*body.centre), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=numbers(body.mass))
+    names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    ET.SubElement(inertial, "inertia", {key: numbers(body.inertia[at]) for key, at in names.items()})
+
+
+def _remove(parent: ET.Element, tag: str) -> None:
+    for element in parent.findall(tag):
+        parent.remove(element)
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """w, x, y, z."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([w, x, y, z])

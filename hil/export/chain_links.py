@@ -1,0 +1,67 @@
+"""The links of an identified arm in space: physical ones that move as identified, nearest to those of its URDF."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hil.chain_model import ChainArmModel
+from hil.description.arm import ArmDescription, ArmFileError, Body
+from hil.description.urdf import read_urdf
+from hil.errors import ExportError
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.geometry import Chain
+from hil.estimator.chain.physical_links import nearest_links
+from hil.export.source import Source
+
+FAR = 3.0  # standard errors that a physical arm may be from the identified parameters without a word
+_SAID = ("viscous", "coulomb", "armature", "torque_scale", "moment", "inertia", "mass")
+
+
+@dataclass(frozen=True)
+class ChainLinks:
+    """An arm to be written: its description, and for each joint the link's body and the rotor's inertia [kg m^2]."""
+
+    path: Path
+    arm: ArmDescription
+    bodies: tuple[Body, ...]
+    armature: tuple[float, ...]
+    left_out: tuple[str, ...]
+    """What no description of a robot has a place for, in words."""
+
+
+def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
+    """From a run folder, which holds the URDF; raises ExportError."""
+    assert source.result.chain is not None
+    path = source.run / source.result.chain.urdf
+    try:
+        arm = read_urdf(path, [joint.name for joint in model.joints])
+    except ArmFileError as error:
+        raise ExportError(f"The URDF that the run was made with is needed: {error}.") from error
+    geometry = model.geometry
+    base = BaseParameters.of(Chain(geometry.rotation, geometry.translation, geometry.axis, geometry.gravity))
+    value = np.array([model.values[name] for name in base.names])
+    std = np.array([model.stds[name] for name in base.names])
+    rotors = np.array([max(model.values.get(f"armature_{n}", 0.0), 1e-3) for n in range(1, len(model.joints) + 1)])
+    found = nearest_links(base, value, std, arm.parameters, rotors)
+    said = []
+    if found.misfit > FAR:
+        said.append(
+            f"the identified values exactly: no links of real mass have them; the nearest are {found.misfit:.1f} "
+            "standard errors away"
+        )
+    bodies = tuple(_body(row) for row in found.links)
+    return ChainLinks(path, arm, bodies, tuple(found.armature.tolist()), (*said, *_left_out(model)))
+
+
+def _left_out(model: ChainArmModel) -> list[str]:
+    return [f"{name} = {value:.6g}" for name, value in model.values.items() if not name.startswith(_SAID)]
+
+
+def _body(link: np.ndarray) -> Body:
+    """Mass, centre and inertia about it, of a link's ten parameters."""
+    mass, centre = float(link[0]), link[1:4] / link[0]
+    about = np.zeros((3, 3))
+    about[np.triu_indices(3)] = link[4:]
+    about = about + np.triu(about, 1).T
+    return Body(mass, centre, about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre)))

@@ -1,0 +1,190 @@
+"""An arm in space from its TOML to its result, model and exports, on the fake bus."""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import mujoco
+import numpy as np
+import pytest
+
+import hil
+from hil.chain_model import ChainArmModel
+from hil.config.schema import Config, load_config, parse_config
+from hil.description.urdf import read_urdf
+from hil.errors import ConfigError
+from hil.estimation.compare import compare_run
+from hil.estimation.settled_estimate import estimate_run
+from hil.estimation.unsettled_estimate import estimate_unsettled
+from hil.estimator.chain.dynamics import inverse_dynamics
+from hil.estimator.chain.geometry import Chain, parameter_names
+from hil.experiment.run import run_experiment
+from hil.export.formats import export
+from hil.plan.chain_plan import make_chain_plan, plan_of
+from hil.results.result import SettledResult
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
+
+FOUR = CONFIGS / "fake_open_manipulator_x.toml"
+TEXT = FOUR.read_text(encoding="utf-8")
+
+
+def short(folder: Path) -> Config:
+    """Five seconds a period, the URDF beside it."""
+    (folder / "open_manipulator_x_like.urdf").write_bytes((CONFIGS / "open_manipulator_x_like.urdf").read_bytes())
+    (folder / "arm.toml").write_text(TEXT.replace("period = 10.0", "period = 5.0"), encoding="utf-8")
+    return load_config(folder / "arm.toml")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    config = short(tmp_path_factory.mktemp("config"))
+    run = RunFolder.create(tmp_path_factory.mktemp("runs") / "run", config)
+    run_experiment(config, run, config.path, lambda _: None)
+    return run
+
+
+@pytest.fixture(scope="module")
+def result(run: RunFolder) -> SettledResult:
+    return estimate_run(run)
+
+
+def test_it_finds_what_the_fake_arm_was_built_with(result: SettledResult) -> None:
+    assert result.truth is not None
+    away = {name: (found.value - result.truth[name]) / found.std for name, found in result.parameters.items()}
+    assert np.mean(np.abs(list(away.values())) < 1.96) > 0.85
+    for joint in range(1, 5):
+        for term in ("viscous", "coulomb"):
+            name = f"{term}_{joint}"
+            assert result.parameters[name].value == pytest.approx(result.truth[name], rel=0.02)
+    assert result.parameters["moment_z_2"].value == pytest.approx(result.truth["moment_z_2"], rel=0.005)
+    assert result.chain is not None
+    assert result.chain.groups["moment_x_3"] == "moment_x_3 + 0.124 mass_4"
+
+
+def test_residual_prediction_and_verdict(result: SettledResult) -> None:
+    assert max(result.fit.residual_rms_ticks) < 0.31
+    assert result.validation.held_out_rms is not None
+    assert max(result.validation.held_out_rms) < 0.01
+    assert result.verdict.trust in ("yes", "with care")
+
+
+def test_it_starts_and_ends_where_the_arm_lies(run: RunFolder) -> None:
+    config = run.load_config()
+    samples = load_samples(run.samples_path, 4)
+    rest = np.array(config.arm.rest_pose)
+    np.testing.assert_allclose(samples["position"][0], rest, atol=0.05)
+    np.testing.assert_allclose(samples["position"][-1], rest, atol=0.05)
+    assert np.abs(samples["velocity"][-1]).max() < 0.1
+    lows, highs = np.array([joint.position_limit for joint in config.joints]).T
+    assert np.all((samples["position"] > lows) & (samples["position"] < highs))
+
+
+def test_the_result_is_read_back_as_a_model(run: RunFolder, result: SettledResult) -> None:
+    model = hil.load_model(run.path)
+    assert isinstance(model, ChainArmModel)
+    g = model.geometry
+    chain = Chain(g.rotation, g.translation, g.axis, g.gravity)
+    every = np.array([model.values.get(name, 0.0) for name in parameter_names(4)])
+    q, v, a = np.random.default_rng(1).standard_normal((3, 4, 30))
+    right = inverse_dynamics(chain, every, q, v, a)
+    np.testing.assert_allclose(model.rigid_body_torque(q.T, v.T, a.T).T, right, atol=1e-12)
+    back = model.forward_dynamics(q.T, v.T, model.inverse_dynamics(q.T, v.T, a.T))
+    np.testing.assert_allclose(back, a.T, atol=1e-8)
+    still = np.zeros_like(q)
+    np.testing.assert_allclose(model.gravity_torque(q.T).T, inverse_dynamics(chain, every, q, still, still), atol=1e-12)
+
+
+def test_exports_move_as_identified_and_keep_the_urdf(run: RunFolder, result: SettledResult, tmp_path: Path) -> None:
+    model = hil.load_model(run.path)
+    said = {name: export(run.path, name, tmp_path / f"arm.{name}").left_out for name in ("urdf", "mjcf")}
+    q, v, a = np.random.default_rng(2).standard_normal((3, 4))
+    right = model.rigid_body_torque(q, v, a)
+    for name in ("urdf", "mjcf"):
+        engine = mujoco.MjModel.from_xml_path(str(tmp_path / f"arm.{name}"))
+        engine.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        if name == "urdf":  # has no place for rotors, and says so
+            found = [float(text.split(" = ")[1].split()[0]) for text in said[name] if text.startswith("armature")]
+            engine.dof_armature[:] = found
+        engine.dof_damping[:] = 0.0
+        data = mujoco.MjData(engine)
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, v, a
+        mujoco.mj_inverse(engine, data)
+        np.testing.assert_allclose(data.qfrc_inverse, right, atol=2e-4)
+        assert engine.joint("joint3").damping == pytest.approx(0.0)
+    before, after = (
+        ET.parse(path).getroot() for path in (CONFIGS / "open_manipulator_x_like.urdf", tmp_path / "arm.urdf")
+    )
+    for tag in ("link", "joint"):
+        assert [each.get("name") for each in before.findall(tag)] == [each.get("name") for each in after.findall(tag)]
+    for name in ("origin", "axis", "limit", "parent", "child"):
+        for old, new in zip(before.findall("joint"), after.findall("joint"), strict=True):
+            kept = [None if each is None else each.attrib for each in (old.find(name), new.find(name))]
+            assert kept[0] == kept[1]
+    assert not read_urdf(tmp_path / "arm.urdf").doubts
+    dynamics = after.find("joint[@name='joint2']/dynamics")
+    assert dynamics is not None
+    assert float(dynamics.get("damping", 0)) == pytest.approx(model.values["viscous_2"])
+
+
+def test_exported_parameters_are_read_back(run: RunFolder, result: SettledResult, tmp_path: Path) -> None:
+    for name in ("toml", "json"):
+        path = tmp_path / f"arm.{name}"
+        export(run.path, name, path)
+        again = hil.load_model(path)
+        assert isinstance(again, ChainArmModel)
+        assert again.values == hil.load_model(run.path).values
+    assert json.loads((tmp_path / "arm.json").read_text())["chain"]["urdf"] == "open_manipulator_x_like.urdf"
+
+
+def test_what_is_not_there_yet_is_refused(run: RunFolder) -> None:
+    for command in (lambda: compare_run(run, False), lambda: estimate_unsettled(run)):
+        with pytest.raises(ConfigError, match="planar arms only"):
+            command()
+
+
+def test_no_real_arm_is_moved() -> None:
+    real = TEXT.replace('url = "fake://"', 'url = "/dev/ttyUSB0"')
+    with pytest.raises(ConfigError, match="not supported yet"):
+        plan_of(parse_config(real, FOUR))
+
+
+def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
+    config = load_config(FOUR)
+    plan = make_chain_plan(config)
+    assert [segment.role for segment in plan.segments] == ["identify", "held_out"]
+    first = plan.segments[0]
+    assert len(first.ramp_in) == len(first.ramp_out) == first.ramp_samples == 1200
+    # Continuous where the pieces meet.
+    joined = np.concatenate((first.ramp_in[-2:], first.period_current[:2]))
+    assert np.abs(np.diff(joined, axis=0)).max() < 0.2
+    joined = np.concatenate((first.period_current[-2:], first.ramp_out[:2]))
+    assert np.abs(np.diff(joined, axis=0)).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "joint2"', 'name = "elbow"', 'no joint "elbow"'),
+        ("swing = [0.9", "swing = [3.9", "outside its position_limit"),
+        ("speed = [4.8", "speed = [48.0", "velocity_limit"),
+        ("[experiment]", "[experiment]\npilot = true", "only planar arms have a pilot"),
+        ('friction = "stribeck"', 'friction = "auto"', "only for planar arms yet"),
+        ('drive = "lag"', 'drive = "lag"\nripple = true', "model.ripple = true"),
+        ("[stabiliser]", "[stabilizer]", "stabili"),
+        ('urdf = "open_manipulator_x_like.urdf"\nrest', 'urdf = "none.urdf"\nrest', "cannot be read"),
+        ('urdf = "open_manipulator_x_like.urdf"\nrest', "rest", "arm.urdf"),
+        ("centre = [0.0, -0.3, 0.3, 0.2]", "centre = [0.0]", "joint_path.centre has 1 entries"),
+    ],
+)
+def test_a_wrong_description_is_named(old: str, new: str, message: str) -> None:
+    assert old in TEXT
+    with pytest.raises(ConfigError, match=message):
+        parse_config(TEXT.replace(old, new, 1), FOUR)
+
+
+def test_too_little_torque_for_the_path_is_named() -> None:
+    weak = TEXT.replace("current_limit = 1.2", "current_limit = 0.3")
+    with pytest.raises(ConfigError, match="needs about"):
+        make_chain_plan(parse_config(weak, FOUR))
