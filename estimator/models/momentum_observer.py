@@ -75,7 +75,11 @@ class MomentumObserver:
         floor = np.zeros(2)
         floor[:joints] = FLOOR_SHARE * largest
         self._constants = np.concatenate(
-            ([joints, interval, *floor], (_LEAST_DRIFT**2 * np.diag(covariance)), (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2)
+            (
+                [joints, interval, *floor],
+                (_LEAST_DRIFT**2 * np.diag(covariance)),
+                (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2,
+            )
         )
         self.observe((0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf)  # compiled, and begun anew
 
