@@ -536,7 +536,7 @@ def _url_of(port: str) -> str:
     if "://" in port:
         return port
     config = find_config(Path(port))
-    if config.suffix == ".toml":
+    if config.suffix == ".toml" or config.is_file():
         return load_config(config).url
     arm = find_arm(port)
     return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port
