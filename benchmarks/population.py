@@ -3,8 +3,8 @@
     python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--jobs N] [--json] [--keep DIR]
 
 The distribution stands in benchmarks/population_arms.py. Each arm is identified by `hil identify` in a process of its
-own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto", for
-tests.
+own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto",
+for tests.
 
 finished              share that ended with a result, nobody helping
 beyond_limit          arms that went farther beyond a position limit than hil.dry_run.stopping_distance predicts

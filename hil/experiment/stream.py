@@ -142,8 +142,8 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} of what only "
-            "drifts. Look for play, a dragging cable or a slipping joint; or raise "
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} of what only drifts. Look for play, a "
+            "dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 

@@ -19,7 +19,9 @@ def change(old: str, new: str) -> str:
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_ready_file_is_right(path: Path) -> None:
     config = load_config(path)
-    assert len(config.joints) == len(config.experiment.peak_torque or config.arm.link_lengths or config.joint_path.centre)
+    assert len(config.joints) == len(
+        config.experiment.peak_torque or config.arm.link_lengths or config.joint_path.centre
+    )
 
 
 @pytest.mark.parametrize(
