@@ -54,7 +54,8 @@ class StatusCheck:
         if status.watchdog == _TRIPPED:
             return Cause.WATCHDOG, (
                 "has lost its torque: its watchdog acted (Bus Watchdog reads 255), so it heard nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Look at its plug and wire."
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms: look at its plug and wire, "
+                "or the computer kept this program waiting."
             )
         if status.watchdog == 0 and self._may_be_unwatched:
             return None
