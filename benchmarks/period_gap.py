@@ -80,6 +80,7 @@ def measure(rate: float, period: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "samples.npy", 2, plan.capacity) as recorder:
         stream = Stream(bus, plan, config, recorder, StopRequest(), lambda _: None, lambda _: None)  # type: ignore[arg-type]
         # A stand-in obeys no mechanics: the model looks at every sample, and what it says is not listened to.
+        assert stream._model is not None
         stream._model._raise = lambda *_: None  # type: ignore[method-assign,assignment]
         gc.collect()
         gc.disable()

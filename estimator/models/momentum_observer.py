@@ -10,9 +10,10 @@ R. Mattone, "Sensorless robot collision detection and hybrid force/motion contro
 ensemble of arms; from sample to sample they are learnt (recursive least squares, that is, a Kalman filter on constants
 that drift slowly). So what the arm may do is wide for an arm hardly known, and narrows as it moves.
 
-Alarm: for `HOLD_S` (less where it is much) the torque lacking in a joint is more than `TIMES` standard deviations of what parameters and noise
-leave open, more than friction can hold while the joint stands, and more than a share of the largest planned torque.
-Noise is learnt too: what the model lacks (Stribeck friction, play, flexibility) widens what is allowed.
+Alarm: for `HOLD_S` (less where it is much) the torque lacking in a joint is more than `TIMES` standard deviations of
+what parameters and noise leave open, more than friction can hold while the joint stands, and more than a share of the
+largest planned torque. Noise is learnt too: what the model lacks (Stribeck friction, play, flexibility) widens what is
+allowed.
 """
 
 import math
@@ -74,13 +75,8 @@ class MomentumObserver:
         self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * largest) ** 2
         floor = np.zeros(2)
         floor[:joints] = FLOOR_SHARE * largest
-        self._constants = np.concatenate(
-            (
-                [joints, interval, *floor],
-                (_LEAST_DRIFT**2 * np.diag(covariance)),
-                (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2,
-            )
-        )
+        drift = _LEAST_DRIFT**2 * np.diag(covariance)
+        self._constants = np.concatenate(([joints, interval, *floor], drift, (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2))
         self.observe((0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf)  # compiled, and begun anew
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:

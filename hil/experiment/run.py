@@ -174,8 +174,9 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
         )
     if bus.port.latency_measured:
         raise WrongSetting(
-            f"experiment.rate = {rate:g}: replies lie {bus.port.latency * 1e3:.0f} ms in this adapter, as measured, "
-            f"which leaves {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short latency."
+            f"experiment.rate = {rate:g}: replies lie {bus.port.latency * 1e3:.0f} ms in this adapter, as "
+            f"measured, which leaves {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short "
+            "latency, such as a U2D2."
         )
 
 

@@ -72,7 +72,7 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._guard = Guard(config, planned)
-        # Arms in space have no watch by a model yet, and are played on the fake bus only.
+        # Of a chain there is no such model yet: position, velocity, current and status are what is looked at.
         self._model = None if config.is_chain else ModelWatch(config, planned, arms)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
