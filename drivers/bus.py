@@ -64,7 +64,7 @@ class BusConfig:
     def __post_init__(self) -> None:
         ids = [drive.id for joint in self.joints for drive in joint.drives]
         if len(set(ids)) < len(ids):
-            raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}: each needs one of its own.")
+            raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}: each needs its own ID.")
 
     def is_same_arm(self, other: "BusConfig") -> bool:
         """Whether both are the same servos on the same port."""
@@ -89,10 +89,11 @@ class TorqueOff:
         if alone:
             return (
                 f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
-                "Watchdog and may go on with its last current: cut the supply now."
+                "Watchdog and may keep its last current: cut the supply now."
             )
         return (
-            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that hears nothing, but cut the "
+            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, but cut "
+            "the "
             "supply before you reach into the arm."
         )
 
@@ -433,7 +434,7 @@ def _write_surely(servo: Servo, register: str, value: int, interrupts: list[Base
             interrupts.append(interrupt)
         else:
             return None
-    return "It was interrupted again and again."
+    return "It was interrupted repeatedly."
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

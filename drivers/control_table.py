@@ -72,7 +72,7 @@ def _folder() -> Path:
     spec = find_spec("dynamixel_easy_sdk")
     if spec is None or spec.origin is None:
         raise UnknownModel(
-            "The package dynamixel-sdk (4.1 or newer), which holds the control tables, is not installed."
+            "The package dynamixel-sdk (4.1 or newer), which provides the control tables, is not installed."
         )
     return Path(spec.origin).parent / "control_table"
 

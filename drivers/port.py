@@ -213,7 +213,9 @@ class DescriptorPort(Port):
 
     def _check_alive(self, received: bytes) -> None:
         if not received:
-            raise OSError("the device is ready but gives nothing; it is gone, or another program reads from it")
+            raise OSError(
+                "the device reports data but returns none; it was unplugged, or another program reads from it"
+            )
 
     def _write_rest(self, data: bytes) -> None:
         """Write what the device did not take at once, as it makes room."""
@@ -222,7 +224,7 @@ class DescriptorPort(Port):
             while data:
                 remaining = deadline - time.perf_counter()
                 if remaining <= 0:
-                    raise TimeoutError(f"it takes no more bytes, {len(data)} are left")
+                    raise TimeoutError(f"it accepts no more bytes; {len(data)} were not sent")
                 if select.select([], [self._descriptor], [], remaining)[1]:
                     data = data[os.write(self._descriptor, data) :]
         except (OSError, ValueError) as error:

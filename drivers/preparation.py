@@ -67,8 +67,8 @@ def check_quiet(port: Port) -> None:
 def shared(what: str) -> BusShared:
     """The error of a bus on which another master does something."""
     return BusShared(
-        f"Another master {what} on this bus, or the adapter has an echo of what this program sends. Two masters talk "
-        "into each other's packets, and its goals would move the arm too: end that program, or unplug that controller."
+        f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
+        "other's packets, and the other's goals would move the arm too: end that program, or unplug that controller."
     )
 
 
@@ -84,19 +84,19 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     drive_mode = servo.read("Drive Mode")
     if drive_mode & ~TIME_BASED_PROFILE:
         raise WrongSetting(
-            f"{joint.title}: Drive Mode is {drive_mode}, 0 is needed (no reverse, no torque on by goal). "
-            "Set it to 0 with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
+            f"{joint.title}: Drive Mode is {drive_mode}, it must be 0 (no reverse, no torque on by goal "
+            "update). Set it with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
         )
     secondary = servo.read("Secondary(Shadow) ID")
     if secondary in others:
         raise WrongSetting(
-            f"{joint.title}: its Secondary ID is {secondary}, so it does what is told to that servo too. Give it none: "
+            f"{joint.title}: its Secondary ID is {secondary}, so it also obeys commands to that servo. Remove it: "
             f"hil setup {servo.port.url} --id {joint.id} --secondary-id 255."
         )
     if arms_itself(servo):
         raise WrongSetting(
-            f"{joint.title}: Startup Configuration turns its torque on by itself whenever it is switched on or "
-            "reboots. Set that register to 0 with DYNAMIXEL Wizard 2.0."
+            f"{joint.title}: Startup Configuration switches its torque on at every power-up or "
+            "reboot. Set that register to 0 with DYNAMIXEL Wizard 2.0."
         )
     if servo.read("Operating Mode") != joint.mode:
         servo.write("Operating Mode", joint.mode)
@@ -111,5 +111,5 @@ def fault_text(joint: Joint, cause: str) -> str:
     """What to say of a servo that raised its alert."""
     return (
         f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
-        "find the cause, then switch its supply off and on."
+        "find the cause, then power-cycle it."
     )

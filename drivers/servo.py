@@ -124,12 +124,12 @@ class Servo:
         if result == COMM_RX_TIMEOUT:
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "
-                "and its cable; `hil scan` finds it at another ID or baud."
+                "and its cable; `hil scan` finds it at another ID or baud rate."
             )
         if result != COMM_SUCCESS:
             text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!. ").lower()
             raise WrongReply(
-                f"{self.title}: {what} failed: what comes back is damaged, or no answer to it ({text}). Look at "
+                f"{self.title}: {what} failed: the reply is corrupted or does not match the request ({text}). Check "
                 f"its cable and supply, and for a second servo with ID {self.id}."
             )
         refused = error & ~ALERT

@@ -53,7 +53,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     Raises WrongSetting while torque is on, else as `Servo.write`; everything that can be written is then written.
     """
     if servo.read("Torque Enable"):
-        raise WrongSetting(f"{servo.title}: its settings cannot be put back while its torque is on.")
+        raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
     if servo.read("Bus Watchdog") != 0:
         servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
     written: dict[str, tuple[int, int]] = {}

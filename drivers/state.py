@@ -180,11 +180,11 @@ class Converter:
 
     def _wrong(self, goals: Sequence[float]) -> ValueError:
         if len(goals) != len(self._joints):
-            return ValueError(f"{len(goals)} goals for {len(self._joints)} joints: one for each is needed.")
+            return ValueError(f"{len(goals)} goals for {len(self._joints)} joints: give one for each.")
         for joint, goal in zip(self._joints, goals, strict=True):
             if not abs(goal) < float("inf"):
                 return ValueError(
-                    f"{joint.title} was given a goal of {goal} {joint.mode.goal_unit}: that is no number."
+                    f"{joint.title} was given a goal of {goal} {joint.mode.goal_unit}: that is not a number."
                 )
         return ValueError(f"goals {list(goals)} cannot be sent.")
 

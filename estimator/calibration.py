@@ -53,7 +53,7 @@ class KnownMass:
         if not (self.mass > 0.0 and self.distance > 0.0 and self.inertia >= 0.0):
             raise ModelError(
                 f"a mass of {self.mass:g} kg at {self.distance:g} m with inertia {self.inertia:g} kg m^2: mass and "
-                "distance must be positive, inertia not negative"
+                "distance must be positive, inertia non-negative"
             )
         M, d, g = self.mass, self.distance, gravity
         about = self.inertia + M * d**2

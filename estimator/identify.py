@@ -175,5 +175,5 @@ def predict(
         state = end
     raise PeriodicityError(
         f"after {settling.max_periods} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "
-        "the next: lower the torque, or look at the friction that was identified"
+        "the next: lower the torque, or check the identified friction"
     )

@@ -25,7 +25,7 @@ def _read(path: Path) -> dict[str, Any]:
     file = _file(path)
     if path.is_dir() and not file.is_file():
         raise ResultError(
-            f"{path} holds no result.json: its identification did not finish. If it holds samples.npy, run "
+            f"{path} has no result.json: its identification did not finish. If it has samples.npy, run "
             f"hil estimate {path}."
         )
     try:
@@ -36,15 +36,13 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         result = tomllib.loads(text) if file.suffix == ".toml" else json.loads(text)
     except ValueError as error:
-        raise ResultError(
-            f"{file}: is half written or damaged: {error}. Make it anew with hil estimate RUN."
-        ) from error
+        raise ResultError(f"{file}: is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:
-        raise ResultError(f"{file}: is no result of hil: it has no schema.")
+        raise ResultError(f"{file}: is not a result file of hil: it has no schema.")
     if result["schema"] != SCHEMA:
         raise ResultError(
             f"{file}: schema {result['schema']!r} is not {SCHEMA}, which this hil reads; it was written by "
-            f"{'a newer' if _newer(result['schema']) else 'another'} hil. Install that one, or estimate again."
+            f"{'a newer' if _newer(result['schema']) else 'another'} hil. Install that version, or estimate again."
         )
     return result
 
@@ -61,7 +59,9 @@ def read_settled_result(path: Path) -> SettledResult:
     """The same, of an estimate from settled periods; raises ResultError for any other."""
     result = read_result(path)
     if not isinstance(result, SettledResult):
-        raise ResultError(f"{path}: was estimated without a settled period, by multiple shooting, and this needs one.")
+        raise ResultError(
+            f"{path}: was estimated by multiple shooting without a settled period; this command needs one."
+        )
     return result
 
 
@@ -125,14 +125,16 @@ def _file(path: Path) -> Path:
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
     """Every term must be there and known: a model that left one out would be wrong without a word."""
     if joints not in RIGID_BODY:
-        raise ResultError(f"{path}: an arm of {joints} joints; this hil has models of one and two.")
+        raise ResultError(f"{path}: an arm of {joints} joints; this version of hil has models of one and two.")
     needed = set(base_names(joints))
     possible = {*needed, *extra_names(joints)}
     missing, unknown = sorted(needed - values.keys()), sorted(values.keys() - possible)
     if missing:
         raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     if unknown:
-        raise ResultError(f"{path}: has {', '.join(unknown)}, which this hil does not know; a newer one wrote it.")
+        raise ResultError(
+            f"{path}: has {', '.join(unknown)}, which this version of hil does not know; a newer one wrote it."
+        )
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:
         raise ResultError(f"{path}: {', '.join(bad)} is not a finite number. Run hil estimate again.")

@@ -30,7 +30,7 @@ def describe(error: ValidationError, path: Path | str, root: type[BaseModel], ta
     if len(faults) == 1:
         return f"{path}: {faults[0]}" + ("" if faults[0].endswith("?") else ".")
     lines = "".join(f"\n  {fault}" for fault in faults)
-    return f"{path}: {len(faults)} faults:{lines}"
+    return f"{path}: {len(faults)} errors:{lines}"
 
 
 def _fault(detail: Any, root: type[BaseModel], table: str) -> str:

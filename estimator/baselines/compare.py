@@ -127,7 +127,7 @@ def _best(
         peer = Peer(name, parameters, std, seconds, words.format(*setting), len(settings))
         found.append((_misfit(recording, parameters), peer))
     if not found:
-        raise EstimationError(f"{name} failed with every one of its {len(settings)} settings")
+        raise EstimationError(f"{name} failed with all {len(settings)} of its settings")
     return min(found, key=lambda pair: pair[0])[1]
 
 

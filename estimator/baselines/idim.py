@@ -121,7 +121,8 @@ def _solve(Y: Array, tau: Array, weight: Array) -> tuple[Array, Array]:
     U, size, Vt = np.linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
     if size[-1] * WORST_CONDITION < size[0] or np.any(norm == 0.0):
         raise UnidentifiableError(
-            "filtered inverse dynamics: the motion does not tell parameters apart; move both joints, faster and further"
+            "filtered inverse dynamics: the motion does not separate the parameters; move both joints, faster and "
+            "farther"
         )
     theta = Vt.T @ ((U.T @ b) / size)
     left = b - A @ (theta / norm)

@@ -81,7 +81,9 @@ def fit_by_kalman(
         padded[:, :joints] = torque
         run(x, P, noise, recording.noise**2, position, padded, intervals, substeps, scale, slots, fixed, coulomb_width)
         if not np.all(np.isfinite(x)):
-            raise ConvergenceError(f"the {kind.upper()} diverged: raise its velocity noise or start it nearer")
+            raise ConvergenceError(
+                f"the {kind.upper()} diverged: raise its velocity noise or use a better initial guess"
+            )
         theta = x[2 * joints :]
     std = np.sqrt(np.maximum(np.diag(P)[2 * joints :], 0.0))
     return Filtered(names, theta * scale, std * scale)

@@ -33,14 +33,14 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     coupling = length gravity_2 / gravity is the fourth equation. Raises ModelError without gravity or length.
     """
     if gravity <= 0.0:
-        raise ModelError("the paper's method linearises about hanging: without gravity there is nothing to hang from")
+        raise ModelError("the paper's method linearises about hanging: without gravity there is no such equilibrium")
     lines = lines_of(period.filled())
     count = cut_off(lines) + 1
     Q = lines[:, 1:count]
     torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, 1:count]
     s = 1j * period.fundamental * np.arange(1, count)
     swing = np.degrees(np.ptp(period.filled(), axis=1))
-    remark = f"linear about hanging; the joints swing {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
+    remark = f"linearised about hanging; the joints swing {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
     if period.joints == 1:
         A = np.stack((s * s * Q[0], s * Q[0], Q[0]), axis=1)
         x, covariance = _solve(A, torque[0])

@@ -45,7 +45,8 @@ def design_path(
     if count < 2 or highest > rate / 8 or min(swing.min(), speed.min()) <= 0.0:
         raise ExcitationError(
             f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s, swing {swing.min():g} "
-            f"rad, speed {speed.min():g} rad/s: it needs two harmonics, below an eighth of the rate, and room to move"
+            f"rad, speed {speed.min():g} rad/s: needs at least two harmonics below an eighth of the rate, and a "
+            "positive swing and speed"
         )
     rng = np.random.default_rng(seed)
     paths = [_candidate(rng, rate, period, count, centre, swing, speed) for _ in range(CANDIDATES)]

@@ -46,7 +46,7 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
             motor = motor + (command - motor) * fallen
         position, _ = simulation.go_on(ChainRun(torque, slopes, missing, step), slice(0, 1))
         if position is None:
-            raise PeriodicityError("under these parameters the simulated arm runs away from the motion")
+            raise PeriodicityError("with these parameters the simulated arm diverges from the measured motion")
         positions[:, k % samples] = position[0]
     return positions
 

@@ -25,7 +25,7 @@ def period_difference(position: Array) -> Settling:
     ShapeError for fewer than two periods.
     """
     if position.ndim != 3 or position.shape[0] < 2:
-        raise ShapeError(f"position is {position.shape}: it must be (periods, joints, samples), two periods or more")
+        raise ShapeError(f"position is {position.shape}: must be (periods, joints, samples) with at least two periods")
     difference = _rms(np.diff(position, axis=0))
     later = position[1:]
     seen = np.isfinite(later)

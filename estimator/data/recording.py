@@ -113,22 +113,22 @@ def _check_times(recording: Recording) -> None:
     time = recording.time
     bad = np.nonzero(~np.isfinite(time))[0]
     if bad.size:
-        raise RecordingError(f"time of sample {bad[0] + 1} is not finite: leave out the samples without a time")
+        raise RecordingError(f"time of sample {bad[0] + 1} is not finite: remove the samples without a time")
     step = np.diff(time)
     if np.any(step <= 0.0):
         k = int(np.argmax(step <= 0.0))
         raise RecordingError(
-            f"time goes from {time[k]:g} to {time[k + 1]:g} s at sample {k + 2}: it must ascend; sort the samples "
-            "and leave out doubles"
+            f"time goes from {time[k]:g} to {time[k + 1]:g} s at sample {k + 2}: it must increase; sort the samples "
+            "and remove duplicates"
         )
     if float(np.median(step)) > MOST_GAP:
         raise RecordingError(
-            f"samples are {float(np.median(step)):.3g} s apart, at most {MOST_GAP:g} s are of use: is time in seconds?"
+            f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is usable: is time in seconds?"
         )
     if step.max() > 5.0 * MOST_GAP:
         k = int(np.argmax(step))
         raise RecordingError(
-            f"{step[k]:.3g} s are missing after sample {k + 1} at {time[k]:g} s: cut the recording there into two"
+            f"{step[k]:.3g} s are missing after sample {k + 1} at {time[k]:g} s: split the recording there"
         )
 
 
@@ -136,14 +136,14 @@ def _check_values(recording: Recording) -> None:
     if not (np.all(recording.position_step > 0.0) and np.isfinite(recording.command_to_sample)):
         raise RecordingError(f"position_step {recording.position_step} rad must be positive, command_to_sample finite")
     if not recording.torque.any():
-        raise RecordingError("all torques are 0: without torque only ratios of parameters can be found")
+        raise RecordingError("all torques are 0: without torque nothing fixes the scale of the parameters")
     for joint in range(recording.joints):
         torque, position = recording.torque[joint], recording.position[joint]
         bad = np.nonzero(~np.isfinite(torque))[0]
         if bad.size:
             raise RecordingError(
                 f"joint {joint + 1}: {bad.size} torques are not finite, the first at sample {bad[0] + 1}, "
-                f"{recording.time[bad[0]]:g} s: cut the recording there or fill in what was commanded"
+                f"{recording.time[bad[0]]:g} s: cut the recording there or fill in the commanded values"
             )
         valid = np.isfinite(position)
         if float(np.mean(valid)) < LEAST_VALID:

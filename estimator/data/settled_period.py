@@ -125,7 +125,7 @@ def _check_values(period: SettledPeriod) -> None:
         if received < LEAST_VALID:
             raise RecordingError(
                 f"joint {joint + 1}: {100 * received:.0f} % of {period.samples} samples were received, at "
-                f"least {100 * LEAST_VALID:.0f} % are needed: look at the bus before you record again"
+                f"least {100 * LEAST_VALID:.0f} % are needed: check the bus before you record again"
             )
 
 
@@ -146,5 +146,5 @@ def _check_motion(period: SettledPeriod) -> None:
         if gap > most:
             raise RecordingError(
                 f"joint {joint + 1} ends the period {gap:.3g} rad from where it began, more than {most:.3g} rad: it "
-                "turned over or has not settled; lower the peak torque or wait longer"
+                "went over the top or has not settled; lower the peak torque or wait longer"
             )

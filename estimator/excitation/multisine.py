@@ -136,7 +136,7 @@ def _whole_samples(rate: float, period: float) -> int:
     if samples < 1 or abs(samples - rate * period) > 1e-6:
         raise ExcitationError(
             f"a period of {period:g} s at {rate:g} samples/s is {rate * period:g} samples: "
-            "choose a period that is a whole number of them"
+            "choose a period that is a whole number of samples"
         )
     return samples
 
@@ -150,11 +150,11 @@ def _check_lines(lines: Sequence[Sequence[int]], samples: int) -> None:
             if not 0 < line < samples / 2:
                 raise ExcitationError(
                     f"line {line} of joint {joint} is outside 1 to {(samples - 1) // 2}, "
-                    f"what {samples} samples can carry"
+                    f"the range that {samples} samples can represent"
                 )
             if line in taken:
                 raise ExcitationError(
-                    f"line {line} is given to joint {taken[line]} and joint {joint}: each must belong to one"
+                    f"line {line} is given to joint {taken[line]} and joint {joint}: each line must belong to one joint"
                 )
             taken[line] = joint
 

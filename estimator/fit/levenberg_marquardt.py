@@ -77,7 +77,7 @@ def minimise(
     """
     x, here = start, evaluate(start) if at is None else at
     if not np.isfinite(here.cost):
-        raise ConvergenceError("the starting values give no finite motion: check the torque and the period's units")
+        raise ConvergenceError("the initial guess gives no finite motion: check the torque and the period's units")
     damping = options.initial_damping if damping is None else damping
     evaluations = int(at is None)
     gained = np.inf
@@ -95,7 +95,7 @@ def minimise(
         return Minimum(x, here, evaluations)
     raise ConvergenceError(
         f"after {options.max_iterations} iterations the sum of squares, {here.cost:.4g}, still falls by {gained:.2g} "
-        "in each: try a simpler model or data with more motion"
+        "per iteration: try a simpler model or data with more motion"
     )
 
 

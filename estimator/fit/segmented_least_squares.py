@@ -136,7 +136,7 @@ def minimise_segmented(
         rows = _residuals(residual, shared, own, threads)
         cost = _cost(rows)
         if not np.isfinite(cost):
-            raise ConvergenceError("the starting values give no finite motion: check the units of torque and time")
+            raise ConvergenceError("the initial guess gives no finite motion: check the units of torque and time")
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):
             blocks = _blocks(derivative, shared, own, threads)
@@ -156,8 +156,8 @@ def minimise_segmented(
                 information, scores, _, _ = blocks.reduced(0.0)
                 return Segmented(shared, own, cost, information, scores, iteration)
     raise ConvergenceError(
-        f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} in "
-        "each: try a simpler friction model or shorter segments"
+        f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} per "
+        "iteration: try a simpler friction model or shorter segments"
     )
 
 
@@ -179,9 +179,7 @@ def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPo
     normal = np.stack([product[0] for product in products])
     gradient = np.stack([product[1] for product in products])
     if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
-        raise ConvergenceError(
-            "a simulated motion runs away: check the units, signs and directions of torque and angle"
-        )
+        raise ConvergenceError("a simulated motion diverges: check the units, signs and directions of torque and angle")
     n = shared.size
     return _Blocks(normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:], gradient[:, :n], gradient[:, n:])
 

@@ -52,7 +52,7 @@ def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> Lin
     """
     joints = periods[0].joints
     if any(period.joints != joints for period in periods):
-        raise ShapeError(f"periods of {[period.joints for period in periods]} joints: they must be of one arm")
+        raise ShapeError(f"periods of {[period.joints for period in periods]} joints: they must be of the same arm")
     lines = [lines_of(period.filled()) for period in periods]
     harmonics = tuple(map(cut_off, lines))
     motions = tuple(
@@ -95,7 +95,7 @@ def _solve(columns: Lines, torque: Lines, weight: Array, max_condition: float) -
     if size[-1] * max_condition < size[0]:
         raise UnidentifiableError(
             f"the regression's condition is {size[0] / max(size[-1], 1e-300):.2g}, at most "
-            f"{max_condition:.0e} can be solved: the motion does not tell parameters apart; "
+            f"{max_condition:.0e} can be solved: the motion does not separate the parameters; "
             "excite more lines or raise the torque"
         )
     theta = Vt.T @ ((U.T @ b) / size)

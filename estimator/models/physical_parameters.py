@@ -198,13 +198,13 @@ def _doubts(
 ) -> tuple[str, ...]:
     doubts = [
         f"{name} comes out as {number:.4g}, {abs(number) / max(std[name], 1e-300):.1f} standard errors below zero: a "
-        "known quantity is wrong, or a torque constant"
+        "known quantity or a torque constant is wrong"
         for name, number in value.items()
         if number < 0.0 and not name.startswith("centre") and -number > 2.0 * std[name]
     ]
     if misfit > CONTRADICTION:
         doubts.append(
             f"the known quantities ({', '.join(known)}) and the data contradict each other by {misfit:.0f} standard "
-            "errors: measure again, or give each its std"
+            "errors: measure again, or give each a std"
         )
     return tuple(doubts)

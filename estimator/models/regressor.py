@@ -29,7 +29,7 @@ def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_wid
     if not position.shape == velocity.shape == acceleration.shape:
         raise ShapeError(
             f"position {position.shape}, velocity {velocity.shape} and acceleration {acceleration.shape} "
-            "must have one shape (joints, samples)"
+            "must all have the shape (joints, samples)"
         )
     joints, samples = position.shape
     Y = np.zeros((joints, samples, len(base_names(joints))))

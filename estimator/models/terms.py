@@ -34,15 +34,15 @@ FRICTIONS: tuple[Friction, ...] = get_args(Friction)
 DRIVES: dict[Drive, tuple[str, ...]] = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 """The drive's terms."""
 OPTIONS: dict[Option, str] = {
-    "presliding": "dry friction that yields like a spring before it slides",
-    "asymmetry": "viscous friction that differs with direction",
-    "ripple": "torque ripple over the joint's angle",
-    "zeros": "errors of the joints' zeros; the first joint's shows only under gravity",
-    "torque_scale": "the ratio of the joints' torque constants; one of them has to be believed",
-    "saturation": "torque that falls behind the command the larger it is",
-    "cable": "a cable or spring that pulls the joint to one angle",
-    "encoder": "errors of the encoders that repeat once and twice a turn",
-    "lags": "current loops of two joints that do not lag alike",
+    "presliding": "presliding friction: elastic displacement before sliding",
+    "asymmetry": "direction-dependent viscous friction",
+    "ripple": "torque ripple over the joint angle",
+    "zeros": "joint zero offsets; the first joint's is observable only under gravity",
+    "torque_scale": "ratio of the joints' torque constants; one of them must be trusted",
+    "saturation": "torque saturation: torque falls short of large commands",
+    "cable": "a cable or spring that pulls the joint towards one angle",
+    "encoder": "encoder errors that repeat once and twice per turn",
+    "lags": "different lags of the two joints' current loops",
 }
 """What a model may have besides its laws of friction and drive, each in words: keys of `[model]` too."""
 
@@ -97,7 +97,7 @@ class Term:
 
 
 _DECLARED = (
-    Term("inertia", "kg m^2", "all that the joint turns", part="base", scale="inertia"),
+    Term("inertia", "kg m^2", "total inertia driven by the joint", part="base", scale="inertia"),
     Term(
         "coupling",
         "kg m^2",
@@ -111,20 +111,20 @@ _DECLARED = (
     Term(
         "armature",
         "kg m^2",
-        "rotor inertia through the gears, seen by its own joint only",
+        "reflected rotor inertia, felt by its own joint only",
         part="base",
         first_joint=2,
         scale="inertia",
         absent=1.0,
     ),
-    Term("gravity", "N m", "weight torque with the arm level", part="base", range="any", scale="torque"),
-    Term("viscous", "N m s/rad", "friction per speed", part="base", scale="damping"),
-    Term("coulomb", "N m", "dry friction while sliding", part="base", scale="torque"),
+    Term("gravity", "N m", "gravity torque with the arm horizontal", part="base", range="any", scale="torque"),
+    Term("viscous", "N m s/rad", "viscous friction coefficient", part="base", scale="damping"),
+    Term("coulomb", "N m", "Coulomb friction while sliding", part="base", scale="torque"),
     Term("offset", "N m", "constant torque", part="base", range="any", scale="torque"),
     Term(
         "coulomb_width",
         "rad/s",
-        "width of the step of dry friction",
+        "velocity width of the Coulomb friction step",
         part="coulomb",
         range="floor",
         scale=0.05,
@@ -135,7 +135,7 @@ _DECLARED = (
     Term(
         "stribeck_rise",
         "1",
-        "dry friction at low speed above Coulomb, as a fraction of it",
+        "Stribeck rise above Coulomb friction at low speed, as a fraction of it",
         part="stribeck",
         initial=0.2,
         max_step=1.0,
@@ -144,7 +144,7 @@ _DECLARED = (
     Term(
         "stribeck_velocity",
         "rad/s",
-        "speed at which that rise has fallen to 1/e",
+        "speed at which the Stribeck rise has fallen to 1/e",
         part="stribeck",
         scale="velocity",
         initial=0.2,
@@ -153,11 +153,11 @@ _DECLARED = (
         standstill=True,
         log_spread=1.0,
     ),
-    Term("load", "1", "dry friction per motor torque", part="stribeck_load", initial=0.02),
+    Term("load", "1", "Coulomb friction per motor torque", part="stribeck_load", initial=0.02),
     Term(
         "presliding_stiffness",
         "N m/rad",
-        "stiffness of dry friction before it slides",
+        "presliding stiffness",
         part="presliding",
         scale="stiffness",
         standstill=True,
@@ -165,7 +165,7 @@ _DECLARED = (
     Term(
         "presliding_damping",
         "N m s/rad",
-        "damping of dry friction before it slides",
+        "presliding damping",
         part="presliding",
         scale="damping",
         standstill=True,
@@ -173,7 +173,7 @@ _DECLARED = (
     Term(
         "viscous_asymmetry",
         "N m s/rad",
-        "viscous friction that differs with direction",
+        "direction-dependent viscous friction",
         part="asymmetry",
         range="share",
         share_of=("viscous", "viscous"),
@@ -181,12 +181,12 @@ _DECLARED = (
     ),
     Term("ripple_sin", "1", "torque ripple over the angle, sine part", part="ripple", range="any", scale=0.02),
     Term("ripple_cos", "1", "torque ripple over the angle, cosine part", part="ripple", range="any", scale=0.02),
-    Term("ripple_cycles", "1", "cycles of that ripple per turn", part="ripple", range="any", scale=0.02),
+    Term("ripple_cycles", "1", "ripple cycles per turn", part="ripple", range="any", scale=0.02),
     Term("zero", "rad", "true minus measured angle", part="zeros", range="any", scale=0.02, spread=0.04),
     Term(
         "torque_scale",
         "1",
-        "true over assumed torque, relative to joint 1",
+        "ratio of true to assumed torque, relative to joint 1",
         part="torque_scale",
         first_joint=2,
         initial=1.0,
@@ -196,7 +196,7 @@ _DECLARED = (
     Term(
         "saturation",
         "1/(N m)^2",
-        "share of the torque that is lost, per square of the torque",
+        "lost fraction of the torque, per torque squared",
         part="saturation",
         range="any",
         scale="saturation",
@@ -205,7 +205,7 @@ _DECLARED = (
     Term(
         "cable_stiffness",
         "N m/rad",
-        "torque of a cable per angle",
+        "cable stiffness",
         part="cable",
         range="any",
         scale="torque",
@@ -215,7 +215,7 @@ _DECLARED = (
         Term(
             f"encoder_{wave}_{times}",
             "rad",
-            f"measured minus true angle, {wave} part of what repeats {times} a turn",
+            f"measured minus true angle, {wave} part of the error that repeats {times} per turn",
             part="encoder",
             range="any",
             scale=1e-3,
@@ -228,7 +228,7 @@ _DECLARED = (
     Term(
         "lag_difference",
         "s",
-        "lag of the joint's current loop beyond joint 1's",
+        "lag of the joint's current loop relative to joint 1's",
         part="lags",
         first_joint=2,
         range="any",
@@ -239,7 +239,7 @@ _DECLARED = (
     Term(
         "delay",
         "s",
-        "delay of the torque",
+        "torque delay",
         part="delay",
         scope="arm",
         range="any",
@@ -279,7 +279,7 @@ def term_of(name: str) -> Term:
     try:
         return TERMS[kind_of(name)]
     except KeyError:
-        raise ModelError(f"{name}: no model has this parameter") from None
+        raise ModelError(f"{name}: not a parameter of any model") from None
 
 
 def joint_of(name: str) -> int | None:
@@ -290,7 +290,7 @@ def joint_of(name: str) -> int | None:
 def base_names(joints: int) -> tuple[str, ...]:
     """Names of the base parameters, in the order of every vector of them. Raises ModelError."""
     if joints not in RIGID_BODY:
-        raise ModelError(f"an arm of {joints} joints: the arm model has one or two")
+        raise ModelError(f"an arm of {joints} joints: the arm model has one or two joints")
     friction = (f"{term}_{joint + 1}" for term in BASE_FRICTION for joint in range(joints))
     return (*RIGID_BODY[joints], *friction)
 

@@ -89,7 +89,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
             error: Array = np.sqrt(np.nanmean((period.position - read) ** 2, axis=1)) / filled.std(axis=1)
             return error
         state = end
-    raise PeriodicityError(f"under these parameters the arm does not settle within {SETTLING.max_periods} periods")
+    raise PeriodicityError(f"with these parameters the arm does not settle within {SETTLING.max_periods} periods")
 
 
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:

@@ -62,7 +62,7 @@ class Choice:
     def estimate(self) -> Estimate:
         """Of the chosen model."""
         if self.chosen.estimate is None:
-            raise ConvergenceError(f"{self.chosen.model.description} could not be fitted to its last digits")
+            raise ConvergenceError(f"{self.chosen.model.description} did not converge to full precision")
         return self.chosen.estimate
 
     @property
@@ -165,7 +165,7 @@ class Selection:
         if best is None or self._left(best) > self._options.presliding_residual**2:
             best = self._better(self._try_or_none(smooth), best)
         if best is None:
-            raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
+            raise ConvergenceError("no friction model could be fitted: check the recording, or lower the torque")
         if self._left(best) > self._options.presliding_residual**2:
             best = self._better(self._try_or_none(smooth.having("presliding"), coarse=True), best) or best
         if not self._is_explained(best):

@@ -87,7 +87,7 @@ def choose_by_shooting(
         trials.append(tried(best.model.having(option)))
         best = trials[-1] if trials[-1].score < options.keep_ratio * best.score else best
     if best.held_out is None:
-        raise ConvergenceError("no friction model could be fitted: look at the recording and its units")
+        raise ConvergenceError("no friction model could be fitted: check the recording and its units")
     estimate = estimate_by_shooting(recordings, best.model, start, length=length, zeros=zeros)
     return SegmentChoice(tuple(trials), best, estimate)
 

@@ -33,8 +33,8 @@ IMPROVEMENT = {
     "viscous": "higher speeds: raise peak_torque",
     "coulomb": "more slow reversals: lower the lower edge of experiment.band, or lengthen the period",
 }
-ODD_HINT = "What it leaves on odd lines is friction or ripple that no term of the model has."
-EVEN_HINT = "What it leaves on even lines differs with direction, or comes from an offset in torque or angle."
+ODD_HINT = "Its residual on odd lines indicates friction or ripple that the model lacks."
+EVEN_HINT = "Its residual on even lines indicates an effect that depends on direction, or an offset in torque or angle."
 BEYOND_NOISE = 2.0
 
 Trust = Literal["yes", "with care", "no"]
@@ -110,7 +110,8 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence)
     joint = int(np.argmax(left))
     error = float(validation.levels.model_error.max())
     said = (
-        f"Joint {joint + 1} moves in a way that the model does not have: {left[joint]:.1f} times the noise is left, a "
+        f"Joint {joint + 1} moves in a way that the model cannot explain: its residual is {left[joint]:.1f} times the "
+        "noise, a "
         f"model error of {error:.2g} encoder steps RMS."
     )
     return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation)))
@@ -126,13 +127,12 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
     if not evidence.tried_all and estimate.model.friction != "stribeck_load":
         return 'No single term explains it; [model] friction = "auto" tries them together.'
     return (
-        "No term that this tool has explains it: play in the gears, a loose screw, a supply that sags or a cable that "
-        "drags would."
+        "No available term explains it. Possible causes: backlash, a loose screw, a sagging supply or a dragging cable."
     )
 
 
 def _in_words(part: str) -> str:
-    laws = {"stribeck": "friction that rises at low speed", "stribeck_load": "friction that grows with load"}
+    laws = {"stribeck": "friction that rises at low speed", "stribeck_load": "load-dependent friction"}
     return laws.get(part) or next(words for option, words in OPTIONS.items() if option == part)
 
 
@@ -140,18 +140,18 @@ def _spoilt(validation: Validation) -> str:
     """The parameters that what is missing may have spoilt, by their widened errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst:
-        return "It spoils none of the parameters: with it, each is known to 2 % or better."
+        return "It does not affect the parameters significantly: including it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
     listed = ", ".join(f"{name} ({100.0 * worst[name]:.2g} %)" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
-    return f"It may spoil {listed}{more}; the others stay within 2 %."
+    return f"It may bias {listed}{more}; the others stay within 2 %."
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
     """Where the excitation left lines out: what answers there, and what of it the model does not have."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        return ("Whether that is odd (friction) or even (offsets, direction), experiment.detection = true would tell.",)
+        return ("experiment.detection = true would show whether this is odd (friction) or even (offsets, direction).",)
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 
@@ -159,9 +159,11 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
         return f"{100.0 * float(level[joint] / driven[joint]):.2g} %"
 
     found = (
-        f"On lines that nothing drove, joint {joint + 1} answers with {share(levels.odd.motion)} of a driven line's "
-        f"motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, what differs "
-        f"with direction); noise is {share(levels.noise)}. The model leaves {share(levels.odd.left)} and "
+        f"On lines that were not excited, joint {joint + 1} responds with {share(levels.odd.motion)} of an excited "
+        "line's "
+        f"motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, "
+        "direction-dependent "
+        f"effects); noise is {share(levels.noise)}. The model leaves {share(levels.odd.left)} and "
         f"{share(levels.even.left)}."
     )
     beyond = [
@@ -177,8 +179,8 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
         return ()
     return tuple(
         f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {100.0 * abs(change):.2g} % within "
-        f"{drift.seconds:.0f} s, as it does while grease warms up: the values hold for the periods that were fitted. "
-        "Run it once more while it is warm for those of a warm arm."
+        f"{drift.seconds:.0f} s, as is typical while grease warms up: the values hold for the fitted periods. Repeat "
+        "the run while the arm is warm to obtain its warm values."
         for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
         if abs(change) > max(LEAST, 3.0 * std)
     )
@@ -186,18 +188,18 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
 
 def _predicted(held_out: Array | None) -> tuple[str, ...]:
     if held_out is None:
-        return ("No other motion checked it: set experiment.held_out = true.",)
+        return ("No held-out motion validated it: set experiment.held_out = true.",)
     worst = 100.0 * float(held_out.max())
-    return (f"It predicts a motion that it never saw to within {worst:.2g} % of that motion's RMS.",)
+    return (f"It predicts a held-out motion to within {worst:.2g} % of that motion's RMS.",)
 
 
 def _weak(validation: Validation) -> tuple[str, ...]:
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
-        return (f"Known least well is {name}, to {100 * part:.2g} %.",)
+        return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
     improvement = IMPROVEMENT[kind_of(name)]
-    return (f"Known least well is {name}, to {100 * part:.2g} % only. What would improve it is {improvement}.",)
+    return (f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}.",)
 
 
 def _alike(validation: Validation) -> tuple[str, ...]:
@@ -206,7 +208,7 @@ def _alike(validation: Validation) -> tuple[str, ...]:
     if abs(correlation) < ALIKE or both <= WELL_KNOWN:
         return ()
     return (
-        f"{first} and {second} are hard to tell apart (correlation {correlation:.3f}): excite more lines, or with "
+        f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more lines, or with "
         "more torque.",
     )
 
@@ -215,4 +217,6 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     # Where the model lacks something, what is far from it is no fault of the reading.
     if not estimate.outliers or not explained:
         return ()
-    return (f"{estimate.outliers} readings were far off and downweighted; if that goes on, look at cables and baud.",)
+    return (
+        f"{estimate.outliers} readings were outliers and downweighted; if this persists, check cables and baud rate.",
+    )

@@ -103,7 +103,7 @@ class Estimation(ShootingResult):
 
         names = self.covariance.names
         return draw_figures(
-            [Matrix("correlation", "Correlation of the parameters", names, correlations(self.covariance.array()))]
+            [Matrix("correlation", "Parameter correlations", names, correlations(self.covariance.array()))]
         )
 
 

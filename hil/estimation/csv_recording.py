@@ -47,10 +47,10 @@ def _read(path: Path) -> dict[str, Values]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CsvError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}.") from error
     if not header or not rows:
-        raise CsvError(f"{path}: is empty; it needs a line of column names and at least one of numbers.")
+        raise CsvError(f"{path}: is empty; it needs a header line and at least one line of numbers.")
     double = {name for name in header if header.count(name) > 1}
     if double:
-        raise CsvError(f"{path}: two columns are named {sorted(double)[0]!r}; give each its own name.")
+        raise CsvError(f"{path}: two columns are named {sorted(double)[0]!r}; rename one of them.")
     for number, row in enumerate(rows, start=2):
         if len(row) != len(header):
             raise CsvError(f"{path}, line {number}: {len(row)} fields for {len(header)} columns.")
@@ -71,7 +71,7 @@ def _column(path: Path, read: dict[str, Values], name: str) -> Values:
     values = read[name]
     bad = np.nonzero(np.isinf(values))[0]
     if bad.size:
-        raise CsvError(f"{path}, line {bad[0] + 2}: column {name!r} holds no number there.")
+        raise CsvError(f"{path}, line {bad[0] + 2}: column {name!r} is not a number.")
     return values
 
 

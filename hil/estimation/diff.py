@@ -68,7 +68,7 @@ def diff_runs(
     models = read_model(before), read_model(after)
     counts = [len(model.joints) for model in models]
     if counts[0] != counts[1]:
-        raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not one arm's.")
+        raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
     return diff_models(*models, str(before), str(after), false_alarms, least_share)
 
 

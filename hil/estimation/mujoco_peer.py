@@ -68,7 +68,7 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
         axis=1,
     )
     std = np.sqrt(np.diag(slope @ covariance @ slope.T))
-    settings = f"started within {100 * WITHIN:.0f} %, {values.size} parameters, {STEPS} steps a sample"
+    settings = f"initial guess within {100 * WITHIN:.0f} %, {values.size} parameters, {STEPS} steps a sample"
     return Peer(
         "mujoco_sysid",
         base | {"delay": linear.delay},

@@ -33,11 +33,13 @@ def unit_of(name: str) -> str:
 
 def physical_lines(physical: Physical) -> list[str]:
     """The same in words, a line each."""
-    lines = ["Masses, centres and inertias with what is known:"]
+    lines = ["Masses, centres and inertias, using the known quantities:"]
     for name, found in physical.quantities.items():
         error = "known" if found.known and found.std == 0.0 else f"+- {found.std:.1e}"
         lines.append(f"  {name:15s} {found.value:11.5g} {found.unit:7s} {error}")
     for group in physical.not_told_apart:
-        lines.append(f"  not told apart: {', '.join(group)}. Measure one of them and add it under [known].")
+        lines.append(
+            f"  not separately identifiable: {', '.join(group)}. Measure one of them and add it under [known]."
+        )
     lines.extend(f"  Doubt: {doubt}." for doubt in physical.doubts)
     return lines

@@ -48,7 +48,7 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
         if not config.arm.gravity:
             if sure:
                 said.append(
-                    f"arm.gravity = 0, but gravity_{joint} is {value:.3g} +- {std:.1g} N m: the arm does not lie flat."
+                    f"arm.gravity = 0, but gravity_{joint} is {value:.3g} +- {std:.1g} N m: the arm is not horizontal."
                 )
         elif sure and value < 0.0:
             said.append(
@@ -62,7 +62,7 @@ def _constants(estimate: Estimate) -> list[str]:
     if abs(np.log(max(ratio, 1e-6))) < np.log1p(RATIO):
         return []
     return [
-        f"The second joint's torque seems to be {ratio:.2g} times what its torque constant says: look at model and "
+        f"The second joint's torque appears to be {ratio:.2g} times what its torque constant says: look at model and "
         "torque_constant of both joints."
     ]
 

@@ -28,15 +28,15 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     position = np.where(np.isfinite(position), position, np.nan)
     for index, joint in enumerate(config.joints):
         if whole and not np.isfinite(position[:, index]).any():
-            raise RecordingCutShort(f"{joint.name} never said where it is during {role!r}: look at its cable and ID.")
+            raise RecordingCutShort(f"{joint.name} returned no position during {role!r}: check its cable and ID.")
     first = _first_settled(position, experiment.settle_within)
     if first is None and whole > max(experiment.max_settling_periods, experiment.periods):
         first = _drifting(position, experiment.drift_within, experiment.periods)
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
         raise RecordingCutShort(
-            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods, and among "
-            f"them no {experiment.periods} settled ones; {wanted * count} samples are the least. Record again."
+            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods, but not "
+            f"{experiment.periods} settled ones; {wanted * count} samples are required. Record again."
         )
     begin, end = first * count, (first + experiment.periods) * count
     # With the row before: its goal holds until the first write.

@@ -24,12 +24,15 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         steps = swing / facts.position_step[index]
         if steps < LEAST_SWING:
             found.append(
-                f"{joint.name} moved by {steps:.0f} encoder steps only: its parameters rest on rounding; raise its "
+                f"{joint.name} moved by {steps:.0f} encoder steps only: rounding dominates its parameters; raise its "
                 "peak_torque."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
         if lost > LOST:
-            found.append(f"{joint.name}: {100 * lost:.1f} % of the samples are missing; look at cable, baud and rate.")
+            found.append(
+                f"{joint.name}: {100 * lost:.1f} % of the samples are missing; check cable, baud rate and sampling "
+                "rate."
+            )
     return found
 
 
@@ -54,7 +57,7 @@ def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]
     if part <= OFTEN:
         return []
     return [
-        f"{name} got less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the strong "
-        "samples: it is clipped by the servo's own current limit or by the supply's voltage at speed; lower "
-        "peak_torque or raise the supply."
+        f"{name} got less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the high-torque "
+        "samples: the servo's own current limit or, at speed, the supply voltage clips it; lower peak_torque "
+        "or raise the supply voltage."
     ]

@@ -35,13 +35,16 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         if joint.torque_per_goal_std
     ]
     if RATIO not in extra:
-        known = f"Every value also scales with its joint's torque constant, known to: {', '.join(unsure)}."
+        known = (
+            "Every value also scales with its joint's torque constant, whose relative uncertainty is: "
+            f"{', '.join(unsure)}."
+        )
         return known if unsure else ""
     first, second = joints
     ratio = extra[RATIO]
     found = (
-        f"Against {first.name}, {second.name} gives {ratio.value:.5g} +- {ratio.std:.1g} times the torque that "
-        f"its torque constant says. Every value scales with {first.name}'s alone"
+        f"Relative to {first.name}, {second.name} gives {ratio.value:.5g} +- {ratio.std:.1g} times the torque that "
+        f"its torque constant implies. Every value scales with {first.name}'s alone"
     )
     if not first.torque_per_goal_std:
         return f"{found}."
@@ -52,4 +55,4 @@ def by_voltage_said(joints: Sequence[JointConfig]) -> str:
     """What viscous friction holds where the joints are driven by voltage; empty where they are not."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
-    return "Driven by voltage: the viscous friction includes what the motor generates when it turns."
+    return "Driven by voltage: the viscous friction includes the motor's back-EMF."

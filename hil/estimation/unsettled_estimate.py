@@ -74,7 +74,9 @@ def _estimate(
     recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool, shown_path: str
 ) -> ShootingResult:
     if wanted.ripple:
-        raise ConfigError("model.ripple needs a settled period to find where it repeats: leave it out for any data.")
+        raise ConfigError(
+            "model.ripple needs a settled period to find its cycles per turn: remove it for unsettled data."
+        )
     began = time.perf_counter()
     start = fit_inverse_dynamics(recordings, START_CUTOFF, START_WIDTH).value
     choice = None
@@ -111,7 +113,7 @@ def make_shooting_result(
     )
     return ShootingResult(
         method=f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
-        f"starting states; {estimate.model.description}; standard errors robust "
+        f"initial states; {estimate.model.description}; standard errors robust "
         "against model error",
         config=shown_path,
         joints=estimate.model.joints,

@@ -26,7 +26,8 @@ def any_warnings(recordings: Sequence[Recording], estimate: ShootingEstimate) ->
         left = float(estimate.residual_rms[joint]) / motion
         if left > LEFT:
             found.append(
-                f"{name}: the fit leaves {100 * left:.2g} % of the motion, so do not use these numbers: check the "
+                f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
+                "check the "
                 "units, signs and zero of position and torque; then try shorter segments."
             )
     return [*found, *_weak(estimate)]
@@ -38,11 +39,11 @@ def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]
     steps = swing / max(float(each.position_step[joint]) for each in recordings)
     if steps < LEAST_SWING:
         found.append(
-            f"{name} moved by {steps:.0f} encoder steps only: its parameters rest on rounding; drive it harder."
+            f"{name} moved by {steps:.0f} encoder steps only: rounding dominates its parameters; drive it harder."
         )
     turns = swing / (2.0 * np.pi)
     if turns > MANY_TURNS:
-        found.append(f"{name} moved over {turns:.0f} turns: if it did not, its positions are not in the unit given.")
+        found.append(f"{name} moved over {turns:.0f} turns: if it did not, its positions are not in the stated unit.")
     lost = 1.0 - float(np.mean(np.concatenate([np.isfinite(each.position[joint]) for each in recordings])))
     if lost > LOST:
         found.append(f"{name}: {100 * lost:.1f} % of its positions are missing.")
@@ -57,7 +58,7 @@ def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
         if each.between == "linear" and FLAT < at_most < 0.9:
             return [
                 f"{name}: its torque stays at {size.max():.3g} N m in {100 * at_most:.0f} % of the samples: if the "
-                "current was clipped, give the measured one, or drive it less."
+                "current was clipped, use the measured current, or drive the joint less hard."
             ]
     return []
 
@@ -72,4 +73,4 @@ def _weak(estimate: ShootingEstimate) -> list[str]:
     ]
     if not weak:
         return []
-    return [f"Hardly known from this motion: {', '.join(weak)}. Faster, wider motion of each joint would tell."]
+    return [f"Poorly identified from this motion: {', '.join(weak)}. Faster, wider motion of each joint would help."]

@@ -44,7 +44,8 @@ WORK_TOLERANCE_RAD = 0.03
 
 _WHY_LATE = (
     "This program was stopped (Ctrl-Z, SIGSTOP, a debugger), the computer was suspended, or other programs kept it "
-    "busy: close them, or lower experiment.rate."
+    "busy: "
+    "close those programs, or lower experiment.rate."
 )
 
 
@@ -113,7 +114,9 @@ class Guard:
         clamped = []
         for index, (goal, former, limits) in enumerate(zip(goal_current, self._former_goal, self._limits, strict=True)):
             if not abs(goal) < float("inf"):
-                self._stop(index, Cause.NOT_A_NUMBER, f"was to be given a goal current of {goal}, which is no number.")
+                self._stop(
+                    index, Cause.NOT_A_NUMBER, f"would have received a goal current of {goal}, which is not a number."
+                )
             limit = limits.current
             wanted = limit if goal > limit else -limit if goal < -limit else goal
             change = wanted - former
@@ -142,8 +145,8 @@ class Guard:
         self._often_late = max(0.0, self._often_late - LATE_SHARE)
         if self._often_late >= max(_OFTEN_LATE, 0.5 * self._late_limit.seconds / self._interval):
             raise SafetyStop(
-                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed: the replies come too late for "
-                f"{1 / self._interval:g} Hz. `hil check` measures what this bus can do: look at the adapter's latency "
+                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed: the replies arrive too late for "
+                f"{1 / self._interval:g} Hz. `hil check` measures what this bus can do: check the adapter's latency "
                 "timer and the servos' return delay, or lower experiment.rate.",
                 Cause.LATE,
             )
@@ -157,7 +160,7 @@ class Guard:
         gap = max(watchdog_gap, state.time_after_read - now)
         if gap >= self._safety.watchdog:
             raise SafetyStop(
-                f"This program stood still: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
+                f"This program stalled: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
                 Cause.LATE,
             )
         self._late = 0
@@ -165,7 +168,9 @@ class Guard:
             self._judge_rate()
         for index, limits in enumerate(self._limits):
             if state.error[index] & ALERT:
-                self._stop(index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, reboot.")
+                self._stop(
+                    index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
+                )
             if state.missing[index]:
                 self._count_missing(index, state.error[index], now)
             else:
@@ -217,8 +222,8 @@ class Guard:
                 self._stop(
                     index,
                     Cause.EARLY_MOTION,
-                    f"moves before the start: {now - first:+.3f} rad without any current, {EARLY_MOTION_RAD} is "
-                    "allowed. Let the arm hang still; look for a draught, a pulling cable, a hand.",
+                    f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
+                    "is allowed. Let the arm hang still; check for a draught, a dragging cable or a hand.",
                 )
 
     def _count_missing(self, index: int, error: int, now: float) -> None:
@@ -233,13 +238,14 @@ class Guard:
                 self._stop(
                     index,
                     Cause.MISSING,
-                    f"answers with error {error} in place of its state, for {1e3 * seconds:.0f} ms: it refuses to be "
-                    "read. Switch its supply off and on.",
+                    f"answers with error {error} instead of its state for {1e3 * seconds:.0f} ms: it refuses "
+                    "reads. Power-cycle it.",
                 )
             self._stop(
                 index,
                 Cause.MISSING,
-                f"missed {self._missing[index]} replies in a row and was last heard {1e3 * seconds:.0f} ms ago; {said} "
+                f"missed {self._missing[index]} replies in a row; its last reply was {1e3 * seconds:.0f} ms ago; "
+                f"{said} "
                 f"allows {1e3 * allowed:.0f} ms. Check its cable and its supply.",
             )
 
@@ -247,8 +253,8 @@ class Guard:
         self._stop(
             index,
             Cause.JUMP,
-            f"seems to have moved {moved:+.3f} rad between two samples, at most {most:.3f} is possible within its "
-            "velocity limit. Look at the encoder, its magnet and the supply.",
+            f"appears to have moved {moved:+.3f} rad between two samples; its velocity limit allows at most "
+            f"{most:.3f}. Check the encoder, its magnet and the supply.",
         )
 
     def _outside(self, index: int, position: float) -> NoReturn:
@@ -257,7 +263,7 @@ class Guard:
             index,
             Cause.POSITION,
             f"is at {position:.3f} rad, outside its position limit [{low:g}, {high:g}]. Lower experiment.peak_torque; "
-            "`hil dry-run` finds how far.",
+            "`hil dry-run` finds a safe value.",
         )
 
     def _too_fast(self, index: int, velocity: float) -> NoReturn:
@@ -265,7 +271,7 @@ class Guard:
             index,
             Cause.VELOCITY,
             f"moves at {velocity:.2f} rad/s, more than its velocity limit {self._limits[index].velocity:g}. Lower "
-            "experiment.peak_torque; `hil dry-run` finds how far.",
+            "experiment.peak_torque; `hil dry-run` finds a safe value.",
         )
 
     def _not_followed(self, index: int, off: Unfollowed) -> NoReturn:
@@ -273,7 +279,8 @@ class Guard:
             index,
             Cause.NOT_FOLLOWING,
             f"carries {off.carried:.3f} where {off.goal:.3f} is commanded, for {1e3 * off.seconds:.0f} ms. Its torque "
-            "is off, it was rebooted, its watchdog acted, or it cannot give this much at its speed and supply "
+            "is off, it was rebooted, its watchdog acted, or it cannot deliver this much at its speed and supply "
+            "voltage "
             "(safety.follow_share).",
         )
 
@@ -282,7 +289,7 @@ class Guard:
             index,
             Cause.FROZEN,
             f"reports a velocity of {velocity:+.2f} rad/s that does not fit its position, {position:.3f} rad: one of "
-            "the two readings is frozen or wrong. Look at the encoder and its magnet; replace the servo.",
+            "the two readings is frozen or wrong. Check the encoder and its magnet; replace the servo if necessary.",
         )
 
     def _look_at_clocks(self, slow: Slow, now: float) -> None:
@@ -305,8 +312,8 @@ class Guard:
             self._stop(
                 index,
                 Cause.WRONG_SIGN,
-                f"moves against its command: its motor has taken {-self._work[index]:.2f} J out of the arm, which "
-                "friction forbids. Is the gear reversed, or does something drive the arm?",
+                f"moves against its command: its motor has taken {-self._work[index]:.2f} J out of the arm, more than "
+                "friction can account for. Is its direction reversed, or does something else drive the arm?",
             )
 
     def _look_slow(self, slow: Slow) -> None:
@@ -324,7 +331,7 @@ class Guard:
                     index,
                     Cause.VOLTAGE,
                     f"has {volt:.1f} V; safety.min_voltage and max_voltage allow {safety.min_voltage:g} to "
-                    f"{safety.max_voltage:g}. Look at the supply.",
+                    f"{safety.max_voltage:g}. Check the supply.",
                 )
 
     def _acted(self, seconds: float) -> str:
@@ -332,7 +339,7 @@ class Guard:
         watchdog = self._safety.watchdog
         if seconds < watchdog:
             return ""
-        return f" The servos' watchdogs act after {1e3 * watchdog:.0f} ms, so the arm was without current by then."
+        return f" The servos' watchdogs act after {1e3 * watchdog:.0f} ms, so the arm had no current by then."
 
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:
         name = self._names[index]

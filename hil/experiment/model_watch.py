@@ -67,14 +67,14 @@ class ModelWatch:
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
             said = (
-                f"{name} stands still although {abs(lacking):.3f} N m drive it, which would move any arm that fits "
-                "what is known and was seen of this one. Something holds it, it is stuck, or its encoder is frozen."
+                f"{name} stands still although {abs(lacking):.3f} N m drive it, which would move any arm consistent "
+                "with the prior and the data so far. Something holds it, it is stuck, or its encoder is frozen."
             )
         else:
             said = (
-                f"{name} does not move as any arm would that fits what is known and was seen of this one: "
-                f"{lacking:+.3f} N m of the commanded torque are not to be found in its motion. Its torque or its "
-                "encoder fails, something pushes or holds it, or the arm is another one than described."
+                f"{name} does not move like any arm consistent with the prior and the data so far: "
+                f"{lacking:+.3f} N m of the commanded torque do not show in its motion. Its motor or its "
+                "encoder has failed, something pushes or holds it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
 

@@ -6,7 +6,8 @@ own core               the loop stays on one core and keeps its caches; asked fo
                        without it a loop that may not move waits for whoever holds its core
 timer slack            1 ns instead of 50 us by which the kernel may delay a wake-up
 no garbage collection  Python's collector is off inside the loop, and never looks at what was there before it
-short thread turns     another thread of this process (the progress bar) hands the interpreter back in 50 us, not 5 ms
+short thread switch interval     another thread of this process (the progress bar) hands the interpreter back in 50 us,
+not 5 ms
 
 Only the calling thread gets the first and the third. Everything is taken back at the end.
 """
@@ -60,7 +61,7 @@ def _fifo(undo: ExitStack) -> Granted:
 def _own_core(undo: ExitStack) -> Granted:
     name = "own core"
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
-        return Granted(name, False, "only together with real-time scheduling")
+        return Granted(name, False, "only with real-time scheduling")
     before = os.sched_getaffinity(0)
     # The last one: interrupts mostly land on the first.
     core = max(before)
@@ -110,7 +111,7 @@ def _restore_collection(was_on: bool) -> None:
 def _short_turns(undo: ExitStack) -> Granted:
     undo.callback(sys.setswitchinterval, sys.getswitchinterval())
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    return Granted("short thread turns", True, f"{_SWITCH_INTERVAL_S * 1e6:.0f} us")
+    return Granted("short thread switch interval", True, f"{_SWITCH_INTERVAL_S * 1e6:.0f} us")
 
 
 def _libc(function: str, *arguments: int) -> str:

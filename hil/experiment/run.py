@@ -160,7 +160,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     rate, wire = config.experiment.rate, bus.prepared.longest
     if wire > 1 / rate:
         raise WrongSetting(
-            f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms on the wire alone at "
+            f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
             f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
         )
     slowest = bus.port.latency + wire
@@ -169,14 +169,15 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     file = latency_timer(bus.port.url)
     if file is not None:
         raise WrongSetting(
-            f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which leaves "
-            f"{1 / slowest:.0f} Hz, and it may not be set by this user. Type: {command_to_set(file)}"
+            f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
+            "at "
+            f"most {1 / slowest:.0f} Hz, and this user may not change it. Type: {command_to_set(file)}"
         )
     if bus.port.latency_measured:
         raise WrongSetting(
-            f"experiment.rate = {rate:g}: replies lie {bus.port.latency * 1e3:.0f} ms in this adapter, as "
-            f"measured, which leaves {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short "
-            "latency, such as a U2D2."
+            f"experiment.rate = {rate:g}: this adapter was measured to hold replies back for "
+            f"{bus.port.latency * 1e3:.0f} ms, which allows at most {1 / slowest:.0f} Hz. Lower the rate, or use a wired "
+            "adapter with a short latency, such as a U2D2."
         )
 
 
@@ -202,9 +203,9 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
         if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
-                f"{joint} is at {position:.3f} rad; arm.rest_pose says {rest:.3f} and arm.rest_tolerance allows "
-                f"{tolerance:g}. Move it there by hand: friction may hold it where it was stopped. "
-                f"Only if it is in its rest pose now, set zero_ticks = {ticks}."
+                f"{joint} is at {position:.3f} rad; arm.rest_pose is {rest:.3f} and arm.rest_tolerance allows "
+                f"{tolerance:g}. Move it there by hand: friction may hold it away from rest. Only "
+                f"if it is in its rest pose now, set zero_ticks = {ticks}."
             )
 
 

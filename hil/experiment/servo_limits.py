@@ -35,7 +35,7 @@ def _lower(config: Config, bus: ServoBus, joint: Joint, limit: float, note: Call
         if present < needed:
             raise WrongSetting(
                 f"{servo.title}: its Current Limit is {present}, but current_limit = {limit:g} A needs {needed}; "
-                "larger goals would be refused without a word. Set current_limit to "
+                "larger goals would be silently refused. Set current_limit to "
                 f"{present * len(servos) * abs(joint.drive_unit(0.0)):.3g} or less, or "
                 "raise the register with DYNAMIXEL Wizard 2.0."
             )
@@ -54,6 +54,7 @@ def _check_pwm_limit(bus: ServoBus, joint: Joint, limit: float) -> None:
         if volts < needed:
             raise WrongSetting(
                 f"{servo.title}: its PWM Limit is {pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply; "
-                f"current_limit = {limit:g} A needs {needed:.1f} V, so the motor would not carry what it is told. "
+                f"current_limit = {limit:g} A needs {needed:.1f} V, so the motor could not reach the commanded "
+                "current. "
                 "Raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
             )

@@ -40,7 +40,7 @@ class StatusCheck:
         """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. What is wrong, for a sentence."""
         if status.hardware_error:
             error = describe_error(HardwareError(status.hardware_error))
-            return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then switch its supply off and on."
+            return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle it."
         if status.torque is False:
             return Cause.TORQUE_OFF, (
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
@@ -53,14 +53,14 @@ class StatusCheck:
             return None
         if status.watchdog == _TRIPPED:
             return Cause.WATCHDOG, (
-                "has lost its torque: its watchdog acted (Bus Watchdog reads 255), so it heard nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms: look at its plug and wire, "
-                "or the computer kept this program waiting."
+                "has lost its torque: its watchdog tripped (Bus Watchdog reads 255), so it received nothing for "
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Check its plug and cable, unless the computer kept this "
+                "program waiting."
             )
         if status.watchdog == 0 and self._may_be_unwatched:
             return None
         return Cause.WATCHDOG, (
-            f"is no longer watched: its Bus Watchdog reads {status.watchdog}, it was armed with {self._armed}. Another "
+            f"is no longer protected: its Bus Watchdog reads {status.watchdog} but was set to {self._armed}. Another "
             "program uses this bus, or the servo was rebooted."
         )
 
@@ -73,8 +73,9 @@ class StatusCheck:
             return None
         unit = self._unit[joint]
         return Cause.GOALS_LOST, (
-            f"does not take its goals: it holds {status.goal:.3f} {unit} where {sent:.3f} {unit} was sent, and held a "
-            "former one before. Packets to it get lost, or it refuses them: look at cable and limits."
+            f"does not take its goals: it holds {status.goal:.3f} {unit} where {sent:.3f} {unit} was sent, and an "
+            "earlier "
+            "one before that. Packets to it get lost, or it refuses them: check cable and limits."
         )
 
     def look_at_clock(self, joint: int, tick: float, now: float) -> tuple[Cause, str] | None:
@@ -95,8 +96,8 @@ class StatusCheck:
             if stale < _STALE_READINGS or readings < _LEARNT_READINGS:
                 return None
             return Cause.STALE, (
-                f"does not answer of now: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies are "
-                "held up on their way and come too late, or it was rebooted. Look at the adapter, its latency and its "
+                f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
+                "are delayed in transit, or it was rebooted. Check the adapter, its latency and its "
                 "cable."
             )
         least = offset if ahead < drifted else behind + drifted

@@ -121,7 +121,7 @@ class Stream:
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
         if moving:
-            raise ExperimentError(f"The arm moves before the start: {moving}. Let it hang still, then start again.")
+            raise ExperimentError(f"The arm is moving before the start: {moving}. Let it hang still, then start again.")
 
     def _play_periods(self, segment: Segment) -> None:
         """Periods until one is like the one before it, which then is the first settled one; then the rest of them."""
@@ -138,12 +138,12 @@ class Stream:
                     self._play_period(segment, period + further)
                 return
         if difference <= self._plan.drift_within:
-            self._note(f"{segment.role}: still changes by {difference:.2%} a period, slowly; the last ones are used")
+            self._note(f"{segment.role}: still drifts slowly: {difference:.2%} per period; using the last ones")
             return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
-            f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} of what only drifts. Look for play, a "
+            f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. Check for play, a "
             "dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )

@@ -28,7 +28,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         link = links[joint.link]
         _replace_inertial(link, body)
         if joint.fixed:
-            comment(link, f"with {', '.join(joint.fixed)}, which are fixed to it and have no inertia of their own")
+            comment(link, f"including {', '.join(joint.fixed)}, fixed to it and without separate inertia")
             for name in joint.fixed:
                 _remove(links[name], "inertial")
         dynamics = joints[joint.name].find("dynamics")
@@ -47,7 +47,7 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     """Write `path`; what MJCF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
-    left = ["the URDF's meshes, limits of effort and fixed frames", *found.left_out]
+    left = ["the URDF's meshes, effort limits and fixed frames", *found.left_out]
     _describe(root, model, found, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     ET.SubElement(root, "option", gravity=numbers(*model.geometry.gravity), timestep="0.001", integrator="implicitfast")
@@ -77,8 +77,9 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
 def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: list[str]) -> None:
     """At the head of the file: where it is from, what was identified and what was kept."""
     words = [
-        f"Inertias, damping and friction identified by hil {__version__}; all else is of {found.path.name}.",
-        "One of many sets of links that move alike, the nearest to that file's: only these sums were measured:",
+        f"Inertias, damping and friction identified by hil {__version__}; everything else is from {found.path.name}.",
+        "Of the many dynamically equivalent sets of link inertias, the one closest to that file's; only these "
+        "combinations were identified:",
         *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
         *(f"Not representable in this format: {sentence}" for sentence in left),
     ]

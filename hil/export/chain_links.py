@@ -47,7 +47,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     said = []
     if found.misfit > FAR:
         said.append(
-            f"the identified values exactly: no links of real mass have them; the nearest are {found.misfit:.1f} "
+            "the identified values exactly: no physically consistent links have them; the nearest are "
+            f"{found.misfit:.1f} "
             "standard errors away"
         )
     bodies = tuple(_body(row) for row in found.links)

@@ -40,7 +40,7 @@ def distribute(model: ArmModel, link_length: float | None = None) -> tuple[LinkM
     """Links from the base outwards; raises ExportError when none of positive mass has these parameters."""
     p = model.values
     if len(model.joints) == 1:
-        _reject_length(link_length, "an arm of one joint has no elbow")
+        _reject_length(link_length, "an arm with one joint has no elbow")
         moment = p["gravity_1"] / model.gravity if model.gravity else 0.0
         _positive("inertia_1", p["inertia_1"])
         return (_link(moment, p["inertia_1"], ROD, math.inf),)
@@ -61,14 +61,16 @@ def _elbow(model: ArmModel, link_length: float | None) -> tuple[float, float]:
     if not model.gravity:
         if link_length is None:
             raise ExportError(
-                "A horizontal arm's parameters do not tell the length of link 1: measure it from joint to joint and "
+                "A horizontal arm's parameters do not determine the length of link 1: measure it from joint to joint "
+                "and "
                 "give it with --link-length METRES."
             )
         return link_length, coupling / link_length
     _reject_length(link_length, "it follows from coupling * gravity / gravity_2")
     if weight == 0 or coupling / weight <= 0:
         raise ExportError(
-            f"coupling = {coupling:.4g} kg m^2 and gravity_2 = {weight:.4g} N m: both must have one sign, since their "
+            f"coupling = {coupling:.4g} kg m^2 and gravity_2 = {weight:.4g} N m: both must have the same sign, since "
+            "their "
             "ratio times gravity is the length of link 1. Check zero_ticks and direction, and excite joint 2 more."
         )
     return coupling * model.gravity / weight, weight / model.gravity
@@ -80,8 +82,8 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
     if needed >= 1:
         raise ExportError(
             f"inertia_1 * inertia_2 = {p['inertia_1'] * p['inertia_2']:.4g} is not above coupling^2 = "
-            f"{p['coupling'] ** 2:.4g} kg^2 m^4: no links of positive mass move like that. Look at the report's "
-            "residual; excite more, or choose a richer [model] friction."
+            f"{p['coupling'] ** 2:.4g} kg^2 m^4: no links of positive mass have such inertias. Check the residual in "
+            "the report; excite more, or choose a richer [model] friction."
         )
     return max(ROD, 0.5 * (1 + needed))
 
@@ -99,9 +101,9 @@ def _link(moment: float, about_joint: float, share: float, farthest: float) -> L
 
 def _positive(name: str, value: float) -> None:
     if value <= 0:
-        raise ExportError(f"{name} = {value:.4g} kg m^2 is not positive: no link of positive mass has it.")
+        raise ExportError(f"{name} = {value:.4g} kg m^2 is not positive: no link of positive mass can have it.")
 
 
 def _reject_length(link_length: float | None, why: str) -> None:
     if link_length is not None:
-        raise ExportError(f"--link-length = {link_length:g} m is not needed here: {why}. Leave it out.")
+        raise ExportError(f"--link-length = {link_length:g} m is not needed here: {why}. Remove it.")

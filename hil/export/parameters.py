@@ -30,7 +30,7 @@ def export_json(source: Source, path: Path) -> list[str]:
 
 def export_toml(source: Source, path: Path) -> list[str]:
     """Write `path`; TOML holds all of it."""
-    lines = ["# Base parameters of an identified arm [SI]; docs/model.md has the equations. Read by hil.load_model."]
+    lines = ["# Base parameters of an identified arm [SI]; equations in docs/model.md. Read it with hil.load_model."]
     _write_table(lines, (), _kept(source))
     write_text(path, "\n".join(lines) + "\n")
     return []

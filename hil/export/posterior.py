@@ -52,7 +52,7 @@ def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: 
     torque_constants: False leaves the torque constants where they are.
     """
     if not 2 <= samples <= MOST_SAMPLES:
-        raise ExportError(f"--samples {samples}: from 2 to {MOST_SAMPLES} arms can be drawn.")
+        raise ExportError(f"--samples {samples}: must be from 2 to {MOST_SAMPLES}.")
     names, mean, covariance = _posterior(source)
     rng = np.random.default_rng(seed)
     values = mean + _matched(rng, samples, len(names)) @ _root(covariance).T
@@ -99,8 +99,9 @@ def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:
     unseen = [name for name, row in zip(result.covariance.names, covariance, strict=True) if not np.isfinite(row).all()]
     if unseen:
         raise ExportError(
-            f"The recording shows nothing of {', '.join(unseen)}, so there is no distribution to draw it from. "
-            "Identify again with more motion, or export the arm alone."
+            f"The recording contains no information about {', '.join(unseen)}, so there is no distribution to draw "
+            "from. "
+            "Identify again with more motion, or export without --samples."
         )
     mean = np.array([result.quantities[name].value for name in result.covariance.names])
     return result.covariance.names, mean, covariance
@@ -138,7 +139,7 @@ def _physical(
         redrawn += len(bad)
         values[bad] = mean + rng.standard_normal((len(bad), len(names))) @ root.T
     raise ExportError(
-        "The error bars are so wide that most draws are no arm of positive masses and friction: identify again with "
+        "The uncertainty is so large that most draws do not have positive masses and friction: identify again with "
         "more motion."
     )
 

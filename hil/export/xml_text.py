@@ -21,7 +21,7 @@ def describe(root: ET.Element, model: ArmModel, left: list[str]) -> None:
     comment(
         root, f"Written by hil {__version__} from an identified arm. Angles are hil's: joint 1 from the horizontal."
     )
-    comment(root, "One of many mass distributions that move alike; only their base parameters were measured:")
+    comment(root, "One of many dynamically equivalent mass distributions; only their base parameters were identified:")
     for name, value in model.values.items():
         comment(root, f"{name} = {value!r} +- {model.stds[name]:.1e}")
     for sentence in left:

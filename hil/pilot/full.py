@@ -53,7 +53,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
             return played
         if number == MOST_TRIES:
             raise played.error
-        say("Once more, with less torque.")
+        say("Repeating with less torque.")
         run.set_aside(f"stopped-{number}", chosen)
         if not played.passed_limit:
             search.cap = _BACK_OFF * found.peak_torque

@@ -133,7 +133,7 @@ class Search:
             still = [joint.name for joint, moves in zip(self.config.joints, moved, strict=True) if not moves]
             if (found.peak_torque[~moved] >= _AT_LIMIT * most_torque(config)[~moved]).all():
                 self._give_up(config, still)
-            self.player.say(f"{_and(still)} did not move: friction is larger than that. Once more, with more torque.")
+            self.player.say(f"{_and(still)} did not move: friction exceeds this torque. Repeating with more torque.")
         moved = self.moved
         if not moved.all():
             self._give_up(config, [j.name for j, m in zip(self.config.joints, moved, strict=True) if not m])
@@ -159,7 +159,7 @@ class Search:
         found = self.amplitude(config, 1.0, plan)
         while not self._certain(config, found) and len(self.steps) < MOST_STEPS:
             self.player.say(
-                "What is known so far is too uncertain to go to the limits at once: one more run on the way."
+                "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
             )
             number = len(self.steps) + 1
             self._play(step_config(config), f"step-{number}", f"Step {number}", only_first(found))
@@ -206,7 +206,7 @@ class Search:
         raise ExperimentError(
             f"{_and(still)} did not move by {MOVED_STEPS} encoder steps. Tried: {tried}; the current limits allow "
             f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
-            "look at the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
+            "check the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
         )
 
 

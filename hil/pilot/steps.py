@@ -106,7 +106,8 @@ class Player:
             self.say(f"{name} ended early: {error}")
         if not step.within:
             self.say(
-                f"{name}: more was seen than 99 % of the simulated arms reach; the arm is not quite what was assumed."
+                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
+                "assumed."
             )
         return Played(step, seen_of(config, samples), torque, error)
 

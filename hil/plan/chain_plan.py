@@ -76,9 +76,10 @@ def make_chain_plan(config: Config) -> Plan:
     experiment = config.experiment
     if not config.is_fake:
         raise ConfigError(
-            f"{config.path}: port.url = {config.port.url!r}: experiments on real arms in space are not supported yet: "
-            "nothing here looks for collisions or lays an arm down that must stop. The fake arm can be identified, and "
-            "`hil scan` and `hil check` look at real servos."
+            f"{config.path}: port.url = {config.port.url!r}: experiments on real spatial arms are not supported yet: "
+            "there is no collision check and no safe way to lower the arm after a stop. The fake arm can be "
+            "identified, and "
+            "`hil scan` and `hil check` work with real servos."
         )
     if config.joint_path is None or experiment.band is None:
         raise ConfigError(f"{config.path}: joint_path is missing: [joint_path] with centre, swing and speed per joint.")
@@ -145,7 +146,8 @@ def _check_torque(config: Config, known: KnownChain, path: Path) -> None:
         most = joint.goal_limit * joint.torque_per_goal
         if peak > 0.8 * most:
             raise ConfigError(
-                f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for it, and has {most:.3g}: "
+                f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path but has "
+                f"{most:.3g}: "
                 "lower joint_path.speed or swing, or raise its current_limit."
             )
 

@@ -152,8 +152,7 @@ def _segment(config: Config, role: str, seed: int) -> Segment:
     experiment = config.experiment
     if experiment.peak_torque is None:
         raise ConfigError(
-            f"{config.path}: experiment.peak_torque is missing. `hil dry-run` finds how much is safe; or set "
-            "pilot = true."
+            f"{config.path}: experiment.peak_torque is missing. `hil dry-run` finds a safe value; or set pilot = true."
         )
     multisine = design_multisine(experiment.rate, experiment.period, _lines(config), experiment.peak_torque, seed)
     return Segment(role, multisine, period_current(config, multisine), round(experiment.ramp * experiment.rate))

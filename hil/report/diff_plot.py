@@ -26,7 +26,7 @@ def save_diff_plot(difference: Difference, path: Path) -> None:
         axes.errorbar(percent, row, xerr=half, fmt="o", color=colour, capsize=3, markersize=4)
     axes.set_yticks(range(len(shown)), [change.name for change in reversed(shown)])
     axes.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
-    axes.set_xlabel("change, % of the value before, with 95 % interval; red: more than chance")
+    axes.set_xlabel("change, % of the earlier value, with 95 % interval; red: significant")
     try:
         figure.savefig(path, dpi=150)
     except (OSError, ValueError) as error:

@@ -311,7 +311,7 @@ class StabiliserShare:
                 names, self.rms, self.commanded_rms, self.share, self.peak, strict=True
             )
         )
-        return f"Of the torque, the stabiliser gave: {each}."
+        return f"Share of torque from the stabiliser: {each}."
 
 
 @dataclass(frozen=True)

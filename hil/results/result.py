@@ -139,5 +139,5 @@ def result_from_json(value: Mapping[str, Any]) -> Result:
     found = from_json(kind, value)
     missing = [name for name in found.covariance.names if name not in found.quantities]
     if missing:
-        raise FormError(f"has {missing[0]!r} in its covariance, which is no parameter")
+        raise FormError(f"has {missing[0]!r} in its covariance, which is not a parameter")
     return found

@@ -53,7 +53,9 @@ def find_runs(folder: Path) -> list[RunSummary]:
     Raises RunFolderError when the folder does not exist.
     """
     if not folder.is_dir():
-        raise RunFolderError(f"{folder} is not a folder. Runs are in runs/ where `hil identify` was started.")
+        raise RunFolderError(
+            f"{folder} is not a folder. Runs are in runs/ of the folder where `hil identify` was started."
+        )
     found = [summarise(path) for path in _run_folders(folder)]
     return sorted(found, key=lambda run: (run.started.timestamp() if run.started else 0.0, str(run.path)))
 
@@ -88,7 +90,7 @@ def write_note(path: Path, note: Note) -> None:
     if not _is_run(path):
         raise RunFolderError(f"{path} is not a run folder: it has neither run.json nor samples.npy.")
     if len(note.name) > _LONGEST or len(note.text) > _LONGEST:
-        raise RunFolderError(f"A name or note may have {_LONGEST} characters at most.")
+        raise RunFolderError(f"A name or note may have at most {_LONGEST} characters.")
     write_json(path / NOTE_FILE, asdict(note))
 
 

@@ -31,7 +31,7 @@ class EventLog:
         dropped = self._written.dropped
         left = self._written.close(PATIENCE_S)
         if dropped:
-            left.append((left[-1][0] if left else 0.0, f"{dropped} events were dropped: the disk did not keep up"))
+            left.append((left[-1][0] if left else 0.0, f"{dropped} events were dropped: the disk could not keep up"))
         if left:
             _write_without_waiting(self._late_path, left)
 

@@ -28,7 +28,7 @@ def check_archive(path: Path) -> None:
     if claimed > MOST_ARCHIVE_BYTES or claimed > 2**20 + MOST_COMPRESSED * packed:
         raise RunFolderError(
             f"{path} would take {claimed / 2**20:.0f} MB of memory; a settled period takes at most "
-            f"{MOST_ARCHIVE_BYTES / 2**20:.0f}. It is no file of hil's: it was not read."
+            f"{MOST_ARCHIVE_BYTES / 2**20:.0f}. It is not a file written by hil and was not read."
         )
 
 
@@ -43,5 +43,5 @@ def check_array(path: Path) -> None:
     held = path.stat().st_size - start
     if promised > held:
         raise RunFolderError(
-            f"{path} cannot be read as a recording: it promises {promised} bytes and holds {held}; it was not read."
+            f"{path} cannot be read as a recording: its header declares {promised} bytes but it has {held}."
         )

@@ -71,4 +71,4 @@ def load_periods(run: Path) -> dict[str, PlayedPeriod]:
                 for role in roles
             }
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise RunFolderError(f"{path} cannot be read: {error}. Make it anew with hil estimate {run}.") from error
+        raise RunFolderError(f"{path} cannot be read: {error}. Recreate it with hil estimate {run}.") from error

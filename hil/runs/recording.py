@@ -198,6 +198,6 @@ def load_samples(path: Path, joints: int) -> NDArray[np.void]:
         raise RunFolderError(f"{path} cannot be read as a recording: {error}.") from error
     expected = sample_type(joints)
     if samples.dtype != expected:
-        raise RunFolderError(f"{path} holds rows of another type than a recording of {joints} joints.")
+        raise RunFolderError(f"{path} does not have the row type of a recording of {joints} joints.")
     recorded: NDArray[np.void] = samples[samples["phase"] != Phase.NOT_RECORDED]
     return recorded

@@ -87,7 +87,7 @@ class RunFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
             if any(path.iterdir()):
-                raise RunFolderError(f"Run folder {path} is not empty; name another with --out, or remove it.")
+                raise RunFolderError(f"Run folder {path} is not empty; choose another with --out, or remove it.")
             run.config_path.write_bytes(config.path.read_bytes())
             for urdf in _urdfs(config):
                 (path / urdf.name).write_bytes(urdf.read_bytes())
@@ -139,7 +139,9 @@ class RunFolder:
             if self.stabiliser_path.is_file():
                 played["stabiliser"] = StabiliserConfig(**_read_json(self.stabiliser_path))
         except ValidationError as error:
-            raise RunFolderError(f"What was played, beside {self.config_path}, is damaged: {error}.") from error
+            raise RunFolderError(
+                f"The record of the excitation beside {self.config_path} is damaged: {error}."
+            ) from error
         return config.model_copy(update=played)
 
     def below(self, name: str, played: Config) -> "RunFolder":
@@ -162,7 +164,7 @@ class RunFolder:
             return []
         starts = _read_json(self.starts_path).get("starts")
         if not isinstance(starts, list):
-            raise RunFolderError(f"{self.starts_path} is damaged: it holds no list of starts.")
+            raise RunFolderError(f"{self.starts_path} is damaged: it has no list of start times.")
         return starts
 
     def write_played(self, played: Config) -> None:
@@ -212,7 +214,8 @@ class RunFolder:
         values = _read_json(self.run_path)
         if values.get("schema") != SCHEMA:
             raise RunFolderError(
-                f"{self.run_path}: schema {values.get('schema')!r} is not {SCHEMA}; this run was made by another hil."
+                f"{self.run_path}: schema {values.get('schema')!r} is not {SCHEMA}; this run was made by another "
+                "version of hil."
             )
         try:
             return from_json(kind, values)
@@ -277,5 +280,5 @@ def _read_json(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise RunFolderError(f"{path} cannot be read: {error}.") from error
     if not isinstance(value, dict):
-        raise RunFolderError(f"{path} is damaged: it holds no JSON object.")
+        raise RunFolderError(f"{path} is damaged: it is not a JSON object.")
     return value

@@ -122,7 +122,7 @@ def _mend(used: Way, ways: list[Way], wanted: float) -> str:
         one_write, fast = str(better.one_write).lower(), str(better.fast).lower()
         return f"Set port.one_write = {one_write} and port.fast_sync_read = {fast}."
     if not any(way.sound for way in ways):
-        return "Replies get lost whichever way they are asked for: check cables, supply and termination."
+        return "Replies are lost with every read method: check cables, supply and termination."
     best = max((way for way in ways if way.sound), key=lambda way: way.rate)
     return (
         f"Set experiment.rate to at most {best.rate:.0f}, or raise the baud, or lower latency timer and return delay."

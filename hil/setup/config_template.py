@@ -60,7 +60,7 @@ def arm_toml(arm: ArmAnswers) -> str:
     port = ["[port]", f"url = {json.dumps(arm.url)}", f"baud = {arm.baud}"]
     mechanism = [
         "[arm]",
-        _line(f"gravity = {arm.gravity:g}", "m/s^2; 0 for an arm that moves in a horizontal plane"),
+        _line(f"gravity = {arm.gravity:g}", "m/s^2; 0 if the arm moves in a horizontal plane"),
         _line(f"rest_pose = {_list([joint.rest for joint in arm.joints], 4)}", _rest_meaning(arm)),
         _line(
             f"link_lengths = {_list([joint.length for joint in arm.joints], 3)}", "m: joint to joint, and to the tip"
@@ -68,20 +68,20 @@ def arm_toml(arm: ArmAnswers) -> str:
     ]
     experiment = [
         "[experiment]",
-        _line(f"rate = {rate:.1f}", "samples per second; hil check tells what this bus can do"),
+        _line(f"rate = {rate:.1f}", "samples per second; hil check measures what this bus can sustain"),
         _line("period = 10.0", "s"),
         _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: its lines are assigned to the joints in turn"),
-        _line("pilot = true", "find the torque: small first, then up to the limits"),
+        _line("pilot = true", "find the torque: start small, then raise it to the limits"),
         _line("ramp = 1.0", "s, at start and end"),
         "seed = 1",
     ]
     model = [
         "[model]",
-        _line('friction = "auto"', "tries friction models and keeps what predicts best"),
+        _line('friction = "auto"', "tries several friction models and keeps the one that predicts best"),
         _line('drive = "lag"', '"delay": a pure delay instead of a current loop'),
     ]
     if len(arm.joints) == 2:
-        model.append(_line("torque_scale = true", "find how far the second torque constant is off against the first"))
+        model.append(_line("torque_scale = true", "estimate the second torque constant relative to the first"))
     safety = ["[safety]", _line("watchdog = 0.1", "s without packets after which a servo stops by itself")]
     tables = [head, port, *(_joint(joint) for joint in arm.joints), mechanism, experiment, model, safety]
     return "\n\n".join("\n".join(table) for table in tables) + "\n"
@@ -109,7 +109,7 @@ def _joint(answers: JointAnswers) -> list[str]:
         _line(f"{constant} = {published.value:.3g}", f"N m/{unit} at the output shaft; published: {figures}"),
         _line(
             f"{constant}_std = {_spread(published):.2g}",
-            "all of the joint's values scale with it",
+            "all values of the joint scale with it",
         ),
         _line(f"position_limit = {_list(ends, 2)}", "rad"),
         _line("velocity_limit = 10.0", "rad/s"),
@@ -132,10 +132,10 @@ def _goal_limit(answers: JointAnswers) -> float:
 
 def _rest_meaning(arm: ArmAnswers) -> str:
     if not arm.gravity:
-        return "rad: where it lies at the start; hil holds it about there"
+        return "rad: where it lies at the start; hil holds it near there"
     if arm.joints[0].rest > 0:
-        return "rad: upright; hold it there until hil does, and again at the end"
-    return "rad: where it hangs; hil looks first"
+        return "rad: upright; support it by hand until hil holds it, and again at the end"
+    return "rad: where it hangs; hil checks this first"
 
 
 def _rate(arm: ArmAnswers) -> float:

@@ -26,7 +26,7 @@ _REST = {HANGING: -math.pi / 2, UPRIGHT: math.pi / 2, FLAT: 0.0}
 _POSE = {
     HANGING: "Let the arm hang at rest, and press Enter",
     UPRIGHT: "Hold the arm upright and straight, and press Enter",
-    FLAT: "Lay the arm straight, in the middle of where it may go, and press Enter",
+    FLAT: "Lay the arm out straight, in the middle of its range, and press Enter",
 }
 
 
@@ -38,14 +38,16 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
     handles = [Servo(port, found.id, load_control_table(str(found.model))) for found in chosen]
     for servo in handles:
         if servo.read("Torque Enable"):
-            raise ExperimentError(f"{servo.title} holds its torque. Switch its supply off and on, then start again.")
+            raise ExperimentError(f"{servo.title} holds its torque. Power-cycle it, then start again.")
     names = [_name(number, found, ask) for number, found in enumerate(chosen)]
     stance = _stance(ask, say)
     tilt = (
         0.0
         if stance == FLAT
         else math.radians(
-            _number("By how many degrees is its plane tilted against the vertical", "0", (0.0, _MOST_TILT), ask, say)
+            _number(
+                "By how many degrees is its plane of motion tilted from the vertical", "0", (0.0, _MOST_TILT), ask, say
+            )
         )
     )
     directions = [_direction(servo, name, ask, say) for servo, name in zip(handles, names, strict=True)]
@@ -63,7 +65,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         joints.append(JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing, length))
     head = (
         "Written by hil init. Before the first run: read each line, then `hil check` this file.\n"
-        "NOT yet run on this arm: limits are careful guesses from the servos' models."
+        "NOT yet run on this arm: the limits are conservative guesses from the servo models."
     )
     gravity = 0.0 if stance == FLAT else round(STANDARD_GRAVITY * math.cos(tilt), 3)
     return ArmAnswers(url, baud, tuple(joints), gravity, head)
@@ -75,11 +77,13 @@ def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
     usable = {baud: servos for baud, servos in answered.items() if servos}
     if not usable:
         raise ExperimentError(
-            "No servo that hil can drive answers. Look at `hil scan`; possible models: " + ", ".join(SERVO_MODELS) + "."
+            "No servo that hil can drive answered. Try `hil scan`; supported models: " + ", ".join(SERVO_MODELS) + "."
         )
     if len(usable) > 1:
         found = "; ".join(f"{baud}: ID {', '.join(str(one.id) for one in servos)}" for baud, servos in usable.items())
-        raise ExperimentError(f"Servos answer at more than one baud ({found}). Bring them to one with hil setup.")
+        raise ExperimentError(
+            f"Servos answer at more than one baud ({found}). Set them all to the same rate with hil setup."
+        )
     return next(iter(usable.items()))
 
 
@@ -88,7 +92,7 @@ def _choose(servos: list[Found], ask: Ask, say: Say) -> list[Found]:
     listed = ", ".join(f"{found.id} ({found.model})" for found in servos)
     usual = " ".join(str(found.id) for found in servos[:2])
     while True:
-        answer = ask(f"IDs of the arm's one or two joints, from the base outwards; there are {listed}", usual)
+        answer = ask(f"IDs of the arm's joints (one or two), from the base outwards; found: {listed}", usual)
         words = answer.replace(",", " ").split()
         if 1 <= len(words) <= 2 and len(set(words)) == len(words) and all(_known(word, by_id) for word in words):
             return [by_id[int(word)] for word in words]
@@ -106,10 +110,10 @@ def _name(number: int, found: Found, ask: Ask) -> str:
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     """Which way Present Position counts, seen so that the arm hangs down and points right when it is lifted."""
     before = servo.read("Present Position")
-    ask(f"Turn {name} by hand a little counter-clockwise, at most a quarter turn, hold it there and press Enter", "")
+    ask(f"Turn {name} by hand slightly counter-clockwise, at most a quarter turn, hold it there and press Enter", "")
     moved = servo.read("Present Position") - before
     if abs(moved) < _MOVED_TICKS:
-        say(f"{name} did not move: direction = 1 is assumed. Correct it in the file if the servo turns the other way.")
+        say(f"{name} did not move: assuming direction = 1. Correct it in the file if the servo turns the other way.")
         return 1
     return 1 if moved > 0 else -1
 

@@ -81,7 +81,7 @@ def _latency_timer(bus: ServoBus) -> Finding:
     if lowered:
         return Finding(Level.OK, url, what, found)
     level = Level.STOP if before_ms >= FACTORY_MS else Level.WARNING
-    return Finding(level, url, what, f"{before_ms} ms, {WANTED_MS} is needed", f"Type: {command_to_set(file)}")
+    return Finding(level, url, what, f"{before_ms} ms; {WANTED_MS} ms is needed", f"Type: {command_to_set(file)}")
 
 
 def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
@@ -89,10 +89,10 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
     try:
         check_quiet(bus.port)
     except BusShared as error:
-        yield Finding(Level.STOP, config.port.url, "other masters", "another one speaks", str(error))
+        yield Finding(Level.STOP, config.port.url, "other masters", "another master is active", str(error))
         return
     except DriverError as error:
-        yield Finding(Level.WARNING, config.port.url, "other masters", "not listened for", str(error))
+        yield Finding(Level.WARNING, config.port.url, "other masters", "not checked", str(error))
         return
     try:
         found = others_on_the_bus(bus)
@@ -100,8 +100,8 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
         yield Finding(Level.WARNING, config.port.url, "others", "not asked", str(error))
         return
     if found:
-        fix = "They are left alone: no torque and no setting of theirs is changed."
-        yield Finding(Level.WARNING, config.port.url, "others on this bus", "; ".join(found), fix)
+        fix = "They are left alone: neither their torque nor their settings are changed."
+        yield Finding(Level.WARNING, config.port.url, "other servos on this bus", "; ".join(found), fix)
 
 
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
@@ -113,7 +113,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
     try:
         number = servo.ping()
     except NoReply:
-        fix = f"Check supply and cable. `hil scan {config.port.url}` finds it at another ID or baud."
+        fix = f"Check supply and cable. `hil scan {config.port.url}` finds it at another ID or baud rate."
         yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", fix)
         return
     except DriverError as error:
@@ -133,8 +133,8 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
             return
         except DriverError as error:
             fix = (
-                f"{error} It answers a ping: if it never answers a read, its Status Return Level is 0; switch its "
-                "supply off and on, which sets it back to 2."
+                f"{error} It answers a ping: if it never answers reads, its Status Return Level is 0; power-cycle "
+                "it, which resets it to 2."
             )
             yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
             return
@@ -143,15 +143,15 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
 
 def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding]:
     """What a run that was killed could not put back."""
-    what = "settings of an earlier run"
+    what = "settings from an earlier run"
     try:
         written = recover(servo, config.url)
     except DriverError as error:
-        yield Finding(Level.WARNING, str(joint), what, "cannot be put back", str(error))
+        yield Finding(Level.WARNING, str(joint), what, "cannot be restored", str(error))
         return
     if written:
         yield Finding(
-            Level.OK, str(joint), what, f"it was ended before it could put them back; now {', '.join(written)}"
+            Level.OK, str(joint), what, f"it ended before it could restore them; restored now: {', '.join(written)}"
         )
 
 
@@ -171,26 +171,26 @@ def _firmware(_config: Config, _joint_config: JointConfig, joint: Joint, servo: 
 
 def _status_level(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     level = servo.read("Status Return Level")
-    fix = "At less than 2 no write is confirmed. Switch its supply off and on, which sets it back to 2."
+    fix = "Below 2, writes are not confirmed. Power-cycle it, which resets it to 2."
     return _graded(level == 2, "status return level", str(level), fix)
 
 
 def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     error = servo.hardware_error()
-    fix = "It stays without torque until it is rebooted: find the cause, then switch its supply off and on."
+    fix = "It stays without torque until rebooted: find the cause, then power-cycle it."
     return _graded(error == HardwareError(0), "hardware error", describe_error(error), fix)
 
 
 def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
-    fix = "Something drives it: stop that program first; or switch its supply off and on."
+    fix = "Another program drives it: stop that program first; or power-cycle it."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 
 def _drive_mode(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     drive_mode = servo.read("Drive Mode")
     fix = (
-        "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), bit 3 lets any goal turn torque on. "
+        "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), bit 3 lets any goal switch torque on. "
         "Set it with DYNAMIXEL Wizard 2.0."
     )
     return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), fix)
@@ -201,7 +201,7 @@ def _secondary_id(config: Config, _joint_config: JointConfig, joint: Joint, serv
     others = {servo_id for each in config.joints for servo_id in each.ids} - {joint.id}
     none = secondary > MAX_ID
     fix = (
-        f"It does what is told to that ID too, EEPROM aside. Type: hil setup {_port(config)} --id {joint.id} "
+        f"It also obeys commands to that ID, except EEPROM writes. Type: hil setup {_port(config)} --id {joint.id} "
         "--secondary-id 255"
     )
     level = Level.STOP if secondary in others else Level.WARNING
@@ -211,10 +211,11 @@ def _secondary_id(config: Config, _joint_config: JointConfig, joint: Joint, serv
 def _startup(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     armed = arms_itself(servo)
     fix = (
-        "Startup Configuration arms it whenever it is switched on or reboots, also in the middle of a run. Set that "
+        "Startup Configuration switches its torque on at every power-up or reboot, even in the middle of a run. Set "
+        "that "
         "register to 0 with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(not armed, "at switch-on", "torque comes on by itself" if armed else "torque stays off", fix)
+    return _graded(not armed, "at switch-on", "torque switches on by itself" if armed else "torque stays off", fix)
 
 
 def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -225,7 +226,7 @@ def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Serv
 
 def _return_delay(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     delay_us = round(RETURN_DELAY_UNIT * 1e6) * servo.read("Return Delay Time")
-    fix = f"Each reply waits for it. Type: hil setup {_port(config)} --id {joint_config.id} --return-delay-us 0"
+    fix = f"It delays every reply. Type: hil setup {_port(config)} --id {joint_config.id} --return-delay-us 0"
     fine = delay_us <= _LONG_RETURN_DELAY_US
     return _graded(fine, "return delay", f"{delay_us} us", fix, Level.WARNING)
 
@@ -262,7 +263,7 @@ def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: 
     needed = share * joint.servo.resistance if joint.mode is Mode.CURRENT else share
     found = f"{pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply"
     fix = (
-        f"It bounds the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
+        f"It limits the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
         "rest and more at speed: raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
     )
     if volts < needed:
@@ -273,7 +274,9 @@ def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: 
 def _shutdown(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     mask = HardwareError(servo.read("Shutdown"))
     wanted = HardwareError.OVERHEATING | HardwareError.OVERLOAD
-    fix = "Overheating and overload should stop it: set Shutdown to its factory value with DYNAMIXEL Wizard 2.0."
+    fix = (
+        "It should shut down on overheating and overload: set Shutdown to its factory value with DYNAMIXEL Wizard 2.0."
+    )
     return _graded(wanted in mask, "shuts down on", describe_error(mask), fix, Level.WARNING)
 
 
@@ -285,7 +288,7 @@ def _voltage(config: Config, _joint_config: JointConfig, joint: Joint, servo: Se
     if voltage < config.safety.min_voltage:
         fix = f"A {joint.servo.name} needs {config.safety.min_voltage:g} V (safety.min_voltage): switch the supply on."
         return Level.STOP, "voltage", found, fix
-    return _graded(low <= voltage <= high, "voltage", found, "Fix the supply: outside its limits it shuts down.")
+    return _graded(low <= voltage <= high, "voltage", found, "Fix the supply: the servo shuts down outside its limits.")
 
 
 def _temperature(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
@@ -293,7 +296,7 @@ def _temperature(_config: Config, _joint_config: JointConfig, _joint: Joint, ser
     found = f"{heat} C (limit {limit})"
     if heat >= limit:
         return Level.STOP, "temperature", found, "Let it cool down."
-    fix = "Close to its limit: let it cool down, or lower experiment.peak_torque."
+    fix = "Near its limit: let it cool down, or lower experiment.peak_torque."
     return _graded(heat < limit - _WARM_BELOW_LIMIT_C, "temperature", found, fix, Level.WARNING)
 
 
@@ -306,7 +309,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
     fix = (
-        f"arm.rest_pose says {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "
+        f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "
         f"at rest now, set zero_ticks = {zero}."
     )
     return _graded(abs(angle - rest) <= config.arm.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)
@@ -344,11 +347,12 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
         tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
         if tripped:
             yield Finding(
-                Level.OK, str(joint), "goals", "refused until its tripped Bus Watchdog is cleared, as a run does"
+                Level.OK, str(joint), "goals", "refused until its tripped Bus Watchdog is cleared, which a run does"
             )
             continue
         fix = (
-            "A goal sent by Sync Write did not arrive though reads are answered: try port.one_write = false; look for "
+            "A goal sent by Sync Write did not arrive although reads are answered: try port.one_write = false; check "
+            "for "
             "an adapter or hub that swallows bytes, and for a second servo with this ID."
         )
         yield Finding(Level.STOP, str(joint), "goals", "not taken", fix)

@@ -114,7 +114,7 @@ def listen(port: Port, patience: float = _PATIENCE_S, watch: Watch = lambda _: N
                 watch(Asking(port.baud, deadline - port.clock.now(), (packet.id, model)))
     servos = tuple(_describe(port, servo_id, data) for servo_id, data in sorted(answers.items()))
     damaged = framer.bad_crc or framer.noise_bytes + framer.pending > _STATUS_BYTES
-    return Heard(port.baud, servos, "damaged answers: two servos with the same ID, or a bad cable" if damaged else "")
+    return Heard(port.baud, servos, "corrupted replies: two servos with the same ID, or a bad cable" if damaged else "")
 
 
 def _describe(port: Port, servo_id: int, data: bytes) -> Found:

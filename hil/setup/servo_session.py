@@ -63,7 +63,7 @@ class ServoSession:
         left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
         bus.release_held(ours=left)
         if others := others_on_the_bus(bus):
-            self._say(f"Also on this bus, and left alone: {'; '.join(others)}.")
+            self._say(f"Also on this bus (left alone): {'; '.join(others)}.")
         described = {
             drive: each for joint, each in zip(bus.joints, config.joints, strict=True) for drive in joint.drives
         }
@@ -72,7 +72,7 @@ class ServoSession:
             if joint in left:
                 settings = _before(left[joint], settings)
                 self._say(
-                    f"{joint.title}: an earlier run was ended before it could put its settings back "
+                    f"{joint.title}: an earlier run ended before it could restore its settings "
                     f"({left[joint].since}); this one does."
                 )
             changed = {"Operating Mode": int(joint.mode)}
@@ -90,8 +90,8 @@ class ServoSession:
             self._kept[joint] = settings_file.keep(url, joint.id, model, settings, changed)
         except RunFolderError as error:
             self._say(
-                f"What {joint} was set to cannot be kept ({error}). Should this program be killed, its Operating Mode "
-                f"{settings['Operating Mode']} and Current Limit have to be put back by hand."
+                f"The settings of {joint} cannot be saved ({error}). If this program is killed, its Operating Mode "
+                f"{settings['Operating Mode']} and Current Limit must be restored by hand."
             )
             self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
@@ -104,8 +104,8 @@ class ServoSession:
             failed = self._put_back(failed)
         for joint, error in failed.items():
             self._say(
-                f"{joint.title}: what it was set to could not be put back ({error}) The next hil identify, record, "
-                f"check or setup on this port does it, from {self._kept[joint].path}."
+                f"{joint.title}: its settings could not be restored ({error}) The next hil identify, record, check "
+                f"or setup on this port restores them from {self._kept[joint].path}."
             )
 
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:

@@ -32,10 +32,14 @@ def open_servo(port: Port, servo_id: int) -> Servo:
     number = Servo(port, servo_id, _PING_ONLY, f"The servo with ID {servo_id}").ping()
     model = model_names().get(number)
     if model is None:
-        raise WrongModel(f"The servo with ID {servo_id} has model number {number}, which no control table describes.")
+        raise WrongModel(
+            f"The servo with ID {servo_id} has model number {number}, for which there is no control table."
+        )
     servo = Servo(port, servo_id, load_control_table(model))
     if servo.read("Torque Enable"):
-        raise WrongSetting(f"{servo.title} has torque on, which locks its EEPROM. Stop what drives it, then try again.")
+        raise WrongSetting(
+            f"{servo.title} has torque on, which locks its EEPROM. Stop the program that drives it, then try again."
+        )
     return servo
 
 
@@ -91,7 +95,9 @@ def _set_id(servo: Servo, confirm: Confirm, new_id: int) -> tuple[Change, Servo]
         return Change("ID", new_id, new_id, False), servo
     renamed = Servo(servo.port, new_id, servo.table)
     if _answers(renamed):
-        raise WrongSetting(f"ID {new_id} is taken: another servo answers there. Two servos with one ID talk at once.")
+        raise WrongSetting(
+            f"ID {new_id} is taken: another servo answers there. Two servos with the same ID reply at once."
+        )
     if not confirm(f"{servo.title}: change its ID from {servo.id} to {new_id}?"):
         return Change("ID", servo.id, new_id, False), servo
     for _ in range(_ATTEMPTS):
@@ -101,16 +107,18 @@ def _set_id(servo: Servo, confirm: Confirm, new_id: int) -> tuple[Change, Servo]
             return Change("ID", servo.id, new_id, True), renamed
         if not _answers(servo):
             raise NoReply(
-                f"{servo.title} was told to take ID {new_id} and answers neither there nor at ID {servo.id}, at "
+                f"{servo.title} was told to change to ID {new_id} but answers neither there nor at ID {servo.id}, at "
                 f"{servo.port.baud} baud on {servo.port.url}. Check its supply and its cable; `hil scan` finds it."
             )
-    raise NoReply(f"{servo.title} still has its old ID {servo.id}: it was told {_ATTEMPTS} times to take {new_id}.")
+    raise NoReply(
+        f"{servo.title} still has its old ID {servo.id}: {_ATTEMPTS} attempts to change it to {new_id} failed."
+    )
 
 
 def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
     name, port, former = "Baud Rate", servo.port, servo.port.baud
     before, after = servo.read(name), BAUD_RATES.index(baud)
-    question = f"{servo.title}: change its baud from {former} to {baud}? All servos on one bus need the same."
+    question = f"{servo.title}: change its baud from {former} to {baud}? All servos on a bus must use the same one."
     if before == after:
         return Change(name, before, after, False)
     # First whether the adapter can do it at all: a servo at a baud that nobody here speaks is lost.
@@ -121,8 +129,9 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
         port.set_baud(former)
     if taken:
         raise WrongSetting(
-            f"At {baud} baud another servo answers to ID {servo.id}. Two servos with one ID talk at once: give one of "
-            "them another ID first."
+            f"At {baud} baud another servo answers to ID {servo.id}. Two servos with the same ID reply at once: give "
+            "one "
+            "of them another ID first."
         )
     if not confirm(question):
         return Change(name, before, after, False)
@@ -135,10 +144,10 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
         port.set_baud(former)
         if not _answers(servo):
             raise NoReply(
-                f"{servo.title} was told to change from {former} to {baud} baud and answers at neither, on {port.url}. "
+                f"{servo.title} was told to change from {former} to {baud} baud but answers at neither, on {port.url}. "
                 "Check its supply and its cable; `hil scan` finds it."
             )
-    raise NoReply(f"{servo.title} is still at {former} baud: it was told {_ATTEMPTS} times to change to {baud}.")
+    raise NoReply(f"{servo.title} is still at {former} baud: {_ATTEMPTS} attempts to change it to {baud} failed.")
 
 
 def _write_blind(servo: Servo, register: str, value: int) -> None:

@@ -141,7 +141,7 @@ def test_what_is_no_settled_period_is_refused(ideal_period: SettledPeriod) -> No
     with pytest.raises(StandstillError, match="joint 1 moved by 0 rad"):
         replace(ideal_period, position=still)
     turning = ideal_period.position + np.linspace(0.0, 2.0 * np.pi, ideal_period.samples)
-    with pytest.raises(RecordingError, match="turned over or has not settled"):
+    with pytest.raises(RecordingError, match="went over the top or has not settled"):
         replace(ideal_period, position=turning)
     mostly_lost = ideal_period.position.copy()
     mostly_lost[1, 10:] = np.nan

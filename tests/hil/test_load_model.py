@@ -106,7 +106,7 @@ def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, 
     result = json.loads(good)
     del result["arm"]
     cases = {
-        good[: len(good) // 2]: "half written or damaged",
+        good[: len(good) // 2]: "incomplete or damaged",
         "[]": "it has no schema",
         json.dumps({**json.loads(good), "schema": 2}): "schema 2 is not 1.* a newer hil",
         json.dumps(result): "it has no 'arm'",

@@ -26,13 +26,17 @@ def correlation(data: RunData) -> Section | None:
     )
     pairs = "; ".join(f"{first} and {second} ({value:+.2f})" for value, first, second in strong[:5])
     said = (
-        f"Strongly correlated: {pairs}. Only their combination is well known; another motion would part them."
+        f"Strongly correlated: {pairs}. Only their combination is well determined; a different motion would separate "
+        "them."
         if strong
-        else f"No two parameters are correlated beyond {STRONG:g}: the motion tells all of them apart."
+        else f"No two parameters are correlated beyond {STRONG:g}: the motion separates all of them."
     )
-    figure = Matrix("correlation", "Correlation of the parameters", names, values)
-    caption = "Red: they rise together without the fit noticing much; blue: one makes up for the other."
-    return Section("correlation", "What the data can tell apart", (said,), pictures=(Picture(figure, caption),))
+    figure = Matrix("correlation", "Parameter correlations", names, values)
+    caption = (
+        "Red: positive correlation, blue: negative. Strongly correlated parameters can change together with little "
+        "effect on the fit."
+    )
+    return Section("correlation", "Identifiability", (said,), pictures=(Picture(figure, caption),))
 
 
 def correlations(covariance: Array) -> Array:

@@ -21,9 +21,10 @@ def friction(data: RunData) -> Section | None:
     speed, torque = _left_to_friction(data.model, data.fitted)
     pictures = [_curve(data, joint, name, speed[joint], torque[joint]) for joint, name in enumerate(data.names)]
     words = (
-        "Dots: commanded torque minus what inertia and gravity of the model need for the measured motion. They scatter "
-        "because the acceleration comes from a rounded position, and near standstill because friction there is "
-        "whatever holds the joint.",
+        "Dots: commanded torque minus the model's inertia and gravity torque for the measured motion. They scatter "
+        "because "
+        "the acceleration is derived from a quantised position, and near standstill because static friction takes any "
+        "value that holds the joint.",
     )
     return Section("friction", "Friction", words, pictures=tuple(pictures))
 
@@ -50,14 +51,14 @@ def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) ->
     curve = _torque(data.model, at)[:, joint]
     low, high = _interval(data, at, joint)
     series = (
-        Series("what the measured motion leaves", speed, torque, GREY, "dots"),
+        Series("from the measured motion", speed, torque, GREY, "dots"),
         Series("95 % interval", at, high, BLUE, "area", low),
         Series("model", at, curve, BLUE),
     )
     chart = Chart(f"friction_{joint + 1}", f"Friction of {name}", "speed [rad/s]", "friction [N m]", series)
     load = data.model.values.get(f"load_{joint + 1}")
-    more = f" It grows with torque besides: {load:.3g} N m per N m, not drawn." if load else ""
-    return Picture(chart, f"{name}: friction over speed, without the constant offset.{more}")
+    more = f" It also grows with torque: {load:.3g} N m per N m, not drawn." if load else ""
+    return Picture(chart, f"{name}: friction versus speed, without the constant offset.{more}")
 
 
 def _torque(model: ArmModel, speed: Array) -> Array:

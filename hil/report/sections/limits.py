@@ -31,8 +31,8 @@ def limits(data: RunData) -> Section:
         rows += _supply(data.samples, index, joint.name)
     table = Table(("joint and quantity", "most used", "limit", "share"), tuple(rows))
     words = (
-        "What the arm did in the whole run, ramps included, against the limits of its TOML file. Of a position range, "
-        "100 % is one of its ends.",
+        "Extremes over the whole run, ramps included, compared with the limits in the TOML file. For a position "
+        "range, 100 % is either end.",
     )
     return Section("limits", "Limits used", words, (table,))
 

@@ -18,10 +18,10 @@ def parameters(data: RunData) -> Section:
     groups = {} if result.chain is None else result.chain.groups
     tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]
     if result.extra:
-        tables.append(_table(result.extra, {}, {}, "What the model needed beside them"))
+        tables.append(_table(result.extra, {}, {}, "Additional model terms"))
     words = (
-        "The interval is what the noise of this one recording leaves open. It holds neither the error of the torque "
-        "constants, with which all values of a joint scale, nor what the model lacks.",
+        "The interval covers the noise of this recording. It includes neither the error of the torque "
+        "constants, with which all values of a joint scale, nor model error.",
     )
     return Section("parameters", "Parameters", words, tuple(tables))
 
@@ -30,7 +30,7 @@ def _table(
     entries: Mapping[str, Quantity], truth: Mapping[str, float], groups: Mapping[str, str], caption: str
 ) -> Table:
     """groups: what base parameters of an arm in space are made of, by name."""
-    head = ("parameter", "what it is", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
+    head = ("parameter", "meaning", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
     return Table(head, tuple(_row(name, entry, truth, groups) for name, entry in entries.items()), 3, caption, 1)
 
 

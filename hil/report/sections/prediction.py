@@ -20,11 +20,11 @@ def prediction(data: RunData) -> Section | None:
     if data.held_out is not None:
         for joint, name in enumerate(data.names):
             error = percent(float(data.held_out.relative_error[joint]))
-            said = f"the model never saw this motion; its error is {error} of the motion's RMS"
+            said = f"held-out motion; prediction error is {error} of the motion's RMS"
             pictures.append(_position(data.held_out, joint, name, "held out", said))
     words = (
-        "The first pictures show the settled period that the model was fitted to. A residual that looks like noise of "
-        "one step is the encoder's rounding; one that looks like a motion is a part of the arm that the model lacks.",
+        "The first pictures show the settled period that the model was fitted to. A residual that looks like noise "
+        "of one step is encoder rounding; a smooth residual is a part of the arm that the model lacks.",
     )
     return Section("prediction", "Measured and predicted motion", words, pictures=tuple(pictures))
 
@@ -52,4 +52,4 @@ def _residual(data: RunData, joint: int, name: str) -> Picture:
         f"residual_{joint + 1}", f"Residual of {name}", "time in the period [s]", "encoder steps", tuple(series)
     )
     rms = steps(data.result.fit.residual_rms_ticks[joint])
-    return Picture(chart, f"{name}: {rms} steps RMS are left; half a step either way is what rounding alone leaves.")
+    return Picture(chart, f"{name}: {rms} steps RMS remain; rounding alone stays within half a step.")

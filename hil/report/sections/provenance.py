@@ -26,7 +26,7 @@ def provenance(data: RunData) -> Section:
         start = data.events[0][0]
         lines = [f"{time - start:9.3f} s  {what}" for time, what in data.events]
         folded.append(Folded("Events", "\n".join(lines)))
-    return Section("provenance", "What was run on what", (), (Table(("", ""), tuple(rows), 2),), folded=tuple(folded))
+    return Section("provenance", "How this was measured", (), (Table(("", ""), tuple(rows), 2),), folded=tuple(folded))
 
 
 def _excitation(entry: Excitation, names: list[str]) -> tuple[str, str]:

@@ -26,9 +26,9 @@ def spectra(data: RunData) -> Section | None:
         return None
     excited = _excited(data)
     words = (
-        "Each joint has lines of its own, so that what one joint does to the other can be told apart. What answers "
-        "between and above the excited lines is the arm's nonlinearity, friction above all: the model must explain it "
-        "too, and it helps. It should stand well above the noise.",
+        "Each joint has its own lines, so that the coupling between the joints can be separated. The response between "
+        "and above the excited lines is the arm's nonlinearity, mainly friction: the model must explain it too, and it "
+        "carries information. It should stand well above the noise.",
     )
     pictures = [_excitation(data, data.fitted, excited)]
     pictures += [_response(data.fitted, joint, name, excited) for joint, name in enumerate(data.names)]
@@ -46,8 +46,8 @@ def _levels(data: RunData) -> tuple[Table, ...]:
         for joint, name in enumerate(data.names)
     ]
     rows += [(f"noise, {name}", "", steps(levels.noise[joint]), "") for joint, name in enumerate(data.names)]
-    head = ("lines", "how many", "motion on one [steps]", "left by the model [steps]")
-    return (Table(head, tuple(rows), caption="RMS of one line, by kind"),)
+    head = ("lines", "how many", "motion per line [steps]", "model residual [steps]")
+    return (Table(head, tuple(rows), caption="RMS per line, by kind"),)
 
 
 def _excited(data: RunData) -> list[list[int]]:
@@ -64,7 +64,7 @@ def _excitation(data: RunData, period: PlayedPeriod, excited: list[list[int]]) -
     ]
     chart = Chart("excitation", "Excitation", "frequency [Hz]", "torque amplitude [N m]", tuple(series))
     peaks = ", ".join(f"{name} {np.abs(period.torque[joint]).max():.3g} N m" for joint, name in enumerate(data.names))
-    return Picture(chart, f"The lines of the commanded torque. Its peaks in time: {peaks}.")
+    return Picture(chart, f"Spectral lines of the commanded torque. Peaks in time:  {peaks}.")
 
 
 def _response(period: PlayedPeriod, joint: int, name: str, excited: list[list[int]]) -> Picture:
@@ -87,7 +87,9 @@ def _response(period: PlayedPeriod, joint: int, name: str, excited: list[list[in
     chart = Chart(
         f"response_{joint + 1}", f"Response of {name}", "frequency [Hz]", "position amplitude [rad]", kept, log_y=True
     )
-    return Picture(chart, f"{name}: the lines of its motion. Noise is the level of the upper half of all lines.")
+    return Picture(
+        chart, f"{name}: spectral lines of its motion. The noise level is taken from the upper half of all lines."
+    )
 
 
 def _points(name: str, amplitude: Array, index: Array, period: PlayedPeriod, colour: str) -> Series:

@@ -19,7 +19,7 @@ def stabiliser(data: RunData) -> Section | None:
     head = ("joint", "stabiliser RMS [N m]", "stabiliser peak [N m]", "all torque RMS [N m]", "share of RMS")
     words = (
         share.said(data.names),
-        "The spring and damper in software held the arm at its pose during the periods. The estimate uses the torque "
-        "that was really commanded, theirs included, and simulates them with the arm.",
+        "The software spring and damper held the arm at its pose during the periods. The estimate uses the total "
+        "commanded torque, including theirs, and simulates them with the arm.",
     )
     return Section("stabiliser", "Stabiliser", words, (Table(head, tuple(rows)),))

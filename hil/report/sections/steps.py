@@ -15,12 +15,12 @@ def steps(data: RunData) -> Section | None:
         return None
     outside = [step.name for step in played if not step.within_quantile]
     said = (
-        f"In {listed(outside)} a peak went beyond what the dry run had given as the most in 99 of 100 arms."
+        f"In {listed(outside)} a peak exceeded the dry run's 99 % prediction."
         if outside
-        else "Every peak with a limit stayed within what the dry run had given as the most in 99 of 100 arms."
+        else "Every peak with a limit stayed within the dry run's 99 % prediction."
     )
     tables = tuple(_table(step, data.config) for step in played)
-    return Section("steps", "Predicted before, seen after", (said,), tables)
+    return Section("steps", "Predicted and measured peaks", (said,), tables)
 
 
 def _table(step: PlayedStep, config: Config) -> Table:

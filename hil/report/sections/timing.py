@@ -20,15 +20,15 @@ def timing(data: RunData) -> Section:
     round_trip = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
     kept = data.result.timing
     rows = [
-        ("rate asked for", f"{data.config.experiment.rate:g} Hz"),
+        ("requested rate", f"{data.config.experiment.rate:g} Hz"),
         ("rate held", f"{kept.rate_held:g} Hz"),
         ("ticks missed", f"{kept.missed_ticks} of {kept.samples}"),
         ("replies lost", f"{kept.lost_replies}"),
-        ("lateness p50, p99, most", _quantiles(kept.lateness_us)),
-        ("round trip p50, p99, most", _quantiles(kept.round_trip_us)),
+        ("lateness p50, p99, max", _quantiles(kept.lateness_us)),
+        ("round trip p50, p99, max", _quantiles(kept.round_trip_us)),
         ("estimation took", f"{kept.estimation_seconds:.2f} s"),
     ]
-    virtual = ("On the fake bus this is virtual time: its own wire and adapter, not this machine.",)
+    virtual = ("On the fake bus this is virtual time: it describes the simulated wire and adapter, not this machine.",)
     return Section(
         "timing",
         "Timing",

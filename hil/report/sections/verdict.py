@@ -29,7 +29,7 @@ def _residual(data: RunData) -> str:
     fit = data.result.fit
     left = listed([steps(value) for value in fit.residual_rms_ticks])
     floor = fit.quantisation_floor_ticks
-    return f"{left} encoder steps of the motion are left unexplained; rounding alone leaves {floor}."
+    return f"{left} encoder steps RMS of the motion remain unexplained; rounding alone gives {floor}."
 
 
 def _truth(data: RunData) -> str:
@@ -39,7 +39,7 @@ def _truth(data: RunData) -> str:
     found = data.result.parameters
     errors = {name: abs(found[name].value / value - 1) for name, value in truth.items() if value and name in found}
     worst = max(errors, key=lambda name: errors[name])
-    return f"The arm is a fake one and knows its truth: the worst parameter is {percent(errors[worst])} off ({worst})."
+    return f"This is a fake arm with known true parameters: the largest error is {percent(errors[worst])} ({worst})."
 
 
 def _limits(data: RunData) -> str:
@@ -55,4 +55,4 @@ def _torque_constants(data: RunData) -> str:
 
 
 def _hardware(data: RunData) -> str:
-    return "The servos were a fake bus: nothing here was measured on hardware." if data.config.is_fake else ""
+    return "The servos were simulated (fake bus): nothing here was measured on hardware." if data.config.is_fake else ""

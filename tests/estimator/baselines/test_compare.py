@@ -102,5 +102,5 @@ def test_one_joint_that_moves_alone_is_not_enough(ideal_period: SettledPeriod) -
     still[1] = 1e-2 * np.sin(np.arange(still.shape[1]) * 2.0 * np.pi / still.shape[1])
     still[0] = still[1]
     period = SettledPeriod(400.0, ideal_period.torque, still, 0.0, np.full(2, 1e-4))
-    with pytest.raises(UnidentifiableError, match="tell parameters apart"):
+    with pytest.raises(UnidentifiableError, match="separate the parameters"):
         fit_inverse_dynamics([joined(period, 1)], 10.0, 1e-9)

@@ -121,7 +121,7 @@ def test_intervals_cover_the_truth_where_the_model_lacks_something(
     assert np.abs((estimate.value[:12] - truth) / estimate.std[:12]).max() < 2.6
     verdict = judge(estimate, validate(sticking_period, estimate), Evidence())
     assert verdict.trust != "yes"
-    assert "the model does not have" in verdict.sentences[0]
+    assert "the model cannot explain" in verdict.sentences[0]
 
 
 def test_a_good_estimate_is_trusted(ideal_period: SettledPeriod) -> None:

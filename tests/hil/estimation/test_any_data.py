@@ -77,7 +77,7 @@ COLUMNS = (
         (CSV, COLUMNS.replace('"deg"', '"turns"'), 1, "are these degrees or encoder"),
         (CSV, COLUMNS.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'), 1, "jumps by"),
         (CSV, "[arm]\ngravity = 9.81\n", 2, "has no [columns] table"),
-        (CSV.replace("\n0.50,", "\n0.50,x"), COLUMNS, 2, "column 'q1' holds no number"),
+        (CSV.replace("\n0.50,", "\n0.50,x"), COLUMNS, 2, "column 'q1' is not a number"),
         (CSV.replace("\n0.50,", "\n0.50,1,"), COLUMNS, 2, "6 fields for 5 columns"),
         (CSV.replace(",0.1\n", ",nan\n", 3), COLUMNS, 1, "joint 2: 3 torques are not finite"),
         (CSV[:300], COLUMNS, 2, "fields for 5 columns"),
@@ -100,7 +100,7 @@ def test_a_csv_that_is_wrong_is_named(
     [
         (
             lambda columns: columns | {"q1": np.degrees(columns["q1"])},
-            "if it did not, its positions are not in the unit",
+            "if it did not, its positions are not in the stated unit",
         ),
         (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
         (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),

@@ -87,7 +87,7 @@ CAUSES: list[tuple[Cause, str, Callable[[list[Any]], None]]] = [
     (Cause.ALERT, r"'elbow'.*overload", lambda p: fault(p, FaultKind.OVERLOAD, servo=2)),
     (Cause.MISSING, r"'elbow'.*missed 6 replies", lambda p: fault(p, FaultKind.LOST_REPLY, servo=2, duration=0.1)),
     (Cause.LATE, r"deadlines in a row", lambda p: stall(p, 0.06)),
-    (Cause.JUMP, r"'elbow'.*seems to have moved", lambda p: fault(p, FaultKind.ENCODER_JUMP, servo=2, amount=-120)),
+    (Cause.JUMP, r"'elbow'.*appears to have moved", lambda p: fault(p, FaultKind.ENCODER_JUMP, servo=2, amount=-120)),
     (Cause.NOT_FOLLOWING, r"'shoulder'.*carries 0\.000", lambda p: p[0].bus.servos[1].write(64, b"\x00")),
     (Cause.WRONG_SIGN, r"against its command", lambda p: turn_round(p, 0)),
 ]
@@ -131,7 +131,7 @@ def test_commands_too_far_apart_for_the_watchdogs(arm: Arm, tmp_path: Path, port
     stop, samples = run_until_stopped(config, tmp_path / "run", lambda _: None, make_plan(config))
     # Whichever is seen first: the gap, or what the servo says of itself.
     assert (stop.cause is Cause.LATE and "25 ms passed between two commands" in str(stop)) or (
-        stop.cause is Cause.WATCHDOG and "heard nothing for 20 ms" in str(stop)
+        stop.cause is Cause.WATCHDOG and "received nothing for 20 ms" in str(stop)
     )
     assert len(samples) <= 2
     assert_stopped(ports[0])

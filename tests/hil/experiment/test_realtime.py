@@ -27,7 +27,7 @@ def test_everything_is_taken_back(fail: bool) -> None:
             "locked memory",
             "timer slack",
             "no garbage collection",
-            "short thread turns",
+            "short thread switch interval",
         ]
         assert all(each.given or each.note for each in granted)
         1 / (not fail)

@@ -121,7 +121,7 @@ def test_link_1_has_the_length_that_a_ruler_measures(identified: Path) -> None:
     [
         ({"inertia_2": -1e-3}, None, "inertia_2 = -0.001 kg m"),
         ({"coupling": 0.02}, None, "no links of positive mass"),
-        ({"gravity_2": -0.2}, None, "both must have one sign"),
+        ({"gravity_2": -0.2}, None, "both must have the same sign"),
         ({}, 0.15, "--link-length = 0.15 m is not needed"),
     ],
 )

@@ -52,7 +52,7 @@ def test_words_come_first_then_every_section_and_figure(identified: Path) -> Non
         *("correlation", "limits", "timing", "provenance"),
     ]
     page = make_page(data)
-    assert page.index("predicts a motion that it never saw") < page.index("<table")
+    assert page.index("predicts a held-out motion") < page.index("<table")
     for figure in figures(data):
         assert page.count(f'aria-label="{figure.title}') == 2
     for said in ("inertia_1", "gravity_2", "coulomb_2", "XM430-W350, ID 1", "seed"):
@@ -68,7 +68,7 @@ def test_a_run_in_steps_shows_prediction_beside_what_was_seen(identified: Path) 
     result["steps"] = [step, {**step, "name": "full", "within_quantile": False}]
     path.write_text(json.dumps(result), encoding="utf-8")
     page = make_page(RunData.load(identified))
-    assert "In full a peak went beyond" in page
+    assert "In full a peak exceeded" in page
     assert "pilot, peak torque shoulder 0.2 N m and elbow 0.1 N m" in page
     assert "0.617" in page
 
@@ -93,7 +93,7 @@ def test_a_run_without_held_out_or_period_leaves_those_sections_out(identified: 
     keys = [section.key for section in sections(data)]
     assert keys == ["verdict", "parameters", "correlation", "limits", "timing", "provenance"]
     page = make_page(data)
-    assert "never saw" not in page and "truth" not in page
+    assert "held-out" not in page and "truth" not in page
 
 
 @pytest.mark.parametrize(

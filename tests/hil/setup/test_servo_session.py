@@ -131,11 +131,11 @@ def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_star
         play(config, tmp_path / "run")
     left = bench.changed()
     if left:
-        assert "could not be put back" in capsys.readouterr().err
+        assert "could not be restored" in capsys.readouterr().err
         assert settings_path(config.url, 2, "XM430-W350").is_file()
         bench.port.bus.faults.clear()
         found = list(check_arm(config))
-        assert any(each.what == "settings of an earlier run" and each.level is Level.OK for each in found)
+        assert any(each.what == "settings from an earlier run" and each.level is Level.OK for each in found)
     assert bench.changed() == []
 
 

@@ -94,7 +94,7 @@ def test_scan_command(arm_file: ArmFile) -> None:
     assert [servo["id"] for servo in json.loads(result.stdout)["servos"]] == [1, 2]
     result = invoke("scan", arm_file(), "--baud", 9600)
     assert result.exit_code == 1
-    assert "No servo answers" in result.stdout
+    assert "No servo answered" in result.stdout
 
 
 # check
@@ -273,7 +273,7 @@ def test_one_lost_packet_loses_no_servo(port: Callable[..., Port], kind: str, pl
     ("change", "said"),
     [
         ({"new_id": 9}, "answers neither there nor at ID 2"),
-        ({"new_baud": 57_600}, "from 1000000 to 57600 baud and answers at neither"),
+        ({"new_baud": 57_600}, "from 1000000 to 57600 baud but answers at neither"),
     ],
 )
 def test_a_servo_that_is_gone_is_said_to_be_at_neither(
