@@ -67,8 +67,8 @@ def check_quiet(port: Port) -> None:
 def shared(what: str) -> BusShared:
     """The error of a bus on which another master does something."""
     return BusShared(
-        f"Another master {what} on this bus. Two masters talk into each other's packets, and its goals would move the "
-        "arm too: end that program, or unplug that controller."
+        f"Another master {what} on this bus, or the adapter has an echo of what this program sends. Two masters talk "
+        "into each other's packets, and its goals would move the arm too: end that program, or unplug that controller."
     )
 
 

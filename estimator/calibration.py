@@ -214,7 +214,7 @@ def _misfit(period: SettledPeriod, physics: Physics, state: Array, factor: Array
         period.command_to_sample,
         steps,
         delay=physics.delay,
-        lag=physics.lag,
+        lag=physics.lags,
     )
     position, _ = simulate(physics, state, torque, 1.0 / (period.rate * steps))
     difference = np.where(period.valid, position - period.position, 0.0)

@@ -213,13 +213,17 @@ class SelectionOptions:
     """RMS error of the prediction in units of the noise: nothing is left for another term."""
     explained_residual: float = 1.02
     """RMS residual in units of the noise: likewise."""
+    near_residual: float = 5.0
+    """The same below which a richer model's minimum is sought near the plainer one's."""
     presliding_residual: float = 1.2
     """The same from which presliding is tried, whose fit takes long."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)
     """Of the Coulomb step of one joint, tried where the motion is not explained [rad/s]."""
     overrule_ratio: float = 0.8
     """Of the chosen model's error of prediction: what another one must reach to be chosen instead."""
-    ripple_evidence: float = 0.15
+    ripple_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
+    """A turn: where ripple is looked for."""
+    ripple_evidence: float = 0.05
     """Of the score test, from which ripple is tried: where it repeats is found roughly, so that a fit sees more."""
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
     """Chance at which nothing is taken for something, in turn until the motion is explained as well."""

@@ -74,7 +74,7 @@ def own_lines() -> Excitation:
     """Table 2 on joint 1, and on joint 2 the same amplitudes one harmonic higher.
 
     As printed, (19), both joints have the same torque on the same lines; then only sums of the two columns of the
-    transfer function are seen and A1 of (33) is singular. One harmonic apart is the least change that mends it.
+    transfer function are seen and A1 of (33) is singular. One harmonic apart is the least change that resolves it.
     """
     lines, amplitude = np.array(LINES), np.array(AMPLITUDES)
     nothing = np.zeros_like(amplitude)

@@ -21,6 +21,7 @@ from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.options import CovarianceOptions
 
 DEFAULTS = CovarianceOptions()
+FAINT_PRIOR = 1e-4  # of a prior's precision, which keeps what is not measured at all finite
 VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
 
 
@@ -90,25 +91,41 @@ def autocorrelation(residual: Array, lags: int) -> Array:
     return rho
 
 
-def robust_covariance(at: Quadratic, scatter: Array | None, samples: int, count: int, structured: float = 0.0) -> Array:
+def robust_covariance(
+    at: Quadratic,
+    scatter: Array | None,
+    samples: int,
+    count: int,
+    structured: float = 0.0,
+    precision: Array | None = None,
+) -> Array:
     """Covariance of the first `count` coordinates (count, count), the others unknown with them.
 
     The larger of the sandwich and of what independent errors would give, direction by direction: a short
     recording cannot prove that its errors cancel. Without `scatter` that of independent errors of variance 1.
-    `structured` is the part of the sum of squares that is a model's error. Infinite for a coordinate that leaves no
-    trace.
+    `structured` is the part of the sum of squares that is a model's error. `precision` (coordinates,) is what a prior
+    has put into the normal equations: it stays as it is where the errors of measurement are larger than independent
+    ones. Infinite for a coordinate that leaves no trace.
     """
+    prior = np.zeros(len(at.normal)) if precision is None else (1.0 - FAINT_PRIOR) * precision
     norm = np.sqrt(np.diag(at.normal))
     seen = norm > 1e-12 * norm.max()
     lengths = np.outer(norm[seen], norm[seen])
-    inverse = np.asarray(np.linalg.pinv(at.normal[np.ix_(seen, seen)] / lengths, hermitian=True), dtype=np.float64)
+    measured = (at.normal - np.diag(prior))[np.ix_(seen, seen)] / lengths
+    inverse = np.asarray(np.linalg.pinv(measured, hermitian=True), dtype=np.float64)
     freedom = max(1, samples - int(seen.sum()))
     covariance = np.zeros_like(at.normal)
     found = inverse
     if scatter is not None:
-        robust = inverse @ (scatter[np.ix_(seen, seen)] / lengths) @ inverse * (samples / freedom)
+        scores = (scatter - np.diag(prior))[np.ix_(seen, seen)] / lengths
+        robust = inverse @ scores @ inverse * (samples / freedom)
         found = _larger(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
         found = found + 0.5 * structured * inverse
+    if prior.any():
+        expected = np.diag(np.sqrt(prior[seen]) / norm[seen])
+        # (found^-1 + prior)^-1 without an inverse of what may be hardly seen.
+        inner = np.eye(len(found)) + expected @ found @ expected
+        found = found - found @ expected @ np.linalg.solve(inner, expected @ found)
     covariance[np.ix_(seen, seen)] = found / lengths
     hidden = np.flatnonzero(~seen)
     covariance[hidden, hidden] = np.inf

@@ -124,7 +124,11 @@ class Prior:
         absent = np.array([term.absent for term in terms])
         # Around its absent value the logarithm of a factor changes as the factor itself does.
         centre = np.where(signed, absent / scales, np.log(np.where(signed | (absent <= 0.0), 1.0, absent)))
-        return cls(centre, (np.where(signed, scales, absent) / spread) ** 2)
+        precision = (np.where(signed, scales, absent) / spread) ** 2
+        for index, term in enumerate(terms):
+            if term.log_spread is not None:
+                centre[index], precision[index] = np.log(term.initial), 1.0 / term.log_spread**2
+        return cls(centre, precision)
 
     def cost(self, x: Array) -> float:
         """What the coordinates `x` (parameters,) add to the sum of squares."""

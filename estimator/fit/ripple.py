@@ -15,7 +15,7 @@ from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.regressor import regressor
 from hil.estimator.options import LinearOptions
 
-CYCLES = np.arange(1.0, 40.01, 0.25)  # per turn of the joint
+CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint: what is slower is gravity, cables, encoders
 COULOMB_WIDTH = LinearOptions().coulomb_width
 STRIBECK_VELOCITY = 0.15  # rad/s: about right is enough to keep the rise of friction out of the ripple
 
@@ -58,8 +58,11 @@ def _prepared(
     kept = lines.copy()
     kept[harmonics + 1 :] = 0.0
     torque = np.fft.irfft(kept * period.samples, period.samples)
-    friction = (sign * np.exp(-((velocity / STRIBECK_VELOCITY) ** 2)), sign * np.abs(torque))
-    columns = np.column_stack((Y, *friction))
+    friction = (sign * np.exp(-((velocity / STRIBECK_VELOCITY) ** 2)), sign * np.abs(torque), np.abs(velocity))
+    # What zeros that are off, cables and torque that saturates leave looks like slow ripple.
+    angles = np.cumsum(motion.position, axis=0)
+    slow = (*np.sin(angles), motion.position[joint], torque**3, *np.sin(2.0 * motion.position))
+    columns = np.column_stack((Y, *friction, *slow))
     columns = columns[:, np.abs(columns).max(axis=0) > 0.0]
     rows = _real(lines_of(columns.T)[:, : harmonics + 1]).T
     return rows, _real(lines[None, : harmonics + 1])[0], torque, motion.position[joint]

@@ -49,8 +49,8 @@ class SimulatedRun:
 
     def position(self, physics: Physics, start: Array) -> Array:
         """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
-        times = {"delay": physics.delay, "lag": physics.lag}
-        torque = motor_torque(self.command, self.rate, self.command_to_sample, self.steps, **times)
+        of = self.command, self.rate, self.command_to_sample, self.steps
+        torque = motor_torque(*of, delay=physics.delay, lag=physics.lags)
         return measured(physics, simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0])
 
     def pieces(
@@ -71,8 +71,8 @@ class SimulatedRun:
             *(physics, start, (*by_motion(names), *state), 1.0 / (self.rate * self.steps), self.max_substeps),
             tracking_stiffness,
         )
-        times = {"delay": physics.delay, "lag": physics.lag}
-        torque, slopes = torque_and_slopes(self.command, self.rate, self.command_to_sample, self.steps, **times)
+        of = self.command, self.rate, self.command_to_sample, self.steps
+        torque, slopes = torque_and_slopes(*of, delay=physics.delay, lag=physics.lags)
         samples = round(horizon * samples)
         ends = self.measured if self.pulled_to is None else self.pulled_to
         for first in range(0, samples, PIECE):

@@ -199,8 +199,14 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
     longest = max(period.samples for period in periods)
     window = max(lags, min(correlation.max_lag, int(correlation.min_window_share * longest)))
     samples = int(sum(period.valid.sum() for period in periods))
-    structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
-    covariance = robust_covariance(minimum.at, objective.scatter(x, window), samples, count, structured)
+    structured = sum(
+        float(np.sum(_model_error(each, weight, period)))
+        for each, weight, period in zip(residuals, objective.weights, periods, strict=True)
+    )
+    precision = np.zeros(x.size)
+    precision[:count] = objective.prior.precision
+    scatter = objective.scatter(x, window)
+    covariance = robust_covariance(minimum.at, scatter, samples, count, structured, precision)
     value = objective.coordinates.values(x[:count])
     return Fit(
         value,
@@ -211,3 +217,14 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
         float(lags),
         minimum.iterations,
     )
+
+
+def _model_error(residual: Array, weight: Array, period: SettledPeriod) -> Array:
+    """Part of each joint's weighted sum of squares that is neither white nor noise (joints,).
+
+    Rounding of a slow joint is not white either: what is no more than the noise is not the model's error.
+    """
+    squares = np.sum(residual**2, axis=1)
+    noise = np.sum((weight * period.noise[:, None]) ** 2, axis=1)
+    error: Array = np.minimum(structured_share(residual) * squares, np.maximum(squares - noise, 0.0))
+    return error

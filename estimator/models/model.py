@@ -33,7 +33,8 @@ class Model:
     unknown torque constant scales all parameters; of two, the ratio shows, since both joints feel the same masses.
     `saturation` takes the share saturation torque^2 off the torque, `cable` adds cable_stiffness q to what holds the
     joint (where it is slack is part of the offset), and `encoder` says that a joint at q is measured to be at q +
-    encoder_sin_once sin q + encoder_cos_once cos q + encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
+    encoder_sin_once sin q + encoder_cos_once cos q + encoder_sin_twice sin 2q + encoder_cos_twice cos 2q. `lags` lets
+    the second joint's torque lag by lag + lag_difference.
 
     Raises ModelError for other names, for other than one or two joints, and for a torque_scale of one joint.
     """

@@ -15,6 +15,7 @@ ABSENT = {name: term_of(name).absent for name in CONSTANTS}
 """What stands for a term that the model lacks; a pendulum's second joint is a wheel that nothing turns."""
 ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
 """Terms of what an encoder gets wrong at every turn."""
+LEAST_LAG = 1e-6  # s
 SLIDING = 0.05  # rad/s: faster than this a joint slides, and its friction's bristles are bent that way
 
 
@@ -35,6 +36,8 @@ class Physics:
     """Time constant of the torque's first-order lag [s]; 0 for none."""
     encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
     """Errors of the encoders by joint, in the order of ENCODER (2, terms) [rad]."""
+    lag_difference: float = 0.0
+    """Lag of the second joint's torque beyond the first's [s]."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":
@@ -48,7 +51,14 @@ class Physics:
         }
         vector = np.array([parameters.get(name, ABSENT[name]) for name in CONSTANTS])
         encoder = np.array([[parameters.get(f"{name}_{joint}", 0.0) for name in ENCODER] for joint in (1, 2)])
-        return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0), encoder)
+        beyond = parameters.get("lag_difference_2", 0.0)
+        return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0), encoder, beyond)
+
+    @property
+    def lags(self) -> Array:
+        """Time constants of the joints' lags (2,) [s]; the second's stays above 0 where there is one at all."""
+        other = max(self.lag + self.lag_difference, LEAST_LAG if self.lag_difference else 0.0)
+        return np.array([self.lag, other])
 
     def crossing_time(self) -> float:
         """The shortest time in which friction turned round moves a joint, over its step or on its bristles [s]."""

@@ -23,6 +23,7 @@ Option = Literal[
     "saturation",
     "cable",
     "encoder",
+    "lags",
 ]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
@@ -41,6 +42,7 @@ OPTIONS: dict[Option, str] = {
     "saturation": "torque that falls behind the command the larger it is",
     "cable": "a cable or spring that pulls the joint to one angle",
     "encoder": "errors of the encoders that repeat once and twice a turn",
+    "lags": "current loops of two joints that do not lag alike",
 }
 """What a model may have besides its laws of friction and drive, each in words: keys of `[model]` too."""
 
@@ -85,6 +87,8 @@ class Term:
     spread: Scale | float | None = None
     """How far from its `absent` value it lies on a usual arm (standard deviation), as a scale or a number [unit]; None
     where nothing is expected of it."""
+    log_spread: float | None = None
+    """The same of a positive term's logarithm, about that of `initial`."""
 
     @property
     def of_torque(self) -> bool:
@@ -147,6 +151,7 @@ _DECLARED = (
         absent=1.0,
         max_step=1.0,
         standstill=True,
+        log_spread=1.0,
     ),
     Term("load", "1", "dry friction per motor torque", part="stribeck_load", initial=0.02),
     Term(
@@ -219,6 +224,17 @@ _DECLARED = (
         )
         for times in ("once", "twice")
         for wave in ("sin", "cos")
+    ),
+    Term(
+        "lag_difference",
+        "s",
+        "lag of the joint's current loop beyond joint 1's",
+        part="lags",
+        first_joint=2,
+        range="any",
+        scale=1e-3,
+        simulated=False,
+        spread=1.5e-3,
     ),
     Term(
         "delay",

@@ -17,11 +17,10 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.covariance import autocorrelation
+from hil.estimator.fit.objective import Run
 from hil.estimator.fit.reparametrisation import Sizes
-from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
-from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.identify import Estimate
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
@@ -30,6 +29,7 @@ from hil.estimator.options import IntegrationOptions
 
 MAX_LAG_SHARE = 0.05  # of the samples, over which a residual's correlation is summed
 INTEGRATION = IntegrationOptions()
+COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,7 @@ def linearised(
     every = (*estimate.names, *added)
     values = {name: known.get(name, term_of(name).absent) for name in added} | estimate.parameters
     physics = Physics.of({**known, **values})
-    run = (
-        SimulatedRun.of(used, INTEGRATION)
-        if used.stabiliser is None
-        else StabilisedRun.of(used, used.stabiliser, INTEGRATION)
-    )
+    run = simulated_run(used)
     rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
     weight = np.where(np.isfinite(estimate.residual), 1.0 / np.maximum(rms, 1e-300), 0.0)
     causes = len(every) + 2 * period.joints
@@ -131,10 +127,12 @@ def linearised(
 def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
     """What could be added to the estimate's model, the best seen first.
 
-    `known`: where ripple repeats (`hil.estimator.fit.ripple.find_ripple`), by parameter name.
+    `known`: where ripple repeats (`ripple_cycles`), by parameter name; without it ripple is none of them.
     """
     model = estimate.model
     richer = _richer(model)
+    if not known:
+        richer.pop("ripple", None)
     new = {part: tuple(n for n in more.names if n not in model.names) for part, more in richer.items()}
     about = linearised(period, estimate, [n for names in new.values() for n in names], known)
     base, _ = about.fall(estimate.names)
@@ -190,6 +188,13 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     return covariance
 
 
+def simulated_run(period: SettledPeriod) -> Run:
+    """A period as it is simulated here, in the steps of a fit's result."""
+    if period.stabiliser is None:
+        return SimulatedRun.of(period, INTEGRATION)
+    return StabilisedRun.of(period, period.stabiliser, INTEGRATION)
+
+
 def colour(residual: Array) -> float:
     """Integrated autocorrelation of a residual (joints, samples), worst joint, missing samples as 0; 1 is white."""
     worst = 1.0
@@ -210,6 +215,8 @@ def _richer(model: Model) -> dict[str, Model]:
 
 
 def _may_be(option: str, model: Model) -> bool:
+    if option == "lags":
+        return model.joints == 2 and model.drive != "delay"
     return option != "torque_scale" or model.joints == 2
 
 
@@ -231,6 +238,36 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
     )
 
 
-def ripple_of(period: SettledPeriod, linear: LinearEstimate) -> dict[str, float]:
-    """Where ripple repeats, for `candidates`."""
-    return {name: value for name, value in find_ripple([period], linear).items() if "cycles" in name}
+def ripple_cycles(period: SettledPeriod, estimate: Estimate, cycles: Sequence[float]) -> dict[str, float]:
+    """Where ripple of each joint would explain most of what `estimate` leaves, of these `cycles` a turn, by name.
+
+    The score test of ripple for one number of cycles after the other, what the fitted parameters explain taken off.
+    """
+    used = without_spikes(period)
+    run = simulated_run(used).integrated(COARSE)
+    weight = np.where(np.isfinite(estimate.residual), 1.0 / period.noise[:, None], 0.0)
+    physics = Physics.of(estimate.parameters)
+    columns, position = _columns(run, physics, estimate.start, estimate.names, weight)
+    Q = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
+    residual = (weight * (run.measured - position)).reshape(-1)
+    rest = residual - Q @ (Q.T @ residual)
+    best: dict[int, tuple[float, float]] = {}
+    joints = range(1, period.joints + 1)
+    for each in cycles:
+        given = {f"ripple_cycles_{joint}": each for joint in joints}
+        names = tuple(f"ripple_{wave}_{joint}" for joint in joints for wave in ("sin", "cos"))
+        waves, _ = _columns(run, Physics.of({**estimate.parameters, **given}), estimate.start, names, weight)
+        waves = waves[:, : len(names)] - Q @ (Q.T @ waves[:, : len(names)])
+        for joint in joints:
+            own = waves[:, 2 * joint - 2 : 2 * joint]
+            fall = float(np.sum((np.linalg.qr(own)[0].T @ rest) ** 2))
+            best[joint] = max(best.get(joint, (-1.0, 0.0)), (fall, each))
+    return {f"ripple_cycles_{joint}": best[joint][1] for joint in joints}
+
+
+def _columns(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
+    """Weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
+    pieces = list(run.pieces(physics, start, names))
+    derivative = np.concatenate([each for _, _, each in pieces], axis=1) * weight[:, :, None]
+    position = np.concatenate([each for _, each, _ in pieces], axis=1)
+    return derivative.reshape(-1, derivative.shape[2]), position

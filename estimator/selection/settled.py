@@ -17,16 +17,22 @@ from scipy.stats import chi2
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError, PeriodicityError
-from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.fit.stage2 import Near
 from hil.estimator.identify import Estimate, identify, predict
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
-from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_of
+from hil.estimator.options import IntegrationOptions, LikelihoodOptions, MinimiserOptions, SelectionOptions
+from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
 
 DEFAULTS = SelectionOptions()
+THOROUGH = LikelihoodOptions()
+QUICK = LikelihoodOptions(
+    minimiser=MinimiserOptions(max_iterations=25, unfinished=1.0),
+    integration=IntegrationOptions(max_substeps=16),
+    coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
+)
+"""Bristles that turn out as stiff as none would take many substeps for nothing."""
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 """What is nothing where it is small, and so costs a fit nothing but its columns."""
 
@@ -60,9 +66,14 @@ class Choice:
         return self.chosen.estimate
 
     @property
+    def plainest(self) -> Trial:
+        """The trial with the fewest parameters that could be fitted."""
+        return min((each for each in self.trials if each.estimate is not None), key=lambda each: len(each.model.names))
+
+    @property
     def gained(self) -> float:
         """The plainest model's error over the chosen one's."""
-        return self.trials[0].score / self.chosen.score
+        return self.plainest.score / self.chosen.score
 
     @property
     def cost(self) -> float:
@@ -70,13 +81,17 @@ class Choice:
         model lacks were known: what adding them cost (geometric mean)."""
         estimate = self.estimate
         std = estimate.std
-        seen = np.isfinite(std)
-        added = seen & [name not in self.trials[0].model.names for name in estimate.names]
+        seen = np.isfinite(std) & (std > 0.0)
+        added = seen & [name not in self.plainest.model.names for name in estimate.names]
         base = seen & [name in estimate.model.base_names for name in estimate.names]
-        correlation = np.where(np.outer(seen, seen), estimate.covariance, 0.0) / np.outer(std, std)
+        if not added.any():
+            return 1.0
+        correlation = np.where(np.outer(seen, seen), estimate.covariance, 0.0) / np.outer(
+            np.where(seen, std, 1.0), np.where(seen, std, 1.0)
+        )
         across = correlation[np.ix_(added, base)]
-        told = np.sum(across * np.linalg.solve(correlation[np.ix_(added, added)], across), axis=0)
-        return float(np.exp(-0.5 * np.mean(np.log1p(-told))))
+        told = np.sum(across * (np.linalg.pinv(correlation[np.ix_(added, added)]) @ across), axis=0)
+        return float(np.exp(-0.5 * np.mean(np.log1p(-np.clip(told, 0.0, 1.0 - 1e-9)))))
 
 
 def choose(
@@ -131,34 +146,42 @@ class Selection:
         self._starts = starts
         self._options = options
         self._fixed = fixed
-        self._known = ripple_of(self._periods[0], fit_lines(self._periods[0]))
         self.trials: list[Trial] = []
         """In the order in which they were made."""
 
     def grow(self, model: Model) -> Trial:
         """From `model` to the richest one that the motion asks for. Raises ConvergenceError."""
-        unknown: set[Option] = {"zeros", "torque_scale"} if model.joints == 2 else {"zeros"}
-        plain = self._try_or_none(model.having(*unknown))
+        unknown: set[Option] = {"zeros"}
+        if model.joints == 2:
+            unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
+        plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
             return plain
         smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
-        best = self._better(self._try_or_none(smooth, plain if explained else None), plain)
+        best = plain
+        if plain is not None and self._left(plain) < self._options.near_residual**2:
+            best = self._better(self._try_or_none(smooth, plain), plain)
+        if best is None or self._left(best) > self._options.presliding_residual**2:
+            best = self._better(self._try_or_none(smooth), best)
         if best is None:
             raise ConvergenceError("no friction model could be fitted: look at the recording, or lower the torque")
         if self._left(best) > self._options.presliding_residual**2:
-            best = self._better(self._try_or_none(smooth.having("presliding")), best) or best
+            best = self._better(self._try_or_none(smooth.having("presliding"), coarse=True), best) or best
         if not self._is_explained(best):
             best = self._with_ripple(best)
         return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
 
     def _seen(self, trial: Trial) -> list[Candidate]:
         assert trial.estimate is not None
-        return [each for each in candidates(self._periods[0], trial.estimate, self._known) if each.evidence > 1.0]
+        return [each for each in candidates(self._periods[0], trial.estimate, {}) if each.evidence > 1.0]
 
     def _with_ripple(self, best: Trial) -> Trial:
         assert best.estimate is not None
-        for each in candidates(self._periods[0], best.estimate, self._known):
+        if "ripple" in best.model.options:
+            return best
+        known = ripple_cycles(self._periods[0], best.estimate, self._options.ripple_cycles)
+        for each in candidates(self._periods[0], best.estimate, known):
             if each.part == "ripple" and each.evidence > self._options.ripple_evidence:
                 return self._better(self._try_or_none(each.model, best, each.values), best) or best
         return best
@@ -177,6 +200,8 @@ class Selection:
         """`richer` if its terms gain what they must, else `plainer`."""
         if richer is None or plainer is None:
             return richer or plainer
+        if richer.model == plainer.model:
+            return min(richer, plainer, key=self._left)
         return richer if self._gain(richer, plainer) > self._worth(richer, plainer) else plainer
 
     def prune(self, best: Trial) -> Trial:
@@ -185,12 +210,19 @@ class Selection:
         if self._left(best) > self._options.presliding_residual**2:
             return best  # what is missing would be taken for what is there
         for level in self._options.prune_levels:
+            plainer = self._pruned_at(level, best)
+            if plainer is best or self._gain(best, plainer) < self._worth(best, plainer):
+                return plainer
+        return best
+
+    def _pruned_at(self, level: float, best: Trial) -> Trial:
+        """Pruned and fitted again until nothing more is doubtful: a fit of fewer terms knows the rest better."""
+        while best.estimate is not None:
             plainer = _without_nothings(best.estimate, level, self._fixed)
-            if plainer == best.model:
-                return best
-            trial = self._try_or_none(plainer, best)
-            if trial is not None and self._gain(best, trial) < self._worth(best, trial):
-                return trial
+            trial = None if plainer == best.model else self._try_or_none(plainer, best)
+            if trial is None:
+                break
+            best = trial
         return best
 
     def judged(self, chosen: Trial) -> Trial:
@@ -226,22 +258,28 @@ class Selection:
         return max(1, len(richer.model.names) - len(plainer.model.names)) * float(np.log(independent))
 
     def _try_or_none(
-        self, model: Model, near: Trial | None = None, values: Mapping[str, float] = MappingProxyType({})
+        self,
+        model: Model,
+        near: Trial | None = None,
+        values: Mapping[str, float] = MappingProxyType({}),
+        *,
+        coarse: bool = False,
     ) -> Trial | None:
         """A trial; None where the fit does not converge."""
         try:
-            return self._try(model, near, values)
+            return self._try(model, near, values, coarse=coarse)
         except ConvergenceError:
             self.trials.append(Trial(model, None, None, np.inf, 0.0))
             return None
 
-    def _try(self, model: Model, near: Trial | None, values: Mapping[str, float]) -> Trial:
+    def _try(self, model: Model, near: Trial | None, values: Mapping[str, float], *, coarse: bool = False) -> Trial:
         """From where `near` ended, with `values` for what it lacks, or from scratch."""
         started = time.perf_counter()
         place = None
         if near is not None and near.estimate is not None:
             place = Near({**near.estimate.parameters, **values}, near.estimate.start)
-        estimate = identify(self._periods, model, starts=self._starts, near=place)
+        options = QUICK if coarse and "presliding" in model.options else THOROUGH
+        estimate = identify(self._periods, model, starts=self._starts, near=place, coarse=coarse, options=options)
         relative, score = self._predicted(estimate)
         trial = Trial(model, estimate, relative, score, time.perf_counter() - started)
         self.trials.append(trial)

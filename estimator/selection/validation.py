@@ -10,9 +10,11 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.identify import Estimate, predict
+from hil.estimator.models.terms import joint_of, kind_of
 from hil.estimator.selection.distortion import Distortion, distortion, excited_lines
 
 LAGS = 100
+LITTLE_TORQUE = 0.1  # of the RMS torque: less gravity than that is as good as none
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,25 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
         _free_run(period, estimate),
         float(np.linalg.cond(correlation)),
         (names[first], names[second], float(correlation[first, second])),
-        {
-            name: float(std / abs(value)) if value else np.inf
-            for name, value, std in zip(names, estimate.value, estimate.std, strict=False)
-            if not name.startswith("offset")
-        },
+        _relative_std(period, estimate),
         levels(period, estimate),
     )
+
+
+def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
+    """Standard error over value of each base parameter but offsets.
+
+    Gravity may be nothing, on an arm that lies flat: then its error counts against the torque that moved the arm.
+    """
+    torque = LITTLE_TORQUE * np.sqrt(np.mean(period.torque**2, axis=1))
+    relative = {}
+    for name, value, std in zip(estimate.model.base_names, estimate.value, estimate.std, strict=False):
+        if kind_of(name) == "offset":
+            continue
+        least = float(torque[(joint_of(name) or 1) - 1]) if kind_of(name) == "gravity" else 0.0
+        size = max(abs(float(value)), least)
+        relative[name] = float(std) / size if size else np.inf
+    return relative
 
 
 def levels(period: SettledPeriod, estimate: Estimate) -> Levels:

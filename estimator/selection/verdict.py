@@ -1,20 +1,31 @@
-"""A verdict in words: trust the estimate or not, which parameter is weak, what experiment would mend it."""
+"""A verdict in words: trust the estimate or not, what is weak, what spoils it, which experiment would improve it.
 
-from dataclasses import dataclass
+"Yes" means that every inertia, gravity and friction parameter is, as far as can be judged, within 2 % or three of its
+standard errors. So it rests on standard errors that hold: those of the estimate are widened by what its model leaves
+out (`hil.estimator.selection.candidates.considered`) and by what it leaves of the motion
+(`hil.estimator.fit.covariance`). No sentence advises what the tool has tried already.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.identify import Estimate
+from hil.estimator.models.terms import OPTIONS, kind_of
+from hil.estimator.selection.candidates import Candidate
+from hil.estimator.selection.drift import LEAST, Drift
 from hil.estimator.selection.validation import Validation
 
-EXPLAINED = 1.04  # residual over floor up to which the model has explained the motion
+EXPLAINED = 1.06  # residual over noise up to which the model has explained the motion
 GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # of the motion's RMS
-MUCH_LEFT = 5.0  # residual over floor from which parameters are doubtful without a held-out check
-WELL_KNOWN = 0.01  # relative standard error
+MUCH_LEFT = 5.0  # residual over noise from which parameters are doubtful without a held-out check
+WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
 ALIKE = 0.99  # correlation
-MEND = {
+NOISY = 1.25  # noise over rounding from which it is said
+IMPROVEMENT = {
     "inertia": "faster motion: raise the upper edge of experiment.band or peak_torque",
     "coupling": "faster motion of both joints together: raise peak_torque",
     "armature": "faster motion of joint 2: raise its peak_torque or the upper edge of experiment.band",
@@ -22,9 +33,8 @@ MEND = {
     "viscous": "higher speeds: raise peak_torque",
     "coulomb": "more slow reversals: lower the lower edge of experiment.band, or lengthen the period",
 }
-
-ODD_MEND = "What it leaves on odd lines asks for richer friction or ripple."
-EVEN_MEND = "What it leaves on even lines asks for model.asymmetry or model.zeros."
+ODD_HINT = "What it leaves on odd lines is friction or ripple that no term of the model has."
+EVEN_HINT = "What it leaves on even lines differs with direction, or comes from an offset in torque or angle."
 BEYOND_NOISE = 2.0
 
 Trust = Literal["yes", "with care", "no"]
@@ -39,53 +49,108 @@ class Verdict:
     sentences: tuple[str, ...]
 
 
-def judge(estimate: Estimate, validation: Validation, held_out: Array | None) -> Verdict:
-    """`held_out`: RMS error of the free prediction of a motion not fitted, over that motion's RMS (joints,)."""
+@dataclass(frozen=True)
+class Evidence:
+    """What is known beside the estimate and its validation."""
+
+    held_out: Array | None = None
+    """RMS error of the free prediction of a motion not fitted, over that motion's RMS (joints,)."""
+    candidates: Sequence[Candidate] = ()
+    """What the model leaves out, best seen first."""
+    drift: Drift | None = None
+    """How friction changed while the arm moved."""
+    doubts: tuple[str, ...] = field(default=())
+    """What cannot be, or does not agree with what is known of the arm: sentences."""
+    tried_all: bool = False
+    """Whether the tool chose the model from all that it knows."""
+
+
+def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
+    """The verdict on `estimate`."""
+    explained = float(validation.residual_over_floor.max()) <= EXPLAINED
     sentences = (
-        _explained(estimate, validation),
-        *_distorted(validation),
-        *_predicted(held_out),
+        _noise(validation) if explained else _unexplained(estimate, validation, evidence),
+        *(() if explained else _distorted(validation)),
+        *_drifted(evidence.drift),
+        *_predicted(evidence.held_out),
+        *evidence.doubts,
         *_weak(validation),
         *_alike(validation),
-        *_outliers(estimate, validation),
+        *_outliers(estimate, explained),
     )
-    return Verdict(_trust(validation, held_out), validation.weakest, sentences)
+    return Verdict(_trust(validation, evidence), validation.weakest, sentences)
 
 
-def _trust(validation: Validation, held_out: Array | None) -> Trust:
+def _trust(validation: Validation, evidence: Evidence) -> Trust:
     left = float(validation.residual_over_floor.max())
-    weak = max(validation.relative_std.values()) > 10 * WELL_KNOWN
-    if held_out is None:
+    doubtful = max(validation.relative_std.values()) > WEAK or bool(evidence.doubts)
+    if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"
-        return "yes" if left <= EXPLAINED and not weak else "with care"
-    worst = float(held_out.max())
+        return "with care" if doubtful or left > EXPLAINED else "yes"
+    worst = float(evidence.held_out.max())
     if not worst <= USABLE_PREDICTION:
         return "no"
-    return "yes" if worst <= GOOD_PREDICTION and left <= MUCH_LEFT and not weak else "with care"
+    return "with care" if doubtful or left > MUCH_LEFT or worst > GOOD_PREDICTION else "yes"
 
 
-def _explained(estimate: Estimate, validation: Validation) -> str:
-    left = float(validation.residual_over_floor.max())
-    if left <= EXPLAINED:
-        return "The model explains the motion down to the encoder's rounding and the scatter between periods."
-    joint = int(np.argmax(validation.residual_over_floor)) + 1
-    error = float(validation.levels.model_error.max())
-    model = estimate.model
-    ratio = "set torque_scale = true there, " if model.joints == 2 and "torque_scale" not in model.options else ""
+def _noise(validation: Validation) -> str:
+    noise = validation.levels.noise
+    joint = int(np.argmax(noise))
+    if noise[joint] * np.sqrt(12.0) < NOISY:
+        return "The model explains the motion down to the encoders' rounding."
     return (
-        f"Joint {joint} moves in a way that the model does not have: {left:.1f} times the noise is left, a model error "
-        f'of {error:.2g} encoder steps RMS. Let [model] friction = "auto" choose, {ratio}and look for play, a '
-        "dragging cable or a loose screw."
+        f"The model explains the motion down to the encoders' noise, {noise[joint]:.2g} steps RMS on joint "
+        f"{joint + 1}; rounding alone is 0.29."
     )
+
+
+def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence) -> str:
+    left = validation.residual_over_floor
+    joint = int(np.argmax(left))
+    error = float(validation.levels.model_error.max())
+    said = (
+        f"Joint {joint + 1} moves in a way that the model does not have: {left[joint]:.1f} times the noise is left, a "
+        f"model error of {error:.2g} encoder steps RMS."
+    )
+    return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation)))
+
+
+def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
+    """What it looks like, with what speaks for it."""
+    seen = [each for each in evidence.candidates if each.evidence > 1.0]
+    if seen:
+        what = _in_words(seen[0].part)
+        advice = "" if evidence.tried_all else ' [model] friction = "auto" tries that.'
+        return f"It looks most like {what}, which would explain {100.0 * seen[0].explained:.0f} % of it.{advice}"
+    if not evidence.tried_all and estimate.model.friction != "stribeck_load":
+        return 'No single term explains it; [model] friction = "auto" tries them together.'
+    return (
+        "No term that this tool has explains it: play in the gears, a loose screw, a supply that sags or a cable that "
+        "drags would."
+    )
+
+
+def _in_words(part: str) -> str:
+    laws = {"stribeck": "friction that rises at low speed", "stribeck_load": "friction that grows with load"}
+    return laws.get(part) or next(words for option, words in OPTIONS.items() if option == part)
+
+
+def _spoilt(validation: Validation) -> str:
+    """The parameters that what is missing may have spoilt, by their widened errors."""
+    worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
+    if not worst:
+        return "It spoils none of the parameters: with it, each is known to 2 % or better."
+    named = sorted(worst, key=lambda name: -worst[name])
+    listed = ", ".join(f"{name} ({100.0 * worst[name]:.2g} %)" for name in named[:4])
+    more = f" and {len(named) - 4} others" if len(named) > 4 else ""
+    return f"It may spoil {listed}{more}; the others stay within 2 %."
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
     """Where the excitation left lines out: what answers there, and what of it the model does not have."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        if validation.residual_over_floor.max() <= EXPLAINED:
-            return ()
         return ("Whether that is odd (friction) or even (offsets, direction), experiment.detection = true would tell.",)
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
@@ -100,11 +165,23 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
         f"{share(levels.even.left)}."
     )
     beyond = [
-        mend
-        for group, mend in ((levels.odd, ODD_MEND), (levels.even, EVEN_MEND))
+        hint
+        for group, hint in ((levels.odd, ODD_HINT), (levels.even, EVEN_HINT))
         if np.any(group.left > BEYOND_NOISE * levels.noise)
     ]
     return (" ".join((found, *beyond)),)
+
+
+def _drifted(drift: Drift | None) -> tuple[str, ...]:
+    if drift is None:
+        return ()
+    return tuple(
+        f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {100.0 * abs(change):.2g} % within "
+        f"{drift.seconds:.0f} s, as it does while grease warms up: the values hold for the periods that were fitted. "
+        "Run it once more while it is warm for those of a warm arm."
+        for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
+        if abs(change) > max(LEAST, 3.0 * std)
+    )
 
 
 def _predicted(held_out: Array | None) -> tuple[str, ...]:
@@ -119,13 +196,14 @@ def _weak(validation: Validation) -> tuple[str, ...]:
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
         return (f"Known least well is {name}, to {100 * part:.2g} %.",)
-    mend = MEND[name.split("_")[0]]
-    return (f"Weak: {name} is known to {100 * part:.2g} % only. What would mend it is {mend}.",)
+    improvement = IMPROVEMENT[kind_of(name)]
+    return (f"Known least well is {name}, to {100 * part:.2g} % only. What would improve it is {improvement}.",)
 
 
 def _alike(validation: Validation) -> tuple[str, ...]:
     first, second, correlation = validation.confounded
-    if abs(correlation) < ALIKE:
+    both = max(validation.relative_std.get(name, 0.0) for name in (first, second))
+    if abs(correlation) < ALIKE or both <= WELL_KNOWN:
         return ()
     return (
         f"{first} and {second} are hard to tell apart (correlation {correlation:.3f}): excite more lines, or with "
@@ -133,8 +211,8 @@ def _alike(validation: Validation) -> tuple[str, ...]:
     )
 
 
-def _outliers(estimate: Estimate, validation: Validation) -> tuple[str, ...]:
+def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     # Where the model lacks something, what is far from it is no fault of the reading.
-    if not estimate.outliers or validation.residual_over_floor.max() > EXPLAINED:
+    if not estimate.outliers or not explained:
         return ()
     return (f"{estimate.outliers} readings were far off and downweighted; if that goes on, look at cables and baud.",)

@@ -8,7 +8,7 @@ to first order.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,7 @@ class Stabilised:
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
     """Commands take effect `command_to_sample` [s] before the sample of the same index: so much less lag."""
-    return Physics(physics.vector, physics.delay, max(physics.lag - command_to_sample, 1e-5))
+    return replace(physics, lag=max(physics.lag - command_to_sample, 1e-5))
 
 
 def resting(pose: Array) -> Array:

@@ -14,21 +14,22 @@ from hil.estimator.arrays import Array
 
 
 def motor_torque(
-    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float
+    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float | Array
 ) -> Array:
     """Mean motor torque over each of `steps` equal steps after each sample (joints, samples, steps) [N m].
 
     `command` (joints, samples) [N m] is periodic, each value held until the next; sample k is taken
     `command_to_sample` [s] after command k takes effect. The torque follows `delay` [s] later through a
-    first-order lag [s]. The means are exact, of a step in which the command changes too.
+    first-order lag [s], one for all joints or each its own. The means are exact, of a step in which the command
+    changes too.
     """
     return _torque(command, rate, command_to_sample, steps, delay, lag)[0]
 
 
 def torque_and_slopes(
-    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float
+    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float | Array
 ) -> tuple[Array, Array]:
-    """`motor_torque`, and its derivatives by delay and by lag (2, joints, samples, steps) [N m/s].
+    """`motor_torque`, and its derivatives by delay and by each joint's own lag (2, joints, samples, steps) [N m/s].
 
     Where a command changes at the very edge of a step and no lag softens it, the derivative by delay is that of less.
     """
@@ -37,7 +38,7 @@ def torque_and_slopes(
 
 
 def _torque(
-    command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float
+    command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float | Array
 ) -> tuple[Array, Array, Array]:
     """The mean torque over each step, and its derivatives by delay and lag."""
     joints, samples = command.shape
@@ -46,23 +47,32 @@ def _torque(
     edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delay
     shifts = np.floor(edges * rate)
     phases = edges - shifts / rate
-    fading = np.exp(-phases / lag) if lag > 0.0 else np.zeros(steps + 1)
+    lags = np.broadcast_to(np.asarray(lag, dtype=np.float64), (2,))[:joints] if np.ndim(lag) else np.full(joints, lag)
+    fading = np.where(lags[:, None] > 0.0, np.exp(-phases / np.where(lags > 0.0, lags, 1.0)[:, None]), 0.0)
     torque, late, change = (np.empty((joints, samples, steps)) for _ in range(3))
     lagging = np.empty((2, samples))
     _average(
-        *(np.ascontiguousarray(command), total, rate, lag, shifts.astype(np.int64), phases, fading),
+        *(
+            np.ascontiguousarray(command),
+            total,
+            rate,
+            np.ascontiguousarray(lags),
+            shifts.astype(np.int64),
+            phases,
+            fading,
+        ),
         *(lagging, torque, late, change),
     )
     return torque, late, change
 
 
 # Compiled code takes its arguments by position. Edge i of each sample's steps is `phases[i]` [s] after the command
-# `shifts[i]` commands later, by when `fading[i]` of what the lag held back then is left.
+# `shifts[i]` commands later, by when `fading[j, i]` of what the lag held back then is left.
 def _average_loop(
     command: Any,
     total: Any,
     rate: float,
-    lag: float,
+    lags: Any,
     shifts: Any,
     phases: Any,
     fading: Any,
@@ -74,6 +84,7 @@ def _average_loop(
     joints, samples, steps = torque.shape
     per_time = steps * rate
     for j in range(joints):
+        lag = lags[j]
         _follow(command, j, rate, lag, lagging)
         for k in range(samples):
             gathered_before = present_before = by_lag_before = 0.0
@@ -84,10 +95,10 @@ def _average_loop(
                 held = command[j, at]
                 # Integral of the held command since command 0.
                 gathered = (turns * total[j, samples] + total[j, at]) / rate + held * phases[i]
-                left = (lagging[0, at] - held) * fading[i]
+                left = (lagging[0, at] - held) * fading[j, i]
                 present = held + left
                 # Without a lag the torque changes by lag times the command's steps, which has no derivative here.
-                by_lag = left * phases[i] / (lag * lag) + lagging[1, at] * fading[i] if lag > 0.0 else 0.0
+                by_lag = left * phases[i] / (lag * lag) + lagging[1, at] * fading[j, i] if lag > 0.0 else 0.0
                 if i > 0:
                     # lag y' = u - y, integrated over a step: the mean of y is that of u less what the lag has stored.
                     stored = (present - present_before) * per_time

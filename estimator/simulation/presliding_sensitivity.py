@@ -33,6 +33,7 @@ from hil.estimator.simulation.bristles import (
 from hil.estimator.simulation.sensitivity import (
     AT_ONCE,
     DELAY,
+    LAG_DIFFERENCE,
     NOWHERE,
     SLOPES,
     STAGE,
@@ -150,6 +151,8 @@ def _bend(
             level_by[r + at[SATURATION + joint]] = -loaded * cube
             for cause in range(2):
                 level_by[r + at[DELAY + cause]] = loaded * scale * eased * dt[cause, joint]
+            if joint == 1:
+                level_by[r + at[LAG_DIFFERENCE]] = loaded * scale * eased * dt[1, joint]
             b[joint] = way * level + away * left
             bent = way * b[joint] / level
             z = (2 + joint) * WIDE

@@ -51,8 +51,8 @@ from hil.estimator.simulation.arm import (
 )
 
 # What can be differentiated by: the constants, the drive's times, the state at the first sample.
-CAUSES = (*CONSTANTS, "delay", "lag", "position_1", "position_2", "velocity_1", "velocity_2")
-DELAY, STATE = len(CONSTANTS), len(CONSTANTS) + 2
+CAUSES = (*CONSTANTS, "delay", "lag", "lag_difference_2", "position_1", "position_2", "velocity_1", "velocity_2")
+DELAY, LAG_DIFFERENCE, STATE = len(CONSTANTS), len(CONSTANTS) + 2, len(CONSTANTS) + 3
 COUPLING, GRAVITY_1, GRAVITY_2 = map(CONSTANTS.index, ("coupling", "gravity_1", "gravity_2"))
 ZERO_1, ZERO_2 = ZERO, ZERO + 1
 
@@ -112,9 +112,9 @@ class Sensitive:
         """Go on by as many samples as `torque` has.
 
         `torque` (joints, samples, steps): mean motor torque over each step after each sample [N m];
-        `torque_slopes` (2, joints, samples, steps): its derivatives by delay and lag [N m/s]; `tracked` (joints,
-        samples) [rad]: the springs' other ends, held from sample to sample. Returns the angles (joints, samples)
-        [rad] and their derivatives (joints, samples, causes).
+        `torque_slopes` (2, joints, samples, steps): its derivatives by delay and by each joint's lag [N m/s]; `tracked`
+        (joints, samples) [rad]: the springs' other ends, held from sample to sample. Returns the angles (joints,
+        samples) [rad] and their derivatives (joints, samples, causes).
         """
         joints, samples, steps = torque.shape
         both = np.zeros((2, samples, steps))
@@ -199,6 +199,9 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     for cause in range(2):
         given = scale * eased * shape * dt[cause, joint]
         rows[f + at[DELAY + cause]], rows[s + at[DELAY + cause]] = given * passed, given * loaded * bent
+    if joint == 1:
+        # The last was that by its own lag.
+        rows[f + at[LAG_DIFFERENCE]], rows[s + at[LAG_DIFFERENCE]] = given * passed, given * loaded * bent
     cable = p[CABLE + joint]
     left[stage, joint] = motor - offset - cable * q - viscous * v - dry * bend
     slope[stage, joint] = viscous + level * bent

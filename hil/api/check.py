@@ -37,7 +37,7 @@ class CheckReport:
     def to_json(self) -> dict[str, Any]:
         """What `hil check --json` prints."""
         findings = [
-            {"level": str(each.level), "where": each.where, "what": each.what, "found": each.found, "mend": each.mend}
+            {"level": str(each.level), "where": each.where, "what": each.what, "found": each.found, "fix": each.fix}
             for each in self.findings
         ]
         return {"ready": self.ready, "findings": findings}

@@ -51,7 +51,7 @@ def estimate(
         paths = [Path(each) for each in recording]
     if are_csv(paths):
         if config is None:
-            raise ConfigError("A CSV file needs --config ARM.toml, whose [columns] says what its columns are.")
+            raise ConfigError("A CSV file needs --config ARM.toml, whose [columns] table describes the columns.")
         on_progress(Progress("estimation", "Estimating by multiple shooting"))
         return estimation(estimate_csv(paths, Path(config)), None)
     run = RunFolder.open(paths[0])
@@ -62,7 +62,7 @@ def estimate(
     try:
         result = estimate_run(run)
     except RecordingCutShort as error:
-        error.add_note(f"What there is can be used without a settled period: hil estimate {run.path} --all-samples")
+        error.add_note(f"To estimate without a settled period: hil estimate {run.path} --all-samples")
         raise
     write_run_report(run)
     return identification(result, run.path)

@@ -75,7 +75,7 @@ def identify(
         tell(Progress("estimation", "Estimating"))
         result = estimate_run(run)
     write_run_report(run)
-    log.info("%s: trust it: %s", run.path, result.verdict.trust)
+    log.info("%s: trust this model: %s", run.path, result.verdict.trust)
     return identification(result, run.path)
 
 
@@ -95,8 +95,8 @@ def record(
         checked = _taking_over(checked)
     if checked.experiment.pilot:
         raise ConfigError(
-            f"{shown}: experiment.pilot = true: each step's torque follows from an estimate of the one before, which "
-            "`hil identify` does. To record alone, give experiment.peak_torque and set pilot = false."
+            f"{shown}: experiment.pilot = true: each step's torque depends on the previous step's estimate, which only "
+            "`hil identify` makes. To record only, set experiment.peak_torque and pilot = false."
         )
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)

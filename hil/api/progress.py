@@ -49,7 +49,7 @@ def forgiving(listener: OnProgress) -> OnProgress:
             listener(progress)
         except Exception:
             failed = True
-            log.exception("on_progress raised an exception; it is not called again")
+            log.exception("on_progress raised an exception; it will not be called again")
 
     return tell
 

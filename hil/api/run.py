@@ -60,7 +60,7 @@ class Identification(SettledResult):
         wanted = names or _SHOWN
         for name in names:
             if not any(each.startswith(name) for each in found):
-                raise ValueError(f"no picture begins with {name!r}; there are {', '.join(found)}")
+                raise ValueError(f"no picture name starts with {name!r}; there are {', '.join(found)}")
         chosen = [figure for each, figure in found.items() if each.startswith(wanted)]
         return draw_figures(chosen or list(found.values()))
 
@@ -79,7 +79,7 @@ class Identification(SettledResult):
         """Write the arm or its recording as "urdf", "mjcf", "toml", "json", "csv", "parquet", "mcap" or "mat".
 
         Returns:
-            Where the file is, and what the format has no place for, a sentence each.
+            Where the file is, and what the format cannot represent, a sentence each.
 
         Raises:
             ExportError: the format cannot hold this arm, or a package for it is not installed.
@@ -132,7 +132,7 @@ class Run:
     def model(self) -> ArmModel:
         """The identified arm; raises ResultError before an estimate from settled periods."""
         if not isinstance(self.result, Identification):
-            raise ResultError(f"{self.path} holds no estimate from settled periods yet; hil.estimate makes one.")
+            raise ResultError(f"{self.path} has no estimate from settled periods yet; run hil.estimate first.")
         return self.result.model
 
     def plot(self) -> Any:

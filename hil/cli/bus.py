@@ -23,9 +23,7 @@ PortOrConfig = Annotated[
 
 def scan(
     port: PortOrConfig = None,
-    baud: Annotated[
-        list[int] | None, typer.Option("--baud", help="Only this baud; may be given more than once.")
-    ] = None,
+    baud: Annotated[list[int] | None, typer.Option("--baud", help="Scan only this baud rate; may be repeated.")] = None,
     json_only: Json = False,
 ) -> None:
     """Find servos: every baud, every ID, with model, firmware, voltage, temperature and errors."""
@@ -53,7 +51,7 @@ def scan(
 
 
 def check(config: ConfigPath, json_only: Json = False) -> None:
-    """Look for everything that would stop an experiment, with how to mend it. Torque stays off."""
+    """Check for everything that would stop an experiment and say how to fix it. Torque stays off."""
     from hil.api.check import check as check_arm
     from hil.cli.setup_view import print_findings
     from hil.cli.terminal import Terminal
@@ -68,16 +66,16 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
 def setup(
     port: PortOrFile,
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
-    baud: Annotated[int, typer.Option("--baud", help="Its present baud.")] = 1_000_000,
+    baud: Annotated[int, typer.Option("--baud", help="Its present baud rate.")] = 1_000_000,
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
     new_baud: Annotated[int | None, typer.Option("--new-baud")] = None,
     return_delay_us: Annotated[
-        int | None, typer.Option("--return-delay-us", min=0, max=508, help="0 is wanted.")
+        int | None, typer.Option("--return-delay-us", min=0, max=508, help="Recommended: 0.")
     ] = None,
     secondary_id: Annotated[
-        int | None, typer.Option("--secondary-id", min=0, max=255, help="255 is none, which is wanted.")
+        int | None, typer.Option("--secondary-id", min=0, max=255, help="255 disables it (recommended).")
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Answer every question with yes.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Answer yes to every question.")] = False,
     json_only: Json = False,
 ) -> None:
     """Set a servo's ID, baud, return delay or Secondary ID: a question before each write, each write read back."""
@@ -89,14 +87,14 @@ def setup(
     from hil.setup.servo_settings import open_servo, set_up
 
     if new_baud is not None and new_baud not in BAUD_RATES:
-        raise typer.BadParameter(f"{new_baud}: a servo can do {', '.join(map(str, BAUD_RATES))}.")
+        raise typer.BadParameter(f"{new_baud}: servos support {', '.join(map(str, BAUD_RATES))}.")
     if json_only and not yes:
         raise typer.BadParameter("--json asks no questions: it needs --yes.")
     opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)
         if written := recover(servo, opened.url):
-            print(f"What an earlier run could not put back is put back: {', '.join(written)}.", file=sys.stderr)
+            print(f"Restored settings that an earlier run had left changed: {', '.join(written)}.", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
         changes = set_up(
             servo,

@@ -24,7 +24,7 @@ def compare(
     from hil.runs.run_folder import RunFolder
 
     folder = RunFolder.open(run)
-    with Terminal(quiet=json_only).busy("Running the peers"):
+    with Terminal(quiet=json_only).busy("Running the other methods"):
         compared = compare_run(folder, mujoco)
     if json_only:
         print(strict_json.dumps(to_json(compared)))
@@ -39,14 +39,18 @@ def compare(
 
 
 def calibrate(
-    without: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder without the mass.")],
-    with_mass: Annotated[Path, typer.Argument(metavar="RUN_WITH_MASS", help="Run folder with it bolted on.")],
-    mass: Annotated[float, typer.Option("--mass", metavar="KG", help="What was bolted to the last link.")],
-    distance: Annotated[float, typer.Option("--distance", metavar="M", help="Its centre from the last joint.")],
+    without: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of the arm without the mass.")],
+    with_mass: Annotated[
+        Path, typer.Argument(metavar="RUN_WITH_MASS", help="Run folder of the arm with the mass bolted on.")
+    ],
+    mass: Annotated[float, typer.Option("--mass", metavar="KG", help="Mass bolted to the last link.")],
+    distance: Annotated[
+        float, typer.Option("--distance", metavar="M", help="Distance of its centre from the last joint.")
+    ],
     length: Annotated[
-        float | None, typer.Option("--length", metavar="M", help="Of link 1; default known.length_1.")
+        float | None, typer.Option("--length", metavar="M", help="Length of link 1; default known.length_1.")
     ] = None,
-    inertia: Annotated[float, typer.Option("--inertia", metavar="KG_M2", help="About its own centre.")] = 0.0,
+    inertia: Annotated[float, typer.Option("--inertia", metavar="KG_M2", help="Inertia about its own centre.")] = 0.0,
     json_only: Json = False,
 ) -> None:
     """Each joint's torque constant, from a second run with a known mass bolted on."""

@@ -12,14 +12,14 @@ from hil.cli.options import ConfigPath, Json
 def dry_run(
     config: ConfigPath,
     result: Annotated[
-        Path | None, typer.Option("--result", metavar="RUN", help="Former run: its result in place of the prior.")
+        Path | None, typer.Option("--result", metavar="RUN", help="Earlier run whose result replaces the prior.")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
+        Path | None, typer.Option("--picture", metavar="FILE", help="Also plot it: .png or .svg.")
     ] = None,
-    arms: Annotated[int, typer.Option("--arms", min=20, max=5000, help="Arms to simulate.")] = 128,
+    arms: Annotated[int, typer.Option("--arms", min=20, max=5000, help="Number of arms to simulate.")] = 128,
     servos: Annotated[
-        bool, typer.Option("--servos", help="Also read the servos' limits and time the bus, with torque off.")
+        bool, typer.Option("--servos", help="Also read the servos' limits and measure bus timing, with torque off.")
     ] = False,
     json_only: Json = False,
 ) -> None:

@@ -19,5 +19,5 @@ def message(error: Exception) -> str:
     lines = [f"hil: {error}", *getattr(error, "__notes__", [])]
     cause = error.__context__
     if cause is not None and error.__cause__ is None and isinstance(cause, Exception) and exit_code(cause) is not None:
-        lines.append(f"This came after: {cause}")
+        lines.append(f"Preceded by: {cause}")
     return "\n".join(lines)

@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from hil.api.run import Estimation, Identification
 
 TakeOver = Annotated[
-    bool, typer.Option("--take-over", help="Let an arm that is held sink slowly and take it over. Hold it by hand.")
+    bool, typer.Option("--take-over", help="Take over an arm whose torque is on: support it by hand; it sinks slowly.")
 ]
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="RUN | FILE.csv ..", help="Run folder, or CSV files of one arm with --config.")
 ]
 ArmPath = Annotated[
-    Path | None, typer.Option("--config", metavar="ARM.toml", help="For CSV files: [columns] says what is in them.")
+    Path | None, typer.Option("--config", metavar="ARM.toml", help="For CSV files: its [columns] table describes them.")
 ]
 AllSamples = Annotated[
-    bool, typer.Option("--all-samples", help="No settled period is needed: every sample, by multiple shooting.")
+    bool, typer.Option("--all-samples", help="Use every sample, by multiple shooting; no settled period is needed.")
 ]
 
 

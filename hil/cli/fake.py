@@ -29,7 +29,7 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
         end = f"{move.to:g} rad" if move.to is not None else f"{move.ticks} ticks"
         print(f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
     print(f"\nServe it to any program: hil fake {config} --pty")
-    print(f'From Python with pyserial: fakes.register(), then serial_for_url("fake://{config}")')
+    print(f'In Python with pyserial: fakes.register(), then serial_for_url("fake://{config}")')
 
 
 def list_faults() -> None:
@@ -100,7 +100,7 @@ class _Status:
 def _totals(counts: Counts) -> str:
     return (
         f"{counts.damaged} damaged, {counts.collisions} collisions, {counts.faults} faults, "
-        f"{counts.overruns} late by more than 1 ms (worst {1e3 * counts.late_max_s:.1f} ms)"
+        f"{counts.overruns} more than 1 ms late (worst {1e3 * counts.late_max_s:.1f} ms)"
         + (f", {counts.lost_s:.1f} s slower than real time" if counts.lost_s >= 0.1 else "")
     )
 

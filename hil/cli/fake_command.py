@@ -24,7 +24,7 @@ def fake(
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="Symbolic link to that device.")] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(metavar="KIND[:KEY=VALUE,...]", help="Let this go wrong; may be repeated. See --list-faults."),
+        typer.Option(metavar="KIND[:KEY=VALUE,...]", help="Inject this fault; may be repeated. See --list-faults."),
     ] = None,
     move: Annotated[
         list[str] | None,
@@ -33,10 +33,10 @@ def fake(
             help="Let a hand move this servo's joint while its torque is off (or ID:ticks=POSITION); may be repeated.",
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of noise and faults, instead of the file's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of noise and faults, overriding the file's.")] = None,
     _: Annotated[
         bool,
-        typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="Print the kinds of faults and exit."),
+        typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="List the fault kinds and exit."),
     ] = False,
 ) -> None:
     """Serve a fake arm to any program, in real time; without --pty, say what it is made of.
@@ -55,9 +55,9 @@ def hand(
     device: Annotated[Path, typer.Argument(metavar="DEVICE", help="The terminal that `hil fake --pty` serves.")],
     moves: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[ID:to=RAD]...", help="Where to: an angle, or ID:ticks=POSITION; also at, duration."),
+        typer.Argument(metavar="[ID:to=RAD]...", help="Target: an angle, or ID:ticks=POSITION; also at, duration."),
     ] = None,
-    release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Let go of this servo's joint.")] = None,
+    release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Release this servo's joint.")] = None,
 ) -> None:
     """Move joints of a fake arm whose torque is off, as somebody does who calibrates an arm."""
     from hil.cli import fake as work

@@ -12,9 +12,9 @@ def init(
     port: PortOrFile,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")] = Path("my_arm.toml"),
     baud: Annotated[
-        list[int] | None, typer.Option("--baud", help="Ask only at this baud; may be given more than once.")
+        list[int] | None, typer.Option("--baud", help="Scan only at this baud rate; may be repeated.")
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: take what an empty answer means.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; accept every default.")] = False,
 ) -> None:
     """Scan the bus, ask what it cannot tell, write a commented TOML file. Nothing is written to the servos."""
     from hil.cli.terminal import Terminal
@@ -28,7 +28,7 @@ def init(
     from hil.setup.scan import scan
 
     if out.exists():
-        raise ConfigError(f"{out} is there already: name another file with --out, or remove it.")
+        raise ConfigError(f"{out} already exists: choose another file with --out, or remove it.")
     url = port_url(port)
     bauds = tuple(baud or BAUD_RATES)
     opened = open_port(url, bauds[0])
@@ -41,7 +41,7 @@ def init(
     text = arm_toml(answers)
     parse_config(text, out)  # what is written can be run
     write_text(out, text)
-    print(f"{out} is written. Read it, then:\n  hil check {out}\n  hil identify {out}")
+    print(f"Wrote {out}. Read it, then:\n  hil check {out}\n  hil identify {out}")
 
 
 def _prompt(question: str, usual: str) -> str:

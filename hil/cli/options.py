@@ -13,4 +13,4 @@ OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run 
 PortOrFile = Annotated[
     str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, a TOML file, or a bundled name.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, the result, and nothing else.")]
+Json = Annotated[bool, typer.Option("--json", help="Print only the result, as one JSON object.")]

@@ -38,7 +38,10 @@ def print_shooting_result(result: ShootingResult) -> None:
         print(f"Warning: {warning}")
     if result.model_choice is not None:
         choice = result.model_choice
-        print(f"Chosen by segments left out: {choice.chosen}, error {choice.error_divided_by:.2f} times smaller.")
+        print(
+            f"Chosen by cross-validation on held-out segments: {choice.chosen}, error {choice.error_divided_by:.2f} "
+            "times smaller."
+        )
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
 
@@ -79,14 +82,12 @@ def _fit(result: SettledResult) -> list[str]:
     fit = result.fit
     residual = ", ".join(f"{value:.3f}" for value in fit.residual_rms_ticks)
     lines = [
-        f"Residual {residual} encoder steps RMS; the encoder's own rounding is {fit.quantisation_floor_ticks}.",
+        f"Residual {residual} encoder steps RMS; encoder rounding alone gives {fit.quantisation_floor_ticks}.",
     ]
     held_out = result.validation.held_out_rms
     if held_out:
         errors = ", ".join(f"{100 * value:.2f} %" for value in held_out)
-        lines.append(
-            f"Free prediction of another multisine, not used for the fit: off by {errors} of the motion's RMS."
-        )
+        lines.append(f"Open-loop prediction of a held-out multisine: error {errors} of the motion's RMS.")
     return lines
 
 
@@ -97,7 +98,7 @@ def _choice(result: SettledResult) -> list[str]:
     tried = ", ".join(trial.model for trial in choice.tried)
     gained, cost = choice.error_divided_by, choice.standard_errors_times
     return [
-        f"Chosen of {tried}: {choice.chosen}. Against the first, it predicts {gained:.3g} times better and makes "
+        f"Chosen of {tried}: {choice.chosen}. Compared with the first, it predicts {gained:.3g} times better and makes "
         f"the standard errors {cost:.3g} times larger."
     ]
 
@@ -105,7 +106,7 @@ def _choice(result: SettledResult) -> list[str]:
 def _verdict(result: SettledResult) -> list[str]:
     verdict = result.verdict
     said = [*verdict.sentences, *(f"Warning: {warning}" for warning in result.warnings)]
-    return [f"Trust it: {verdict.trust}. " + " ".join(said)]
+    return [f"Trust this model: {verdict.trust}. " + " ".join(said)]
 
 
 def _stabiliser(result: SettledResult, config: Config) -> list[str]:
@@ -120,5 +121,5 @@ def _torque_constants(result: SettledResult, config: Config) -> list[str]:
 
 
 def _next(result: SettledResult, run: Path) -> list[str]:
-    lines = [f"Run folder: {run}, its report: {run / 'report.html'}"]
-    return [*lines, f"Estimate again from the recording: hil estimate {run}"]
+    lines = [f"Run folder: {run}, report: {run / 'report.html'}"]
+    return [*lines, f"To estimate again from the recording: hil estimate {run}"]

@@ -14,8 +14,12 @@ from hil.cli.options import RunPath
 def report(
     run: RunPath,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default RUN/report.html.")] = None,
-    png: Annotated[Path | None, typer.Option("--png", metavar="DIR", help="Save the pictures there as PNG.")] = None,
-    svg: Annotated[Path | None, typer.Option("--svg", metavar="DIR", help="Save the pictures there as SVG.")] = None,
+    png: Annotated[
+        Path | None, typer.Option("--png", metavar="DIR", help="Save the figures in this folder as PNG.")
+    ] = None,
+    svg: Annotated[
+        Path | None, typer.Option("--svg", metavar="DIR", help="Save the figures in this folder as SVG.")
+    ] = None,
 ) -> None:
     """Write a run as one HTML page that needs no network: verdict, parameters, pictures."""
     from hil.report.pictures import save_pictures
@@ -25,7 +29,7 @@ def report(
     data = RunData.load(run)
     for kind, folder in (("png", png), ("svg", svg)):
         if folder is not None:
-            print(f"{len(save_pictures(data, folder, kind))} pictures in {folder}")
+            print(f"{len(save_pictures(data, folder, kind))} figures in {folder}")
 
 
 def export(
@@ -35,18 +39,19 @@ def export(
     ],
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="File, with --samples folder; default in RUN."),
+        typer.Option("--out", metavar="FILE", help="Output file (a folder with --samples); default: in RUN."),
     ] = None,
     link_length: Annotated[
-        float | None, typer.Option(min=1e-3, metavar="METRES", help="Of link 1; needed for a horizontal arm only.")
+        float | None,
+        typer.Option(min=1e-3, metavar="METRES", help="Length of link 1; needed for a horizontal arm only."),
     ] = None,
     samples: Annotated[
         int | None,
-        typer.Option("--samples", metavar="N", help="Draw N arms from the error bars, into --out."),
+        typer.Option("--samples", metavar="N", help="Draw N arms from the posterior into --out."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the draws.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the draws.")] = 1,
 ) -> None:
-    """Write the identified arm or its recording for other tools; says what a format has no place for."""
+    """Write the identified arm or its recording for other tools; says what a format cannot represent."""
     if samples is not None:
         from hil.export.posterior import export_samples
 
@@ -57,12 +62,12 @@ def export(
     from hil.export.formats import export
 
     if out is not None and len(formats) > 1:
-        raise typer.BadParameter("--out names one file: give one --format with it.")
+        raise typer.BadParameter("--out names a single file: give exactly one --format.")
     for name in formats:
         written = export(run, name, out, link_length)
         print(f"{written.path}")
         for missing in written.left_out:
-            print(f"  {name.upper()} has no place for {missing}")
+            print(f"  {name.upper()} cannot represent {missing}")
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:

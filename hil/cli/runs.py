@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def runs(
-    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the run folders are.")] = Path("runs"),
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder that holds the run folders.")] = Path("runs"),
     json_only: Json = False,
 ) -> None:
     """List the runs in a folder: arm, when, verdict, residual, name and note."""
@@ -48,8 +48,8 @@ def runs(
 
 def note(
     run: RunPath,
-    name: Annotated[str | None, typer.Option("--name", help="A short name, for `hil runs`.")] = None,
-    text: Annotated[str | None, typer.Option("--text", help="Anything worth remembering.")] = None,
+    name: Annotated[str | None, typer.Option("--name", help="Short name, shown by `hil runs`.")] = None,
+    text: Annotated[str | None, typer.Option("--text", help="Free text.")] = None,
 ) -> None:
     """Give a run a name and a note; without options, print them. Example: hil note RUN --text "new gearbox"."""
     from hil.runs.collection import Note, read_note, write_note
@@ -62,9 +62,11 @@ def note(
 
 
 def diff(
-    before: Annotated[Path, typer.Argument(metavar="RUN", help="The earlier run (or result.json, exported TOML).")],
-    after: Annotated[Path, typer.Argument(metavar="RUN", help="The later one, of the same arm.")],
-    png: Annotated[Path | None, typer.Option("--png", metavar="FILE", help="Draw it; needs the extra `png`.")] = None,
+    before: Annotated[Path, typer.Argument(metavar="RUN", help="Earlier run (or result.json, or exported TOML).")],
+    after: Annotated[Path, typer.Argument(metavar="RUN", help="Later run of the same arm.")],
+    png: Annotated[
+        Path | None, typer.Option("--png", metavar="FILE", help="Plot the differences; needs the extra `png`.")
+    ] = None,
     json_only: Json = False,
 ) -> None:
     """What changed on an arm between two runs, and whether it is more than chance: is the gearbox wearing?"""
@@ -104,7 +106,7 @@ def _print_difference(difference: "Difference") -> None:
             console.print(f"Not in the model {lacking}: {', '.join(names)}.", soft_wrap=True, markup=False)
     found = ", ".join(change.name for change in difference.changed)
     console.print(
-        f"Changed by more than chance: {found}." if found else "Nothing changed by more than chance.",
+        f"Significant changes: {found}." if found else "No significant changes.",
         soft_wrap=True,
         markup=False,
     )

@@ -8,7 +8,7 @@ import typer
 
 def schema(
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Write it there in place of standard output.")
+        Path | None, typer.Option("--out", metavar="FILE", help="Write it to this file instead of standard output.")
     ] = None,
 ) -> None:
     """Print the JSON Schema of the TOML; with `#:schema FILE` as its first line an editor completes and checks it."""
@@ -19,4 +19,4 @@ def schema(
         print(schema_text(), end="")
         return
     write_text(out, schema_text())
-    print(f"{out} is written. First line of a TOML file beside it: #:schema ./{out.name}")
+    print(f"Wrote {out}. Put this first in a TOML file beside it: #:schema ./{out.name}")

@@ -22,7 +22,7 @@ def print_ports(ports: Sequence[tuple[str, str]], json_only: bool) -> None:
         print(json.dumps({"ports": [{"device": device, "description": text} for device, text in ports]}))
         return
     if not ports:
-        print("No serial port is plugged in. With a TOML file: hil scan configs/fake_two_link.toml")
+        print("No serial port found. To use a TOML file: hil scan configs/fake_two_link.toml")
         return
     for device, text in ports:
         print(f"{device}  {text}")
@@ -53,16 +53,16 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
     if servos:
         console.print(table)
     else:
-        console.print("No servo answers. Is the bus powered? A U2D2 does not power it.")
+        console.print("No servo answered. Is the bus powered? A U2D2 does not supply power.")
     for each in heard:
         if each.trouble:
             console.print(f"At {each.baud} baud: {escape(each.trouble)}")
     if len({servo.baud for servo in servos}) > 1:
-        console.print("The servos of one arm need the same baud: see hil setup --help.")
+        console.print("All servos of an arm must use the same baud rate: see hil setup --help.")
 
 
 def print_findings(findings: Sequence[Finding], config: Path) -> None:
-    """One line for each finding, how to mend it below it, and whether an experiment can start."""
+    """One line for each finding, with its fix below it, and whether an experiment can start."""
     console = Console(highlight=False, soft_wrap=True)
     former = None
     for finding in findings:
@@ -72,14 +72,14 @@ def print_findings(findings: Sequence[Finding], config: Path) -> None:
         style = _STYLES[finding.level]
         level = f"[{style}]{finding.level:>8}[/{style}]"
         console.print(f"{level}  {escape(finding.what)}: {escape(finding.found)}")
-        if finding.mend:
-            console.print(f"          {escape(finding.mend)}")
+        if finding.fix:
+            console.print(f"          {escape(finding.fix)}")
     stops = sum(finding.level is Level.STOP for finding in findings)
     warnings = sum(finding.level is Level.WARNING for finding in findings)
     if stops:
-        console.print(f"\n{stops} to mend before an experiment can start, {warnings} to think about.")
+        console.print(f"\n{stops} blocking problems, {warnings} warnings.")
     else:
-        console.print(f"\nReady, {warnings} to think about. Next: hil identify {escape(str(config))}")
+        console.print(f"\nReady, {warnings} warnings. Next: hil identify {escape(str(config))}")
 
 
 def changed(changes: Sequence[Change]) -> dict[str, Any]:
@@ -89,11 +89,11 @@ def changed(changes: Sequence[Change]) -> dict[str, Any]:
 
 def print_changes(changes: Sequence[Change]) -> None:
     if not changes:
-        print("Nothing was asked for: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
+        print("Nothing to change: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
     for change in changes:
         if change.written:
             print(f"{change.register}: {change.before} -> {change.after}, read back.")
         elif change.before == change.after:
-            print(f"{change.register}: is {change.after} already.")
+            print(f"{change.register}: is already {change.after}.")
         else:
             print(f"{change.register}: left at {change.before}.")

@@ -77,7 +77,7 @@ class Terminal:
                 if asking.servo is not None:
                     servo_id, model = asking.servo
                     self.say(f"{asking.baud} baud, ID {servo_id}: {model}")
-                status.update(f"Asking at {asking.baud} baud, about {asking.left_s:.0f} s left")
+                status.update(f"Scanning at {asking.baud} baud, about {asking.left_s:.0f} s left")
 
             yield watch
 

@@ -13,9 +13,9 @@ from typing import Annotated, Any
 import typer
 
 _Verbose = Annotated[
-    int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Show the log; -vv with its details.")
+    int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Show log messages; -vv for details.")
 ]
-_Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show the result and errors only.")]
+_Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only the result and errors.")]
 
 
 def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:

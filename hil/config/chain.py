@@ -27,8 +27,8 @@ def only_planar(config: "Config", what: str) -> None:
     """Raise ConfigError for an arm in space: `what` needs a planar arm."""
     if config.is_chain:
         raise ConfigError(
-            f"{config.path}: {what} is for planar arms only yet: this one has arm.urdf. `hil identify` works on its "
-            "fake arm, `hil estimate`, `hil report` and `hil export` on its runs."
+            f"{config.path}: {what} supports only planar arms so far; this one has arm.urdf. `hil identify` works on a "
+            "fake one, `hil estimate`, `hil report` and `hil export` on its runs."
         )
 
 
@@ -37,11 +37,11 @@ def chain_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None:
         if len(config.joints) > _PLANAR:
             yield (
-                f"joints: {len(config.joints)} of them make an arm in space: say where they are with arm.urdf; without "
-                "it an arm has one or two"
+                f"joints: {len(config.joints)} of them need arm.urdf, which gives the geometry; without it an arm "
+                "has one or two joints"
             )
         if config.joint_path is not None:
-            yield "joint_path: only an arm with arm.urdf follows a path; a planar arm has experiment.peak_torque"
+            yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
         return
     try:
         described_arm(config)
@@ -50,18 +50,26 @@ def chain_slips(config: "Config") -> Iterator[str]:
         return
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
-        yield f"arm.urdf and fake.chain.urdf are two files of one name, {fake.name}, and a run keeps both: rename one"
+        yield (
+            f"arm.urdf and fake.chain.urdf are two files with the same name, {fake.name}, and a run folder holds "
+            "both: rename one"
+        )
     if config.stabiliser is None:
-        yield "stabiliser is missing: an arm in space cannot hang still, so a spring and a damper must hold its path"
+        yield (
+            "stabiliser is missing: a spatial arm does not hang at rest, so a spring and a damper must keep it "
+            "on its path"
+        )
     if config.experiment.pilot:
-        yield "experiment.pilot = true: only planar arms have a pilot yet; set it to false and give [joint_path]"
+        yield (
+            "experiment.pilot = true: only planar arms support the pilot so far; set it to false and give [joint_path]"
+        )
     if config.known is not None:
-        yield "known: only of planar arms; the masses of a URDF are its own"
+        yield "known: only for planar arms; a URDF gives its own masses"
     told = [option for option in _OPTIONS if getattr(config.model, option)]
     if told:
-        yield f"model.{told[0]} = true: only planar arms have that term yet; leave it out"
+        yield f"model.{told[0]} = true: only planar arms support this term so far; remove it"
     if config.model.friction == "auto":
-        yield 'model.friction = "auto": only for planar arms yet; choose "coulomb", "stribeck" or "stribeck_load"'
+        yield 'model.friction = "auto": only for planar arms so far; choose "coulomb", "stribeck" or "stribeck_load"'
     yield from _path_slips(config)
 
 
@@ -69,7 +77,10 @@ def _path_slips(config: "Config") -> Iterator[str]:
     if config.joint_path is None:
         return
     if config.experiment.band is None:
-        yield "experiment.lines: an arm in space follows a path, whose highest frequency is the end of experiment.band"
+        yield (
+            "experiment.lines: a spatial arm follows a path, whose highest frequency is the upper end of "
+            "experiment.band"
+        )
     parts = zip(config.joints, *config.joint_path.model_dump().values(), strict=False)
     for joint, centre, swing, speed in parts:
         low, high = joint.position_limit

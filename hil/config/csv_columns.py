@@ -44,16 +44,20 @@ class Columns(_Table):
     time_unit: Literal["s", "ms", "us"] = "s"
     position: list[Column] = Field(min_length=1, max_length=2, description="one column per joint")
     position_unit: Literal["rad", "deg", "turns"] = "rad"
-    zero: list[float] | None = Field(None, description="rad added to each position, so that joint 1 is from horizontal")
-    position_step: PositiveFloat | None = Field(None, description="rad per encoder step; found in the data if absent")
+    zero: list[float] | None = Field(
+        None, description="rad added to each position, so that joint 1 is measured from the horizontal"
+    )
+    position_step: PositiveFloat | None = Field(
+        None, description="rad per encoder step; detected from the data if absent"
+    )
     torque: list[Column] | None = Field(None, description="one column per joint")
     torque_unit: Literal["N m", "mN m"] = "N m"
     current: list[Column] | None = Field(None, description="one column per joint, in place of torque")
     current_unit: Literal["A", "mA"] = "A"
     torque_constant: list[PositiveFloat] | None = Field(None, description="N m/A per joint, with current")
     between: Literal["held", "linear"] = Field("linear", description="held for a command, linear for a measurement")
-    segment: PositiveFloat = Field(1.0, le=60, description="s of simulation before the state is unknown again")
-    zeros_unknown: bool = Field(True, description="estimate what each encoder reads at angle 0")
+    segment: PositiveFloat = Field(1.0, le=60, description="s per shooting segment, each with an unknown initial state")
+    zeros_unknown: bool = Field(True, description="estimate each encoder's zero offset")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -98,7 +102,7 @@ def load_csv_config(path: Path) -> CsvConfig:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     if "columns" not in values:
         raise ConfigError(
-            f"{path}: has no [columns] table, which says what each column of the CSV is. For instance:\n[columns]\n"
+            f"{path}: has no [columns] table, which says what each CSV column holds. Example:\n[columns]\n"
             'time = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
         )
     try:

@@ -16,7 +16,7 @@ class Measured(BaseModel):
     std: float = Field(0.0, ge=0)
 
 
-Quantity = Annotated[float | Measured | None, Field(description="a number of SI units, or {value = .., std = ..}")]
+Quantity = Annotated[float | Measured | None, Field(description="a number in SI units, or {value = .., std = ..}")]
 
 
 class KnownConfig(BaseModel):
@@ -44,9 +44,11 @@ class KnownConfig(BaseModel):
         for joint in ("1", "2"):
             rotor, gear = getattr(self, f"rotor_inertia_{joint}"), getattr(self, f"gear_ratio_{joint}")
             if (rotor is None) != (gear is None):
-                raise ValueError(f"known: rotor_inertia_{joint} and gear_ratio_{joint} go together; give both")
+                raise ValueError(f"known: rotor_inertia_{joint} and gear_ratio_{joint} belong together; give both")
             if rotor is not None and getattr(self, f"armature_{joint}") is not None:
-                raise ValueError(f"known: armature_{joint} and rotor_inertia_{joint} say the same; give one")
+                raise ValueError(
+                    f"known: armature_{joint} and rotor_inertia_{joint} mean the same thing; give only one"
+                )
         return self
 
     def quantities(self) -> dict[str, Known]:

@@ -149,6 +149,6 @@ def _heaviest(stall_torque: float) -> float:
 def _too_much(key: str, value: float, most: float, unit: str, joint: "JointConfig") -> Iterator[str]:
     if value > most:
         yield (
-            f"{key} = {value:g} {unit}: far more than a {joint.model} could move ({most:.3g} {unit}). All quantities "
+            f"{key} = {value:g} {unit}: far more than a {joint.model} can move ({most:.3g} {unit}). All quantities "
             "are SI: kg, m, N m, rad, s"
         )

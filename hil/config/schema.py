@@ -38,6 +38,9 @@ from hil.toml_errors import UNSAID, describe
 
 FAKE_URL = "fake://"
 
+DRIFT = 5.0
+"""Times experiment.settle_within."""
+
 SLOW_INTERVAL_S = 0.25
 """From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
 
@@ -61,18 +64,18 @@ class PortConfig(_Table):
 
     url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
-    one_write: bool = Field(True, description="commands and request in one write; false where hil check says so")
-    fast_sync_read: bool = Field(True, description="read with Fast Sync Read where every servo's firmware has it")
+    one_write: bool = Field(True, description="send goals and read request in one write; false where hil check says so")
+    fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")
 
 
 class JointConfig(_Table):
     """`[[joints]]`: one joint, from the base outwards."""
 
     name: str = Field(min_length=1, max_length=20)
-    servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or those of the two servos of the joint")
+    servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or the IDs of the joint's two servos")
     model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
     turns: OneOrList[Literal[-1, 1]] = Field(
-        1, alias="direction", description="-1 where the servo turns against the joint; for two servos one each"
+        1, alias="direction", description="-1 where the servo turns opposite to the joint; one entry per servo"
     )
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
     mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
@@ -90,24 +93,24 @@ class JointConfig(_Table):
     def _printable(cls, name: str) -> str:
         """A name goes into terminals, XML, HTML and CSV: no control character, line break or half of a surrogate."""
         if bad := [each for each in name if not each.isprintable()]:
-            raise ValueError(f"{name!a}: {bad[0]!a} is not a character that can be printed")
+            raise ValueError(f"{name!a}: {bad[0]!a} is not a printable character")
         return name
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.position_limit
         if low >= high:
-            raise ValueError(f"position_limit = [{low}, {high}]: the first must be the smaller")
+            raise ValueError(f"position_limit = [{low}, {high}]: the first value must be the smaller one")
         return self
 
     @model_validator(mode="after")
     def _a_direction_for_each_servo(self) -> Self:
         if isinstance(self.servos, list) and not 1 <= len(self.servos) <= 2:
-            raise ValueError(f"id has {len(self.servos)} entries: one servo or two move a joint")
+            raise ValueError(f"id has {len(self.servos)} entries: a joint has one or two servos")
         if len(set(self.ids)) < len(self.ids):
-            raise ValueError(f"id = {list(self.ids)}: each servo needs one of its own")
+            raise ValueError(f"id = {list(self.ids)}: each servo needs its own ID")
         if isinstance(self.turns, list) and len(self.turns) != len(self.ids):
-            raise ValueError(f"direction has {len(self.turns)} entries for {len(self.ids)} servos: one each")
+            raise ValueError(f"direction has {len(self.turns)} entries for {len(self.ids)} servos: give one per servo")
         return self
 
     @property
@@ -143,7 +146,7 @@ class JointConfig(_Table):
                 raise ValueError(f"{name} is missing; {mode} mode needs it")
         for name, value in zip(names[not pwm], values[not pwm], strict=True):
             if value is not None:
-                raise ValueError(f"{name} = {value:g}: it means nothing in {mode} mode; {' and '.join(names[pwm])} do")
+                raise ValueError(f"{name} = {value:g}: it has no meaning in {mode} mode; {' and '.join(names[pwm])} do")
         return self
 
     @property
@@ -189,9 +192,9 @@ class PriorConfig(_Table):
     from link lengths and servo models (hil.dry_run.prior), with `rough_spread` in place of `spread`.
     """
 
-    spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each value given here")
+    spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each given value")
     rough_spread: PositiveFloat | None = Field(
-        None, le=1, description="of each value guessed; each its own unless given"
+        None, le=1, description="of each guessed value; a default per quantity unless given"
     )
     link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
     link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
@@ -206,16 +209,19 @@ class ArmConfig(_Table):
     """`[arm]`: what is known of the mechanism."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
-    urdf: str | None = Field(None, description="of an arm in space: a file beside this one; [[joints]] bear its names")
-    base: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
-        [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of its base, rad"
+    urdf: str | None = Field(
+        None, description="of a spatial arm: a file beside this one; [[joints]] use its joint names"
     )
-    rest_pose: list[float] = Field(description="rad: where the arm hangs, or lies, when nothing drives it")
+    base: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+        [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of the base, rad"
+    )
+    rest_pose: list[float] = Field(description="rad: where the undriven arm comes to rest")
     rest_tolerance: PositiveFloat = Field(
-        0.5, description="rad from the rest pose allowed at the start: friction may hold an arm far from it"
+        0.5,
+        description="rad of deviation from the rest pose allowed at the start (friction may hold the arm away from it)",
     )
     link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
-    prior: PriorConfig | None = Field(None, description="what is known of masses and friction, for a dry run")
+    prior: PriorConfig | None = Field(None, description="prior knowledge of masses and friction, for a dry run")
 
 
 class ExperimentConfig(_Table):
@@ -223,21 +229,24 @@ class ExperimentConfig(_Table):
 
     rate: float = Field(ge=20, le=4000, description="samples per second")
     period: float = Field(gt=0, le=1000, description="s")
-    band: Range | None = Field(None, description="Hz: lines shared out between the joints in turn")
+    band: Range | None = Field(None, description="Hz: its lines are assigned to the joints in turn")
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
-    detection: bool = Field(False, description="drive odd lines only, not all: what is left out shows the distortion")
-    peak_torque: list[PositiveFloat] | None = Field(None, description="N m per joint; with pilot, found by dry runs")
-    pilot: bool = Field(False, description="find peak_torque by a small pilot run first, then raise it to the limits")
-    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" designs on the pilot\'s model')
-    ramp: float = Field(1.0, ge=0, le=60, description="s, in and out")
-    rest: float = Field(0.5, ge=0, le=60, description="s without torque before")
-    settle_within: PositiveFloat = Field(0.01, lt=1, description="RMS between periods, as a fraction of the motion's")
-    drift_within: float = Field(
-        0.05, ge=0, lt=1, description="the same, of a motion that still drifts after max_settling_periods"
+    detection: bool = Field(
+        False, description="drive only some of the odd lines: the others reveal nonlinear distortion"
+    )
+    peak_torque: list[PositiveFloat] | None = Field(
+        None, description="N m per joint; with pilot = true, found by dry runs"
+    )
+    pilot: bool = Field(False, description="find peak_torque with a small pilot run first, then raise it to the limits")
+    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
+    ramp: float = Field(1.0, ge=0, le=60, description="s, at start and end")
+    rest: float = Field(0.5, ge=0, le=60, description="s without torque beforehand")
+    settle_within: PositiveFloat = Field(
+        0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
     )
     max_settling_periods: int = Field(5, ge=1, le=100)
-    periods: int = Field(1, ge=1, le=1000, description="settled periods used")
-    held_out: bool = Field(True, description="play a second multisine with other phases to check the prediction")
+    periods: int = Field(1, ge=1, le=1000, description="number of settled periods recorded")
+    held_out: bool = Field(True, description="play a second multisine with other phases to validate the model")
     seed: int = Field(1, ge=0)
 
     @model_validator(mode="after")
@@ -248,7 +257,7 @@ class ExperimentConfig(_Table):
         if (self.band is None) == (self.lines is None):
             raise ValueError("give either band or lines")
         if self.detection and self.band is None:
-            raise ValueError("detection chooses lines from a band; with lines, leave the ones out that shall detect")
+            raise ValueError("detection chooses lines from a band; with lines, omit the detection lines yourself")
         if self.band is not None:
             low, high = self.band
             if not 0 < low < high < self.rate / 4:
@@ -259,6 +268,11 @@ class ExperimentConfig(_Table):
         return self
 
     @property
+    def drift_within(self) -> float:
+        """As settle_within, of a motion that after max_settling_periods only drifts, as while grease warms."""
+        return DRIFT * self.settle_within
+
+    @property
     def samples(self) -> int:
         """Samples in a period."""
         return round(self.rate * self.period)
@@ -267,16 +281,16 @@ class ExperimentConfig(_Table):
 class PathConfig(_Table):
     """`[joint_path]`: of an arm in space, the path that excites it; band's upper end is its highest frequency."""
 
-    centre: list[float] = Field(description="rad per joint: what the path goes around")
-    swing: list[PositiveFloat] = Field(description="rad per joint: how far from there")
-    speed: list[PositiveFloat] = Field(description="rad/s per joint: how fast at most")
+    centre: list[float] = Field(description="rad per joint: centre of the path")
+    swing: list[PositiveFloat] = Field(description="rad per joint: amplitude around the centre")
+    speed: list[PositiveFloat] = Field(description="rad/s per joint: maximum speed")
 
 
 class ModelConfig(_Table):
     """`[model]`: what the estimator may explain the motion with."""
 
     friction: Literal["auto"] | Friction = Field(
-        "stribeck", description='"auto" tries them, presliding, asymmetry and ripple, and keeps what predicts best'
+        "auto", description='"auto" also tries every term below and keeps those that the data support'
     )
     drive: Drive = "lag"
     presliding: bool = Field(False, description=OPTIONS["presliding"])
@@ -287,6 +301,7 @@ class ModelConfig(_Table):
     saturation: bool = Field(False, description=OPTIONS["saturation"])
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
+    lags: bool = Field(False, description=OPTIONS["lags"])
 
     @property
     def fixed_friction(self) -> Friction:
@@ -295,9 +310,10 @@ class ModelConfig(_Table):
 
     @model_validator(mode="after")
     def _auto_has_no_terms(self) -> Self:
-        if self.friction == "auto" and (self.presliding or self.asymmetry or self.ripple or self.zeros):
+        given = [option for option in OPTIONS if option != "torque_scale" and getattr(self, option)]
+        if self.friction == "auto" and given:
             raise ValueError(
-                'friction = "auto" chooses presliding, asymmetry and ripple itself and leaves zeros out: give none'
+                f'friction = "auto" chooses {", ".join(given)} itself: remove them, or choose a friction model'
             )
         return self
 
@@ -305,34 +321,40 @@ class ModelConfig(_Table):
 class SafetyConfig(_Table):
     """`[safety]`: what stops the arm, beside the joints' own limits, and how."""
 
-    watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s of silence after which a servo stops by itself")
-    allow_no_watchdog: bool = Field(False, description="accept firmware without a Bus Watchdog: nothing stops it then")
+    watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s without packets after which a servo stops by itself")
+    allow_no_watchdog: bool = Field(
+        False, description="accept firmware without a Bus Watchdog: nothing then stops the servo when packets cease"
+    )
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
-    missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may give no reply")
+    missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may fail to reply")
     late_time: PositiveFloat = Field(0.05, le=2, description="s for which deadlines may be missed")
-    max_missing: int | None = Field(None, ge=1, le=1000, description="replies in a row; in place of missing_time")
-    max_late: int | None = Field(None, ge=1, le=1000, description="deadlines in a row; in place of late_time")
+    max_missing: int | None = Field(None, ge=1, le=1000, description="consecutive replies; instead of missing_time")
+    max_late: int | None = Field(None, ge=1, le=1000, description="consecutive deadlines; instead of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
-    slew: PositiveFloat = Field(100.0, description="A/s (V/s under PWM): goals change no faster")
+    slew: PositiveFloat = Field(100.0, description="A/s (V/s in PWM mode): maximum rate of change of goals")
     max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
-    min_voltage: float = Field(0.0, ge=0, description="V; what the models shut down at from the factory, unless given")
+    min_voltage: float = Field(0.0, ge=0, description="V; default: the models' factory shutdown thresholds")
     max_voltage: PositiveFloat = Field(30.0, description="V")
-    follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may differ from its goal")
+    follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
-        0.3, le=1, description="of the planned peak, by how much it may differ for longer"
+        0.3, le=1, description="fraction of the planned peak by which it may deviate for longer"
     )
-    take_over: bool = Field(False, description="let an arm that is held sink slowly and take it over; else refuse it")
-    stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes before torque is cut where it can')
-    damp_time: float = Field(0.06, ge=0, le=2, description="s of braking at most")
-    limit_chance: float = Field(0.002, gt=0, le=0.5, description="chance of touching a limit that a dry run may leave")
+    take_over: bool = Field(
+        False, description="take over an arm whose torque is on, letting it sink slowly; otherwise refuse it"
+    )
+    stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes, where possible, before torque is cut')
+    damp_time: float = Field(0.06, ge=0, le=2, description="s: maximum braking time")
+    limit_chance: float = Field(
+        0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
+    )
 
     @field_validator("watchdog")
     @classmethod
     def _in_whole_steps(cls, seconds: float) -> float:
         steps = seconds / WATCHDOG_UNIT
         if abs(steps - round(steps)) > 1e-6:
-            raise ValueError(f"the servos count in steps of {WATCHDOG_UNIT:g} s, so a multiple of it")
+            raise ValueError(f"must be a multiple of {WATCHDOG_UNIT:g} s, the servos' time step")
         return seconds
 
 
@@ -345,7 +367,9 @@ class StabiliserConfig(_Table):
     @model_validator(mode="after")
     def _not_negative(self) -> Self:
         if min(*self.stiffness, *self.damping) < 0:
-            raise ValueError("stiffness and damping must be at least 0: less would drive the arm away from its pose")
+            raise ValueError(
+                "stiffness and damping must be at least 0: negative values would drive the arm away from its pose"
+            )
         return self
 
 
@@ -391,7 +415,7 @@ class Config(_Table):
             _same_length("experiment.lines", self.experiment.lines, count)
             excited = [line for lines in self.experiment.lines for line in lines]
             if len(set(excited)) != len(excited):
-                raise ValueError("experiment.lines: two joints share a line; each joint needs its own")
+                raise ValueError("experiment.lines: two joints share a line; each line may belong to one joint only")
         _all_different("id", [servo_id for joint in self.joints for servo_id in joint.ids])
         _all_different("name", [joint.name for joint in self.joints])
         for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
@@ -427,7 +451,7 @@ class Config(_Table):
         if experiment.peak_torque is None and self.arm.link_lengths is None:
             raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
         if experiment.design == "optimal" and not experiment.pilot:
-            raise ValueError('experiment.design = "optimal" needs pilot = true: it designs on the pilot\'s model')
+            raise ValueError('experiment.design = "optimal" needs pilot = true: the design uses the pilot\'s model')
 
     @property
     def is_chain(self) -> bool:
@@ -531,7 +555,7 @@ def _url_of(port: str) -> str:
     if "://" in port:
         return port
     config = find_config(Path(port))
-    if config.suffix == ".toml":
+    if config.suffix == ".toml" or config.is_file():
         return load_config(config).url
     arm = find_arm(port)
     return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port

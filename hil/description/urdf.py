@@ -58,7 +58,7 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         held += stiff
         if not body.mass > 0.0:
             raise ArmFileError(
-                f'{path}: link "{joint.child}", which joint "{joint.name}" moves, has no mass: give it an '
+                f'{path}: link "{joint.child}", moved by joint "{joint.name}", has no mass: give it an '
                 "<inertial> with a rough mass [kg], centre and inertia; they are only a starting point"
             )
         arm.append(
@@ -67,7 +67,7 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         rotation, translation = np.eye(3), np.zeros(3)
     _check_units(arm, path)
     doubts = tuple(
-        f'link "{each.link}": no mass distribution has its inertia; the data decide'
+        f'link "{each.link}": no mass distribution can have this inertia; the data will decide'
         for each in arm
         if not physical[each.link] or not each.body.is_physical
     )
@@ -81,15 +81,15 @@ def parse_urdf(path: Path) -> ET.Element:
     except (OSError, UnicodeDecodeError) as error:
         raise ArmFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ArmFileError(f"{path}: has a document type or entities, which a URDF does not need: take them out")
+        raise ArmFileError(f"{path}: contains a document type or entities, which a URDF does not need: remove them")
     try:
         root = ET.fromstring(text, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     except ET.ParseError as error:
         raise ArmFileError(f"{path}: is not XML: {error}") from error
     if root.tag != "robot":
-        raise ArmFileError(f"{path}: its root is <{root.tag}>, not <robot>: it is no URDF")
+        raise ArmFileError(f"{path}: its root is <{root.tag}>, not <robot>: it is not a URDF")
     if "<xacro:" in text:
-        raise ArmFileError(f"{path}: holds xacro macros: expand them first, xacro {path.name} > arm.urdf")
+        raise ArmFileError(f"{path}: contains xacro macros: expand them first: xacro {path.name} > arm.urdf")
     return root
 
 
@@ -146,7 +146,7 @@ def _joints(root: ET.Element, bodies: dict[str, Body], path: Path) -> dict[str, 
         moved[ends["child"]] = name
         kind = element.get("type", "")
         if kind not in (*MOVABLE, "fixed"):
-            raise ArmFileError(f"{path}: {where}: type {kind!r}: revolute, continuous, prismatic or fixed is known")
+            raise ArmFileError(f"{path}: {where}: type {kind!r}: must be revolute, continuous, prismatic or fixed")
         rotation, translation = _origin(element, where, path)
         mimic = element.find("mimic")
         tree[name] = _Joint(
@@ -170,7 +170,8 @@ def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> 
         raise ArmFileError(f"{path}: every link is some joint's child: the links form a loop; one must be the base")
     if len(roots) > 1:
         raise ArmFileError(
-            f"{path}: links {', '.join(roots)} hang on no joint: one base is allowed; join the others by fixed joints"
+            f"{path}: links {', '.join(roots)} have no parent joint: only one base link is allowed; attach the others "
+            "with fixed joints"
         )
     return roots[0]
 
@@ -186,8 +187,8 @@ def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
             return names
         if len(turning) > 1:
             raise ArmFileError(
-                f'{path}: at link "{link}" the arm branches into {", ".join(joint.name for joint in turning)}: say '
-                "which joints are the arm's, in the order from the base"
+                f'{path}: at link "{link}" the arm branches into {", ".join(joint.name for joint in turning)}: name '
+                "the arm's joints, in order from the base"
             )
         if turning[0].kind in TURNING:
             names.append(turning[0].name)
@@ -204,16 +205,16 @@ def _turns(joint: _Joint, tree: dict[str, _Joint]) -> bool:
 def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) -> list[_Joint]:
     """All joints from the base to the last of `names`, which must be among them in this order."""
     if not names:
-        raise ArmFileError(f"{path}: no joint turns, so there is no arm")
+        raise ArmFileError(f"{path}: no joint rotates, so there is no arm")
     if len(set(names)) < len(names):
         raise ArmFileError(f"{path}: joints {', '.join(names)}: one is named twice")
     for name in names:
         if name not in tree:
             turning = [joint.name for joint in tree.values() if joint.kind in TURNING]
-            raise ArmFileError(f'{path}: has no joint "{name}"; those that turn are {", ".join(turning) or "none"}')
+            raise ArmFileError(f'{path}: has no joint "{name}"; the rotating joints are {", ".join(turning) or "none"}')
         joint = tree[name]
         if joint.kind not in TURNING:
-            raise ArmFileError(f'{path}: joint "{name}" is {joint.kind}: only joints that turn can be identified')
+            raise ArmFileError(f'{path}: joint "{name}" is {joint.kind}: only rotating joints can be identified')
         if joint.mimics is not None:
             raise ArmFileError(
                 f'{path}: joint "{name}" mimics "{joint.mimics}", so it has no motor of its own: leave it out'
@@ -224,10 +225,10 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
         missing = [name for name in names if name not in found]
         if missing:
             raise ArmFileError(
-                f'{path}: joint "{missing[0]}" does not lie between base and "{branch[-1].name}": the joints must make '
-                "up one branch"
+                f'{path}: joint "{missing[0]}" does not lie between base and "{branch[-1].name}": the joints must form '
+                "one branch"
             )
-        raise ArmFileError(f"{path}: the joints come in the order {', '.join(found)} from the base: name them so")
+        raise ArmFileError(f"{path}: from the base, the joints are {', '.join(found)}: list them in this order")
     between = [joint for joint in branch if joint.name not in names and joint.kind != "fixed"]
     if between:
         raise ArmFileError(
@@ -270,7 +271,7 @@ def _check_units(arm: Sequence[ArmJoint], path: Path) -> None:
         length = float(np.linalg.norm(joint.translation))
         if length > MOST_LENGTH:
             raise ArmFileError(
-                f'{path}: joint "{joint.name}" is {length:.4g} m from the one before: is that in millimetres? URDF '
+                f'{path}: joint "{joint.name}" is {length:.4g} m from the previous one: is that in millimetres? URDF '
                 "is in metres and kilograms"
             )
         body = joint.body
@@ -303,7 +304,7 @@ def _axis(element: ET.Element, where: str, path: Path) -> Array:
     length = float(np.linalg.norm(axis))
     if abs(length - 1.0) > 1e-3:
         raise ArmFileError(
-            f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}: it must be 1; divide it by that"
+            f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}: it must be 1; normalise it"
         )
     unit: Array = axis / length
     return unit

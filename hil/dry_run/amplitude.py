@@ -67,7 +67,7 @@ def largest_amplitude(
             return Amplitude(plan, found, prediction)
         found = found * _BACK_OFF
     raise NoSafeTorque(
-        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, say more "
+        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, give more "
         "in [arm.prior], or raise safety.limit_chance."
     )
 

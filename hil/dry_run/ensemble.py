@@ -26,7 +26,7 @@ _MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2)
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Arms to simulate.
+    """Number of arms to simulate.
 
     torque_scale: what a commanded torque really is, (arms, joints): the torque constant is a guess too. A result's
     parameters are in units of the commanded torque, so there it is 1.

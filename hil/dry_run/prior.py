@@ -53,7 +53,7 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     if lengths is None:
         raise ConfigError(
             f"{config.path}: a dry run needs arm.link_lengths = [...] in m, one for each of [[joints]], or the run "
-            "folder of a former identification (--result)."
+            "folder of an earlier identification (--result)."
         )
     random = np.random.default_rng((seed, 5))
     drawn = {name: quantity.draw(random, count) for name, quantity in quantities(config, np.array(lengths)).items()}

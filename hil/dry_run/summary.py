@@ -71,9 +71,7 @@ def settling_text(config: Config, prediction: Prediction) -> str:
     seconds = config.experiment.ramp + config.experiment.period * float(
         np.quantile(prediction.settled_after[settled], 0.99)
     )
-    return (
-        f"{100 * settled.mean():.0f} % of the simulated arms settle, 99 % of those within {seconds:g} s of the start."
-    )
+    return f"{100 * settled.mean():.0f} % of the simulated arms settle, 99 % of them within {seconds:g} s of the start."
 
 
 def _prediction_json(config: Config, prediction: Prediction) -> dict[str, Any]:
@@ -118,23 +116,23 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     planned, passed = run.stopping.planned, run.stopping.passed
     stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])
     lines = [
-        "99 %: all peaks of an arm together stay within these in 99 of 100 arms.",
+        "99 %: in 99 of 100 arms, all peaks stay within these values.",
         settling_text(config, shown),
-        f"Stopped at any moment, they swing beyond their limits by up to: {_each(config, stopped)}; with the program "
+        f"If stopped at any moment, they overshoot their limits by up to: {_each(config, stopped)}; if the program is "
         f"killed or the cable pulled: {_each(config, planned[Way.SILENT])}.",
-        "Should something drive them over a limit at these speeds, they go on by up to: "
+        "If something drives them past a limit at these speeds, they continue by up to: "
         f"{_each(config, passed[Way.BRAKED])} when braked; {_each(config, passed[Way.CUT])} when cut. "
-        "Keep that much clear.",
+        "Keep that much space clear.",
         f"Largest safe torque: peak_torque = [{torque}] N m.",
     ]
     allowed = f"safety.limit_chance allows {100 * config.safety.limit_chance:g} %"
     if run.asked is None:
         return [
             *lines,
-            f"Safe at that torque: a guard stop has a chance of {_percent(shown.stop_chance)}; {allowed}.",
+            f"Safe at that torque: probability of a guard stop: {_percent(shown.stop_chance)}; {allowed}.",
         ]
     word = "SAFE" if run.is_safe(config) else "NOT SAFE as configured"
-    return [*lines, f"{word}: a guard stop has a chance of {_percent(shown.stop_chance)}; {allowed}."]
+    return [*lines, f"{word}: probability of a guard stop: {_percent(shown.stop_chance)}; {allowed}."]
 
 
 def _percent(chance: float) -> str:

@@ -66,7 +66,7 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
     only_planar(config, "a calibration by a known mass")
     _same_arm(config, other)
     if config.arm.gravity == 0.0:
-        raise ConfigError("arm.gravity = 0: nothing pulls at the mass; calibrate in a vertical plane.")
+        raise ConfigError("arm.gravity = 0: gravity does not act on the mass; calibrate in a vertical plane.")
     periods = [
         settled_period(each, run.load_facts(), load_samples(run.samples_path, len(each.joints)), IDENTIFY)
         for each, run in ((config, without), (other, with_mass))
@@ -82,8 +82,8 @@ def _same_arm(config: Config, other: Config) -> None:
     for one, two in zip(config.joints, other.joints, strict=False):
         if one.torque_per_goal != two.torque_per_goal:
             raise ConfigError(
-                f"joint {one.name!r}: one run supposes {one.torque_per_goal:g} N m per unit of goal and the other "
-                f"{two.torque_per_goal:g}; record both with the same TOML."
+                f"joint {one.name!r}: one run assumes {one.torque_per_goal:g} N m per unit of goal, the other "
+                f"{two.torque_per_goal:g}; record both with the same TOML file."
             )
     if len(config.joints) != len(other.joints):
         raise ConfigError(f"one run has {len(config.joints)} joints and the other {len(other.joints)}.")
@@ -123,7 +123,9 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
             f"({100 * (found.value / found.supposed - 1):+.1f} % from the {found.supposed:g} supposed)"
         )
     worst = float(np.max(result.fit.residual_rms_ticks))
-    lines.append(f"Residual of both runs: {worst:.3f} encoder steps at most; rounding alone leaves 0.289.")
-    lines.append("The standard errors hold noise only: the mass's own error, and its distance's, come on top in full.")
+    lines.append(f"Residual of both runs: {worst:.3f} encoder steps at most; rounding alone gives 0.289.")
+    lines.append(
+        "The standard errors cover noise only: add the relative errors of the mass and of its distance in full."
+    )
     lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these and estimate again.")
     return lines

@@ -47,8 +47,9 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
     result = SettledResult(
-        method="settled period, least squares on Fourier lines, then maximum likelihood of each position as foreseen "
-        f"from the past, the arm drawn to the measured path at {estimate.softness:g} Hz; {model.description}",
+        method="settled period, least squares on Fourier lines, then maximum likelihood of each position by "
+        "one-step-ahead "
+        f"prediction, the simulated arm tracking the measured path at {estimate.softness:g} Hz; {model.description}",
         config=facts.config,
         joints=len(config.joints),
         parameters=_quantities(estimate, 0, linear),
@@ -132,23 +133,22 @@ def _verdict(
     worst = config.joints[int(np.argmax(over))].name
     sentences = [
         f"The residual is {over.max():.2f} times what the encoder's rounding leaves, at {worst}: "
-        + ("nothing is left to explain." if over.max() <= EXPLAINED else "the model lacks something.")
+        + ("nothing remains unexplained." if over.max() <= EXPLAINED else "the model is incomplete.")
     ]
     trust = "yes" if over.max() <= EXPLAINED else "with care"
     if held_out is None:
-        sentences.append("No other path was played, so that nothing says how well it foretells.")
+        sentences.append("No other path was played, so the prediction could not be validated.")
         trust = "with care"
     else:
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
-        sentences.append(
-            f"A path that was not used is foretold within {100 * error:.2f} % of its motion, {joint} worst."
-        )
+        sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
     if estimate.from_prior:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
-            f"The recording shows little of {', '.join(estimate.from_prior)}: these are the URDF's. Swing farther and "
-            "faster ([joint_path]) to see them, or leave them, since they hardly move the arm."
+            f"The recording says little about {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
+            "wider and "
+            "faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
     return Verdict(trust, weakest, tuple(sentences))

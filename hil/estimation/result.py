@@ -25,9 +25,15 @@ class Checks:
 
 
 def make_result(
-    config: Config, shown_path: str, period: SettledPeriod, estimate: Estimate, checks: Checks, timing: RunTiming
+    config: Config,
+    shown_path: str,
+    period: SettledPeriod,
+    estimate: Estimate,
+    checks: Checks,
+    timing: RunTiming,
+    mean_time: float,
 ) -> SettledResult:
-    """The result of one run."""
+    """The result of one run. mean_time: of the period's samples, since the bus was opened [s]."""
     base = len(estimate.model.base_names)
     return SettledResult(
         method=f"settled period, least squares on Fourier lines, then maximum likelihood; "
@@ -52,7 +58,7 @@ def make_result(
         model_choice=checks.model_choice,
         timing=timing,
         arm=arm_facts(config),
-        truth=true_parameters(config),
+        truth=true_parameters(config, mean_time),
     )
 
 

@@ -4,27 +4,32 @@ import logging
 import time
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hil.config.schema import Config
 from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.physical import physical_of
+from hil.estimation.plausibility import doubts
 from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
-from hil.estimator.selection.candidates import considered
+from hil.estimator.selection.candidates import candidates, considered
+from hil.estimator.selection.drift import Drift, friction_change
 from hil.estimator.selection.settled import Choice, choose, predict_period
 from hil.estimator.selection.validation import validate
-from hil.estimator.selection.verdict import judge
+from hil.estimator.selection.verdict import Evidence, judge
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.plan.stabiliser import stabiliser_share
 from hil.results.parts import RunTiming
 from hil.results.result import SettledResult
 from hil.runs.period_file import PlayedPeriod, save_periods
 from hil.runs.recording import Phase, load_samples
-from hil.runs.run_folder import RunFolder
+from hil.runs.run_folder import RunFacts, RunFolder
 from hil.runs.timing import timing
 
 log = logging.getLogger(__name__)
@@ -40,22 +45,29 @@ def estimate_run(run: RunFolder) -> SettledResult:
     period = settled_period(config, facts, samples, IDENTIFY)
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     estimate, choice = _estimate(config, period, other, run.load_starts())
+    left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=considered(period, estimate))
+    drift = None if other is None else _drift(facts, samples, other, estimate)
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if other is not None:
-        predicted = predict_period(estimate, other)
+        later = estimate if drift is None or not drift.is_seen else drift.at_the_later(estimate)
+        predicted = predict_period(later, other)
         played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
+    wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
+    evidence = Evidence(held_out, left_out, drift, wrong, tried_all=choice is not None)
     checks = Checks(
         describe_validation(validation, held_out),
-        describe_verdict(judge(estimate, validation, held_out)),
+        describe_verdict(judge(estimate, validation, evidence)),
         tuple(warnings_of(config, facts, samples, period)),
         None if choice is None else describe_choice(choice),
     )
     seconds = round(time.perf_counter() - started, 3)
     kept_time = RunTiming.of(timing(samples, config.experiment.rate), seconds)
-    result = make_result(config, facts.config, period, estimate, checks, kept_time)
+    result = make_result(
+        config, facts.config, period, estimate, checks, kept_time, _mean_time(facts, samples, IDENTIFY)
+    )
     if config.known is not None:
         result = replace(result, physical=physical_of(result, config.known.quantities(), config.arm.gravity))
     if config.stabiliser is not None:
@@ -67,6 +79,19 @@ def estimate_run(run: RunFolder) -> SettledResult:
     save_periods(run.path, played)
     run.write_result(result)
     return result
+
+
+def _drift(facts: RunFacts, samples: NDArray[np.void], other: SettledPeriod, estimate: Estimate) -> Drift:
+    """How friction changed from what was fitted to the motion held out."""
+    between = _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
+    return friction_change(other, estimate, between)
+
+
+def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
+    """When the last periods of a multisine were played, on the port's clock [s]."""
+    rows = samples[(samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))]
+    last = rows["period"] == rows["period"].max()
+    return float(rows["deadline"][last].mean())
 
 
 def _estimate(

@@ -51,6 +51,7 @@ class Following:
         sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)
         self._per_square = 0.5 / sigma**2
         self._allowed = max(follow_share * planned, SIGMA_TICKS * tick)
+        self._share = follow_share
         self._follow_time = follow_time
         self._former_goal = 0.0
         self._evidence = 0.0
@@ -77,7 +78,8 @@ class Following:
         else:
             self._evidence = 0.0
             self._count = 0
-        if off <= self._allowed:
+        # A stabiliser may ask for more than was planned.
+        if off <= self._allowed or off <= self._share * abs(goal):
             self._differs_for, self._differs = 0.0, 0
             return None
         self._differs_for += seconds

@@ -7,6 +7,7 @@ turn), `silence` (time without replies or commands).
 """
 
 from collections.abc import Sequence
+from math import isnan
 from typing import NamedTuple, NoReturn
 
 from hil.config.schema import Config, JointConfig
@@ -30,6 +31,12 @@ EARLY_MOTION_RAD = 0.05
 
 LONG_GAP = 3.0
 """Intervals between two samples from which on what lies between them is not known well enough to be added up."""
+
+LATE_SHARE = 0.2
+"""Of the deadlines that may be missed for long."""
+
+_OFTEN_LATE = 5.0
+_OF_ONE_STALL = 2  # deadlines that count, of those that one stall makes late
 
 WORK_TOLERANCE_RAD = 0.03
 """Work that a joint may seem to give out before its sign is called wrong: this angle at its largest torque."""
@@ -97,6 +104,7 @@ class Guard:
         self._missing = [0] * count
         self._work = [0.0] * count
         self._late = 0
+        self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
@@ -116,6 +124,8 @@ class Guard:
     def late(self, seconds: float = 0.0) -> None:
         """A deadline passed unused, `seconds` after the last command. Raises SafetyStop after too long a time."""
         self._late += 1
+        if self._late <= _OF_ONE_STALL:
+            self._often_late += 1.0
         seconds = max(seconds, self._late * self._interval)
         allowed, said = self._late_limit
         if seconds <= allowed:
@@ -126,6 +136,17 @@ class Guard:
             f"{1e3 * allowed:.0f} ms. {_WHY_LATE}{self._acted(seconds)}",
             Cause.LATE,
         )
+
+    def _judge_rate(self) -> None:
+        """Deadlines missed now and then add up where more than a share of them is; a single stall does not."""
+        self._often_late = max(0.0, self._often_late - LATE_SHARE)
+        if self._often_late >= max(_OFTEN_LATE, 0.5 * self._late_limit.seconds / self._interval):
+            raise SafetyStop(
+                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed: the replies come too late for "
+                f"{1 / self._interval:g} Hz. `hil check` measures what this bus can do: look at the adapter's latency "
+                "timer and the servos' return delay, or lower experiment.rate.",
+                Cause.LATE,
+            )
 
     def look(self, state: State, watchdog_gap: float = 0.0) -> None:
         """Raise SafetyStop when a limit is passed or an answer makes no sense.
@@ -140,15 +161,18 @@ class Guard:
                 Cause.LATE,
             )
         self._late = 0
+        if self._often_late > 0.0:
+            self._judge_rate()
         for index, limits in enumerate(self._limits):
             if state.error[index] & ALERT:
                 self._stop(index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, reboot.")
             if state.missing[index]:
-                self._count_missing(index, now)
+                self._count_missing(index, state.error[index], now)
             else:
                 self._look_at_joint(index, limits, state, now)
         if state.slow is not None:
             self._look_slow(state.slow)
+            self._look_at_clocks(state.slow, now)
         if state.status is not None:
             self._look_status(state.status, state)
 
@@ -176,7 +200,7 @@ class Guard:
         consistency = self._consistency[index]
         if seconds > LONG_GAP * interval:
             consistency.lost()
-        if consistency.look(position, velocity, seconds) is not None:
+        if consistency.look(position, velocity, seconds):
             self._disagree(index, position, velocity)
         work = self._work[index] = self._work[index] + work_scale * goal * velocity
         if work < work_least and self._passive:
@@ -197,7 +221,7 @@ class Guard:
                     "allowed. Let the arm hang still; look for a draught, a pulling cable, a hand.",
                 )
 
-    def _count_missing(self, index: int, now: float) -> None:
+    def _count_missing(self, index: int, error: int, now: float) -> None:
         if self._missing[index] == 0 and self._position[index] is None:
             self._seen_at[index] = now
         self._missing[index] += 1
@@ -205,6 +229,13 @@ class Guard:
         self._consistency[index].lost()
         allowed, said = self._missing_limit
         if is_missing_too_long(self._missing[index], seconds, self._missing_limit):
+            if error:
+                self._stop(
+                    index,
+                    Cause.MISSING,
+                    f"answers with error {error} in place of its state, for {1e3 * seconds:.0f} ms: it refuses to be "
+                    "read. Switch its supply off and on.",
+                )
             self._stop(
                 index,
                 Cause.MISSING,
@@ -253,6 +284,11 @@ class Guard:
             f"reports a velocity of {velocity:+.2f} rad/s that does not fit its position, {position:.3f} rad: one of "
             "the two readings is frozen or wrong. Look at the encoder and its magnet; replace the servo.",
         )
+
+    def _look_at_clocks(self, slow: Slow, now: float) -> None:
+        for index, tick in enumerate(slow.tick):
+            if not isnan(tick) and (wrong := self._status.look_at_clock(index, tick, now)) is not None:
+                self._stop(index, *wrong)
 
     def _look_status(self, told: Sequence[Status | None], state: State) -> None:
         for index, status in enumerate(told):

@@ -60,15 +60,15 @@ class ModelWatch:
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint >= 0:
-            self._raise(joint, torque[joint], state)
+            self._raise(joint, state)
 
-    def _raise(self, joint: int, torque: float, state: State) -> None:
+    def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
             said = (
-                f"{name} stands still under {torque:+.3f} N m, which would move any arm that fits what is known and "
-                "was seen of this one. Something holds it, it is stuck, or its encoder is frozen."
+                f"{name} stands still although {abs(lacking):.3f} N m drive it, which would move any arm that fits "
+                "what is known and was seen of this one. Something holds it, it is stuck, or its encoder is frozen."
             )
         else:
             said = (

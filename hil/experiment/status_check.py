@@ -13,10 +13,13 @@ from hil.errors import Cause
 
 _TRIPPED = 255
 _WRAP_S = 32.768
-_CLOCK_TOLERANCE_S = 0.05
-"""By how much a servo's clock may differ from the computer's between two readings: its replies' own delay included."""
+_CLOCK_TOLERANCE_S = 0.004
+"""By how much a servo's clock, which counts milliseconds, may be behind what is expected of it."""
 
+_REBOOTED_S = 1.0  # ahead by more than any delay of a request
 _CLOCK_DRIFT = 0.01
+_LEARNT_READINGS = 3
+_STALE_READINGS = 2
 _GOALS_MISSED = 2
 """Times in a row that a goal may not have arrived: one packet may get lost."""
 
@@ -30,7 +33,8 @@ class StatusCheck:
         self._half_tick = [0.5 * abs(joint.joint.drive_unit(12.0)) for joint in config.joints]
         self._unit = [joint.drive_mode.goal_unit for joint in config.joints]
         self._missed = [0] * len(config.joints)
-        self._clock: list[tuple[float, float] | None] = [None] * len(config.joints)
+        # Per joint: the least seen of servo's less computer's clock [s], when that was, readings, stale ones in a row.
+        self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. What is wrong, for a sentence."""
@@ -42,15 +46,16 @@ class StatusCheck:
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
                 "supply failed for a moment, or another program uses this bus."
             )
-        return self._watchdog(status) or self._goal(joint, status, sent) or self._time(joint, status, now)
+        return self._watchdog(status) or self._goal(joint, status, sent) or self.look_at_clock(joint, status.tick, now)
 
     def _watchdog(self, status: Status) -> tuple[Cause, str] | None:
         if status.watchdog == self._armed:
             return None
         if status.watchdog == _TRIPPED:
             return Cause.WATCHDOG, (
-                "was stopped by its Bus Watchdog: it heard nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Look at its cable; close other programs on this computer."
+                "has lost its torque: its watchdog acted (Bus Watchdog reads 255), so it heard nothing for "
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms: look at its plug and wire, "
+                "or the computer kept this program waiting."
             )
         if status.watchdog == 0 and self._may_be_unwatched:
             return None
@@ -72,16 +77,28 @@ class StatusCheck:
             "former one before. Packets to it get lost, or it refuses them: look at cable and limits."
         )
 
-    def _time(self, joint: int, status: Status, now: float) -> tuple[Cause, str] | None:
-        former, self._clock[joint] = self._clock[joint], (status.tick, now)
-        if former is None:
-            return None
-        elapsed = now - former[1]
-        off = (status.tick - former[0] - elapsed + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S
-        if abs(off) <= _CLOCK_TOLERANCE_S + _CLOCK_DRIFT * elapsed:
-            return None
-        return Cause.STALE, (
-            f"does not answer of now: its own clock went on by {1e3 * (elapsed + off):.0f} ms while "
-            f"{1e3 * elapsed:.0f} ms passed. Its replies are old ones, held up on their way, or it was rebooted. Look "
-            "at the adapter and its cable."
-        )
+    def look_at_clock(self, joint: int, tick: float, now: float) -> tuple[Cause, str] | None:
+        """tick: the servo's own clock [s]; now: the computer's, before it asked [s].
+
+        A servo's clock may be ahead of what is expected, since the request was late, but never behind: then the reply
+        is an old one. What is expected is the least that was seen, which may drift.
+        """
+        behind, seen_at, readings, stale = self._clock[joint]
+        offset = (tick - now) % _WRAP_S
+        if readings == 0:
+            behind = offset
+        ahead = (offset - behind + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S
+        drifted = _CLOCK_DRIFT * (now - seen_at)
+        if ahead < -_CLOCK_TOLERANCE_S - drifted or ahead > _REBOOTED_S:
+            stale += 1
+            self._clock[joint] = behind, seen_at, readings, stale
+            if stale < _STALE_READINGS or readings < _LEARNT_READINGS:
+                return None
+            return Cause.STALE, (
+                f"does not answer of now: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies are "
+                "held up on their way and come too late, or it was rebooted. Look at the adapter, its latency and its "
+                "cable."
+            )
+        least = offset if ahead < drifted else behind + drifted
+        self._clock[joint] = least, now, readings + 1, 0
+        return None

@@ -72,7 +72,7 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._guard = Guard(config, planned)
-        # Arms in space have no watch by a model yet, and are played on the fake bus only.
+        # Of a chain there is no such model yet: position, velocity, current and status are what is looked at.
         self._model = None if config.is_chain else ModelWatch(config, planned, arms)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
@@ -143,8 +143,8 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"changes by {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} of what only "
-            "drifts. Look for play, a dragging cable or a slipping joint; or raise "
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} of what only drifts. Look for play, a "
+            "dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 

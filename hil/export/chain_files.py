@@ -19,7 +19,7 @@ from hil.export.xml_text import comment, numbers, to_text
 
 
 def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write `path`; what URDF has no place for. Raises ExportError."""
+    """Write `path`; what URDF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = parse_urdf(found.path)
     links = {element.get("name"): element for element in root.findall("link")}
@@ -44,7 +44,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
 
 
 def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write `path`; what MJCF has no place for. Raises ExportError."""
+    """Write `path`; what MJCF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
     left = ["the URDF's meshes, limits of effort and fixed frames", *found.left_out]
@@ -80,7 +80,7 @@ def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: l
         f"Inertias, damping and friction identified by hil {__version__}; all else is of {found.path.name}.",
         "One of many sets of links that move alike, the nearest to that file's: only these sums were measured:",
         *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
-        *(f"No place in this format for {sentence}" for sentence in left),
+        *(f"Not representable in this format: {sentence}" for sentence in left),
     ]
     for position, text in enumerate(words):
         root.insert(position, ET.Comment(f" {text.replace('--', '- -')} "))

@@ -18,7 +18,7 @@ Exporter = Callable[[Source, Path], list[str]]
 
 @dataclass(frozen=True)
 class Format:
-    """One format. write: writes a file and returns what it has no place for. file_name: within the run folder."""
+    """One format. write: writes a file and returns what it cannot represent. file_name: within the run folder."""
 
     write: Exporter
     file_name: str
@@ -40,7 +40,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Written:
-    """A file that was written, and what its format has no place for."""
+    """A file that was written, and what its format cannot represent."""
 
     format: str
     path: Path

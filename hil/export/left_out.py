@@ -1,4 +1,4 @@
-"""What a robot description has no place for, in words: said on the terminal and in the file, never dropped silently."""
+"""What a robot description cannot represent, in words: said on the terminal and in the file, never dropped silently."""
 
 from hil.arm_model import ArmModel
 from hil.estimator.models.terms import term_of

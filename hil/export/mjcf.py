@@ -15,7 +15,7 @@ _CARRIED = ("armature", "offset", "lag")
 
 
 def export_mjcf(source: Source, path: Path) -> list[str]:
-    """Write `path`; what MJCF has no place for. Raises ExportError when no physical masses exist."""
+    """Write `path`; what MJCF cannot represent. Raises ExportError when no physical masses exist."""
     model = source.model
     if isinstance(model, ChainArmModel):
         return export_chain_mjcf(source, model, path)

@@ -15,7 +15,7 @@ STANDARD_GRAVITY = 9.81
 
 
 def export_urdf(source: Source, path: Path) -> list[str]:
-    """Write `path`; what URDF has no place for. Raises ExportError when no physical masses exist."""
+    """Write `path`; what URDF cannot represent. Raises ExportError when no physical masses exist."""
     model = source.model
     if isinstance(model, ChainArmModel):
         return export_chain_urdf(source, model, path)

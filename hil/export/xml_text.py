@@ -25,7 +25,7 @@ def describe(root: ET.Element, model: ArmModel, left: list[str]) -> None:
     for name, value in model.values.items():
         comment(root, f"{name} = {value!r} +- {model.stds[name]:.1e}")
     for sentence in left:
-        comment(root, f"No place in this format for {sentence}")
+        comment(root, f"Not representable in this format: {sentence}")
 
 
 def axis(model: ArmModel) -> str:

@@ -99,7 +99,7 @@ class Result:
 
     @property
     def _title(self) -> str:
-        trust = "" if self.verdict is None else f", trust it: {self.verdict.trust}"
+        trust = "" if self.verdict is None else f", trust this model: {self.verdict.trust}"
         residual = ", ".join(f"{value:.3f}" for value in self.fit.residual_rms_ticks)
         return f"{self.joints}-joint arm of {self.config}{trust}; residual {residual} encoder steps RMS"
 

@@ -46,11 +46,11 @@ class Way:
 
 @dataclass(frozen=True)
 class RateReport:
-    """All ways measured; `found` in words what the configured way can hold; `mend` is empty where that is enough."""
+    """All ways measured; `found` in words what the configured way can hold; `fix` is empty where that is enough."""
 
     ways: tuple[Way, ...]
     found: str
-    mend: str
+    fix: str
 
 
 def check_rate(bus: ServoBus, wanted: float) -> RateReport:

@@ -70,9 +70,9 @@ def arm_toml(arm: ArmAnswers) -> str:
         "[experiment]",
         _line(f"rate = {rate:.1f}", "samples per second; hil check tells what this bus can do"),
         _line("period = 10.0", "s"),
-        _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: lines shared out between the joints in turn"),
+        _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: its lines are assigned to the joints in turn"),
         _line("pilot = true", "find the torque: small first, then up to the limits"),
-        _line("ramp = 1.0", "s, in and out"),
+        _line("ramp = 1.0", "s, at start and end"),
         "seed = 1",
     ]
     model = [
@@ -82,7 +82,7 @@ def arm_toml(arm: ArmAnswers) -> str:
     ]
     if len(arm.joints) == 2:
         model.append(_line("torque_scale = true", "find how far the second torque constant is off against the first"))
-    safety = ["[safety]", _line("watchdog = 0.1", "s of silence after which a servo stops by itself")]
+    safety = ["[safety]", _line("watchdog = 0.1", "s without packets after which a servo stops by itself")]
     tables = [head, port, *(_joint(joint) for joint in arm.joints), mechanism, experiment, model, safety]
     return "\n\n".join("\n".join(table) for table in tables) + "\n"
 
@@ -104,7 +104,7 @@ def _joint(answers: JointAnswers) -> list[str]:
         f"name = {json.dumps(answers.name, ensure_ascii=False)}",
         f"id = {answers.id}",
         f"model = {json.dumps(answers.model)}",
-        _line(f"direction = {answers.direction}", "-1 where the servo turns against the joint"),
+        _line(f"direction = {answers.direction}", "-1 where the servo turns opposite to the joint"),
         _line(f"zero_ticks = {answers.zero_ticks}", "Present Position where the joint's angle is 0"),
         _line(f"{constant} = {published.value:.3g}", f"N m/{unit} at the output shaft; published: {figures}"),
         _line(

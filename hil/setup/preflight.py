@@ -34,13 +34,13 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at: what, on what, what was found, and where it is not well how to mend it."""
+    """One thing looked at: what, on what, what was found, and where it is not well how to fix it."""
 
     level: Level
     where: str
     what: str
     found: str
-    mend: str = ""
+    fix: str = ""
 
 
 def check_arm(config: Config) -> Iterator[Finding]:
@@ -100,8 +100,8 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
         yield Finding(Level.WARNING, config.port.url, "others", "not asked", str(error))
         return
     if found:
-        mend = "They are left alone: no torque and no setting of theirs is changed."
-        yield Finding(Level.WARNING, config.port.url, "others on this bus", "; ".join(found), mend)
+        fix = "They are left alone: no torque and no setting of theirs is changed."
+        yield Finding(Level.WARNING, config.port.url, "others on this bus", "; ".join(found), fix)
 
 
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
@@ -113,8 +113,8 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
     try:
         number = servo.ping()
     except NoReply:
-        mend = f"Check supply and cable. `hil scan {config.port.url}` finds it at another ID or baud."
-        yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", mend)
+        fix = f"Check supply and cable. `hil scan {config.port.url}` finds it at another ID or baud."
+        yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", fix)
         return
     except DriverError as error:
         yield Finding(Level.STOP, where, "answers", "damaged", str(error))
@@ -127,18 +127,18 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
     yield from _left_behind(config, joint, servo)
     for look in (*_LOOKS, _pose):
         try:
-            level, what, found, mend = look(config, joint_config, joint, servo)
+            level, what, found, fix = look(config, joint_config, joint, servo)
         except PortLost as error:
             yield Finding(Level.STOP, where, "port", "lost", str(error))
             return
         except DriverError as error:
-            mend = (
+            fix = (
                 f"{error} It answers a ping: if it never answers a read, its Status Return Level is 0; switch its "
                 "supply off and on, which sets it back to 2."
             )
-            yield Finding(Level.STOP, where, "registers", "cannot be read", mend)
+            yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
             return
-        yield Finding(level, where, what, found, mend)
+        yield Finding(level, where, what, found, fix)
 
 
 def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding]:
@@ -159,62 +159,62 @@ _Seen = tuple[Level, str, str, str]
 _Look = Callable[[Config, JointConfig, Joint, Servo], _Seen]
 
 
-def _graded(fine: bool, what: str, found: str, mend: str, otherwise: Level = Level.STOP) -> _Seen:
-    return (Level.OK, what, found, "") if fine else (otherwise, what, found, mend)
+def _graded(fine: bool, what: str, found: str, fix: str, otherwise: Level = Level.STOP) -> _Seen:
+    return (Level.OK, what, found, "") if fine else (otherwise, what, found, fix)
 
 
 def _firmware(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     firmware, needed = servo.read("Firmware Version"), joint.servo.watchdog_firmware
-    mend = f"The Bus Watchdog needs {needed} or newer: update it with DYNAMIXEL Wizard 2.0."
-    return _graded(firmware >= needed, "firmware", str(firmware), mend)
+    fix = f"The Bus Watchdog needs {needed} or newer: update it with DYNAMIXEL Wizard 2.0."
+    return _graded(firmware >= needed, "firmware", str(firmware), fix)
 
 
 def _status_level(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     level = servo.read("Status Return Level")
-    mend = "At less than 2 no write is confirmed. Switch its supply off and on, which sets it back to 2."
-    return _graded(level == 2, "status return level", str(level), mend)
+    fix = "At less than 2 no write is confirmed. Switch its supply off and on, which sets it back to 2."
+    return _graded(level == 2, "status return level", str(level), fix)
 
 
 def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     error = servo.hardware_error()
-    mend = "It stays without torque until it is rebooted: find the cause, then switch its supply off and on."
-    return _graded(error == HardwareError(0), "hardware error", describe_error(error), mend)
+    fix = "It stays without torque until it is rebooted: find the cause, then switch its supply off and on."
+    return _graded(error == HardwareError(0), "hardware error", describe_error(error), fix)
 
 
 def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
-    mend = "Something drives it: stop that program first; or switch its supply off and on."
-    return _graded(torque == 0, "torque", "on" if torque else "off", mend)
+    fix = "Something drives it: stop that program first; or switch its supply off and on."
+    return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 
 def _drive_mode(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     drive_mode = servo.read("Drive Mode")
-    mend = (
+    fix = (
         "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), bit 3 lets any goal turn torque on. "
         "Set it with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), mend)
+    return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), fix)
 
 
 def _secondary_id(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     secondary = servo.read("Secondary(Shadow) ID")
     others = {servo_id for each in config.joints for servo_id in each.ids} - {joint.id}
     none = secondary > MAX_ID
-    mend = (
+    fix = (
         f"It does what is told to that ID too, EEPROM aside. Type: hil setup {_port(config)} --id {joint.id} "
         "--secondary-id 255"
     )
     level = Level.STOP if secondary in others else Level.WARNING
-    return _graded(none, "secondary ID", "none" if none else str(secondary), mend, level)
+    return _graded(none, "secondary ID", "none" if none else str(secondary), fix, level)
 
 
 def _startup(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     armed = arms_itself(servo)
-    mend = (
+    fix = (
         "Startup Configuration arms it whenever it is switched on or reboots, also in the middle of a run. Set that "
         "register to 0 with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(not armed, "at switch-on", "torque comes on by itself" if armed else "torque stays off", mend)
+    return _graded(not armed, "at switch-on", "torque comes on by itself" if armed else "torque stays off", fix)
 
 
 def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -225,16 +225,16 @@ def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Serv
 
 def _return_delay(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     delay_us = round(RETURN_DELAY_UNIT * 1e6) * servo.read("Return Delay Time")
-    mend = f"Each reply waits for it. Type: hil setup {_port(config)} --id {joint_config.id} --return-delay-us 0"
+    fix = f"Each reply waits for it. Type: hil setup {_port(config)} --id {joint_config.id} --return-delay-us 0"
     fine = delay_us <= _LONG_RETURN_DELAY_US
-    return _graded(fine, "return delay", f"{delay_us} us", mend, Level.WARNING)
+    return _graded(fine, "return delay", f"{delay_us} us", fix, Level.WARNING)
 
 
 def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     value = servo.read("Baud Rate")
     found = str(BAUD_RATES[value]) if value < len(BAUD_RATES) else f"unknown value {value}"
-    mend = f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then port.baud = 1000000"
-    return _graded(config.port.baud >= 1_000_000, "baud", found, mend, Level.WARNING)
+    fix = f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then port.baud = 1000000"
+    return _graded(config.port.baud >= 1_000_000, "baud", found, fix, Level.WARNING)
 
 
 def _share(joint_config: JointConfig) -> float:
@@ -245,14 +245,14 @@ def _share(joint_config: JointConfig) -> float:
 def _drive_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
     if joint.mode is Mode.PWM:
         volts = VOLTAGE_UNIT * servo.read("Present Input Voltage") * servo.read("PWM Limit") / FULL_PWM_TICKS
-        mend = f"Lower voltage_limit in the configuration, or raise the servo's PWM Limit (at most {FULL_PWM_TICKS})."
-        return _graded(_share(joint_config) <= volts, "voltage limit", f"{volts:.1f} V at this supply", mend)
+        fix = f"Lower voltage_limit in the configuration, or raise the servo's PWM Limit (at most {FULL_PWM_TICKS})."
+        return _graded(_share(joint_config) <= volts, "voltage limit", f"{volts:.1f} V at this supply", fix)
     amperes = servo.read("Current Limit") * abs(joint.drive_unit(0.0))
-    mend = (
+    fix = (
         f"The configuration's current_limit is {joint_config.goal_limit:g} A: lower it, or raise the servo's Current "
         "Limit with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(_share(joint_config) <= amperes, "current limit", f"{amperes:.3f} A", mend)
+    return _graded(_share(joint_config) <= amperes, "current limit", f"{amperes:.3f} A", fix)
 
 
 def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -261,20 +261,20 @@ def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: 
     share = _share(joint_config)
     needed = share * joint.servo.resistance if joint.mode is Mode.CURRENT else share
     found = f"{pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply"
-    mend = (
+    fix = (
         f"It bounds the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
         "rest and more at speed: raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
     )
     if volts < needed:
-        return Level.STOP, "PWM limit", found, mend
-    return _graded(pwm >= FULL_PWM_TICKS, "PWM limit", found, mend, Level.WARNING)
+        return Level.STOP, "PWM limit", found, fix
+    return _graded(pwm >= FULL_PWM_TICKS, "PWM limit", found, fix, Level.WARNING)
 
 
 def _shutdown(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     mask = HardwareError(servo.read("Shutdown"))
     wanted = HardwareError.OVERHEATING | HardwareError.OVERLOAD
-    mend = "Overheating and overload should stop it: set Shutdown to its factory value with DYNAMIXEL Wizard 2.0."
-    return _graded(wanted in mask, "shuts down on", describe_error(mask), mend, Level.WARNING)
+    fix = "Overheating and overload should stop it: set Shutdown to its factory value with DYNAMIXEL Wizard 2.0."
+    return _graded(wanted in mask, "shuts down on", describe_error(mask), fix, Level.WARNING)
 
 
 def _voltage(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -283,8 +283,8 @@ def _voltage(config: Config, _joint_config: JointConfig, joint: Joint, servo: Se
     )
     found = f"{voltage:.1f} V ({low:.1f} to {high:.1f})"
     if voltage < config.safety.min_voltage:
-        mend = f"A {joint.servo.name} needs {config.safety.min_voltage:g} V (safety.min_voltage): switch the supply on."
-        return Level.STOP, "voltage", found, mend
+        fix = f"A {joint.servo.name} needs {config.safety.min_voltage:g} V (safety.min_voltage): switch the supply on."
+        return Level.STOP, "voltage", found, fix
     return _graded(low <= voltage <= high, "voltage", found, "Fix the supply: outside its limits it shuts down.")
 
 
@@ -293,8 +293,8 @@ def _temperature(_config: Config, _joint_config: JointConfig, _joint: Joint, ser
     found = f"{heat} C (limit {limit})"
     if heat >= limit:
         return Level.STOP, "temperature", found, "Let it cool down."
-    mend = "Close to its limit: let it cool down, or lower experiment.peak_torque."
-    return _graded(heat < limit - _WARM_BELOW_LIMIT_C, "temperature", found, mend, Level.WARNING)
+    fix = "Close to its limit: let it cool down, or lower experiment.peak_torque."
+    return _graded(heat < limit - _WARM_BELOW_LIMIT_C, "temperature", found, fix, Level.WARNING)
 
 
 def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -305,11 +305,11 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     angle = joint.within_turn(ticks).angle(ticks)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
-    mend = (
+    fix = (
         f"arm.rest_pose says {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "
         f"at rest now, set zero_ticks = {zero}."
     )
-    return _graded(abs(angle - rest) <= config.arm.rest_tolerance, "pose", f"{angle:+.3f} rad", mend)
+    return _graded(abs(angle - rest) <= config.arm.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)
 
 
 _LOOKS: tuple[_Look, ...] = (
@@ -347,11 +347,11 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
                 Level.OK, str(joint), "goals", "refused until its tripped Bus Watchdog is cleared, as a run does"
             )
             continue
-        mend = (
+        fix = (
             "A goal sent by Sync Write did not arrive though reads are answered: try port.one_write = false; look for "
             "an adapter or hub that swallows bytes, and for a second servo with this ID."
         )
-        yield Finding(Level.STOP, str(joint), "goals", "not taken", mend)
+        yield Finding(Level.STOP, str(joint), "goals", "not taken", fix)
 
 
 def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
@@ -362,8 +362,8 @@ def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
         return
     for way in report.ways:
         yield Finding(Level.OK if way.sound else Level.WARNING, "bus", way.name, str(way))
-    level = Level.STOP if report.mend else Level.OK
-    yield Finding(level, "bus", "rate", f"{config.experiment.rate:g} Hz wanted, {report.found}", report.mend)
+    level = Level.STOP if report.fix else Level.OK
+    yield Finding(level, "bus", "rate", f"{config.experiment.rate:g} Hz wanted, {report.found}", report.fix)
 
 
 def _port(config: Config) -> str:

@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -109,6 +109,15 @@ def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(
         assert off - left < 0.002
 
 
+@pytest.fixture
+def _interrupts() -> Iterator[None]:
+    """Ctrl-C as a program without handlers of its own feels it; a test runner's workers ignore it."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.usefixtures("_interrupts")
 @pytest.mark.parametrize("after", [0, 1, 2, 5])
 def test_an_interrupt_while_torque_is_cut_waits_until_it_is_cut(fake_config: Make, after: int) -> None:
     """Used as a library, without handlers that would only take note of Ctrl-C."""

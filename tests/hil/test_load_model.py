@@ -88,7 +88,9 @@ def test_a_pendulum_is_an_arm_too(identified: Path) -> None:
 
 def test_shapes_that_do_not_fit_are_named(identified: Path) -> None:
     model = load_model(identified)
-    with pytest.raises(ValueError, match=r"q \(3, 2\), dq \(3, 2\), ddq \(2,\): all must have one shape \(\.\.\., 2\)"):
+    with pytest.raises(
+        ValueError, match=r"q \(3, 2\), dq \(3, 2\), ddq \(2,\): all must have the same shape \(\.\.\., 2\)"
+    ):
         model.inverse_dynamics(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(2))
     with pytest.raises(ValueError, match=r"q \(3,\)"):
         model.gravity_torque(np.zeros(3))

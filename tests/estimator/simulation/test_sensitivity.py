@@ -18,7 +18,7 @@ EACH = {
 }
 ARM = {
     **{"inertia_1": 0.018, "coupling": 0.0033, "inertia_2": 0.0028, "armature_2": 0.01},
-    **{"gravity_1": 0.55, "gravity_2": 0.22, "lag": 1e-3, "delay": 2e-4},
+    **{"gravity_1": 0.55, "gravity_2": 0.22, "lag": 1e-3, "delay": 2e-4, "lag_difference_2": 4e-4},
     **{f"{name}_{joint}": value for name, value in EACH.items() for joint in (1, 2)},
 }
 BRISTLES = {f"presliding_{name}_{joint}": v for name, v in (("stiffness", 12.0), ("damping", 0.1)) for joint in (1, 2)}
@@ -32,7 +32,8 @@ def torque() -> np.ndarray:
 
 
 def position(values: dict[str, float]) -> np.ndarray:
-    motor = motor_torque(torque(), RATE, 3e-4, STEPS, delay=values["delay"], lag=values["lag"])
+    physics = Physics.of(values)
+    motor = motor_torque(torque(), RATE, 3e-4, STEPS, delay=physics.delay, lag=physics.lags)
     start = np.array([[values["position_1"], values["position_2"]], [values["velocity_1"], values["velocity_2"]]])
     return simulate(Physics.of(values), start, motor, 1.0 / (RATE * STEPS))[0]
 
@@ -41,7 +42,7 @@ def position(values: dict[str, float]) -> np.ndarray:
 def test_derivatives_are_those_of_the_simulation(bristles: dict[str, float]) -> None:
     values = {**ARM, **START, **bristles}
     start = np.array(list(START.values())).reshape(2, 2)
-    motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=ARM["lag"])
+    motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=Physics.of(ARM).lags)
     # With bristles no step over the velocity has a width, without them they have no stiffness.
     absent = "coulomb_width" if bristles else "presliding"
     causes = tuple(cause for cause in CAUSES if not cause.startswith(absent))
@@ -80,7 +81,7 @@ def test_what_the_encoders_get_wrong_is_differentiated_too(joints: int) -> None:
 
 def test_pulled_motion_keeps_to_its_target_and_has_its_own_derivatives() -> None:
     start = np.array(list(START.values())).reshape(2, 2)
-    motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=ARM["lag"])
+    motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=Physics.of(ARM).lags)
     target = np.tile([[-1.5], [0.1]], SAMPLES)
 
     def pulled(values: dict[str, float], pull: float) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +100,7 @@ def test_pulled_motion_keeps_to_its_target_and_has_its_own_derivatives() -> None
 
 def test_rough_steps_stay_within_a_tenth_of_an_encoder_step() -> None:
     values = {**ARM, **START}
-    motor = motor_torque(torque(), RATE, 3e-4, 1, delay=values["delay"], lag=values["lag"])
+    motor = motor_torque(torque(), RATE, 3e-4, 1, delay=values["delay"], lag=Physics.of(values).lags)
     start = np.array(list(START.values())).reshape(2, 2)
     rough = simulate(Physics.of(values), start, motor, 1.0 / RATE)[0]
     assert np.sqrt(np.mean((rough - position(values)) ** 2)) < 0.1 * 2.0 * np.pi / 4096

@@ -51,7 +51,7 @@ def test_record_then_estimate_is_identify(arm_file: ArmFile, identified_once: Pa
     run = hil.record(arm_file(), out="run")
     assert run.result is None and "not estimated" in repr(run)
     assert len(run.samples) == run.timing.samples > 1000
-    with pytest.raises(ResultError, match="holds no estimate"):
+    with pytest.raises(ResultError, match="has no estimate"):
         _ = run.model
     result = hil.estimate(run)
     known = hil.load_run(identified_once).result
@@ -159,7 +159,7 @@ def test_plots_are_figures_a_notebook_can_show(identified_once: Path) -> None:
     assert figure._repr_png_().startswith(b"\x89PNG")
     assert len(run.result.plot().axes) >= 4
     assert len(run.plot().axes) == 4
-    with pytest.raises(ValueError, match=r"no picture begins with 'velocity'.*residual_1"):
+    with pytest.raises(ValueError, match=r"no picture name starts with 'velocity'.*residual_1"):
         run.result.plot("velocity")
     assert "matplotlib.pyplot" not in sys.modules
 

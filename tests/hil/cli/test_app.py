@@ -76,7 +76,7 @@ def test_a_recording_alone_is_estimated_later(arm_file: ArmFile, capsys: pytest.
 def test_a_pilot_is_not_recorded_alone(capsys: pytest.CaptureFixture[str]) -> None:
     config = CONFIGS / "first_time.toml"
     assert hil("record", config, "--out", "run") == 2
-    assert "give experiment.peak_torque and set pilot = false" in capsys.readouterr().err
+    assert "set experiment.peak_torque and pilot = false" in capsys.readouterr().err
     assert not Path("run").exists()
 
 

@@ -27,7 +27,7 @@ def test_export_prints_files_and_what_they_lack(identified: Path, capsys: pytest
     assert hil("export", identified, "--format", "urdf", "--format", "toml") == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0] == str(identified / "arm.urdf") and printed[-1] == str(identified / "arm.toml")
-    assert any(line.startswith("  URDF has no place for armature_2 = 0.0") for line in printed)
+    assert any(line.startswith("  URDF cannot represent armature_2 = 0.0") for line in printed)
 
 
 @pytest.mark.parametrize("command", [("report",), ("export", "--format", "urdf")])
@@ -47,7 +47,7 @@ def test_a_run_that_is_not_whole_is_one_message_and_code_2(
 
 def test_arguments_that_do_not_go_together(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("export", identified, "--format", "toml", "--format", "json", "--out", "x") == 2
-    assert "--out names one file" in capsys.readouterr().err
+    assert "--out names a single file" in capsys.readouterr().err
     assert hil("export", identified, "--format", "step") == 2
     assert "'step' is not a format" in capsys.readouterr().err
     assert hil("export", identified, "--format", "urdf", "--link-length", 0.2) == 2

@@ -53,5 +53,5 @@ def test_a_changed_parameter_is_named_and_drawn(
     assert json.loads(capsys.readouterr().out)["changed"] == ["coulomb_1"]
     pytest.importorskip("matplotlib")
     assert hil("diff", identified, worn, "--png", tmp_path / "wear.png") == 0
-    assert "Changed by more than chance: coulomb_1." in capsys.readouterr().out
+    assert "Significant changes: coulomb_1." in capsys.readouterr().out
     assert (tmp_path / "wear.png").read_bytes().startswith(b"\x89PNG")

@@ -19,7 +19,9 @@ def change(old: str, new: str) -> str:
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_ready_file_is_right(path: Path) -> None:
     config = load_config(path)
-    assert len(config.joints) == len(config.experiment.peak_torque or config.arm.link_lengths or config.joint_path.centre)
+    assert len(config.joints) == len(
+        config.experiment.peak_torque or config.arm.link_lengths or config.joint_path.centre
+    )
 
 
 @pytest.mark.parametrize(
@@ -38,7 +40,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("id = 2", "id = 300", r"joints\[2\]\.id = 300: must be at most 252"),
         ("id = 2", "id = 2.5", r"joints\[2\]\.id = 2\.5: must be a whole number"),
         ("direction = 1 ", "direction = 2 ", r"joints\[1\]\.direction = 2: must be one of -1 or 1"),
-        ("[-4.2, 1.06]", "[1.06, -4.2]", r"the first must be the smaller"),
+        ("[-4.2, 1.06]", "[1.06, -4.2]", r"the first value must be the smaller one"),
         ("[-4.2, 1.06]", "[-4.2]", r"joints\[1\]\.position_limit = \[-4\.2\]: needs at least 2 entries"),
         ("[-4.2, 1.06]", "[-1.2, 1.06]", r"arm\.rest_pose: -1\.5708 rad for joint 'shoulder' is outside"),
         ("[0.80, 0.42]", "[0.80]", r"experiment\.peak_torque has 1 entries; it needs 2"),
@@ -54,10 +56,10 @@ def test_every_ready_file_is_right(path: Path) -> None:
         (
             "[experiment]",
             "[safety]\nwatchdog = 0.05\n[experiment]",
-            r"safety\.watchdog.*steps of 0\.02 s, so a multiple",
+            r"safety\.watchdog.*must be a multiple of 0\.02 s",
         ),
         ("url =", "url ", r"not valid TOML"),
-        ('friction = "stribeck"', 'friction = "auto"\npresliding = true', r"chooses presliding.*: give none"),
+        ('friction = "stribeck"', 'friction = "auto"\npresliding = true', r"chooses presliding.*: remove them"),
         ("[model]", "[model]\ntorque_scale = 1", r"model\.torque_scale = 1: must be true or false"),
     ],
 )

@@ -104,7 +104,7 @@ def test_exports_move_as_identified_and_keep_the_urdf(run: RunFolder, result: Se
     for name in ("urdf", "mjcf"):
         engine = mujoco.MjModel.from_xml_path(str(tmp_path / f"arm.{name}"))
         engine.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        if name == "urdf":  # has no place for rotors, and says so
+        if name == "urdf":  # cannot represent rotors, and says so
             found = [float(text.split(" = ")[1].split()[0]) for text in said[name] if text.startswith("armature")]
             engine.dof_armature[:] = found
         engine.dof_damping[:] = 0.0
@@ -140,7 +140,7 @@ def test_exported_parameters_are_read_back(run: RunFolder, result: SettledResult
 
 def test_what_is_not_there_yet_is_refused(run: RunFolder) -> None:
     for command in (lambda: compare_run(run, False), lambda: estimate_unsettled(run)):
-        with pytest.raises(ConfigError, match="planar arms only"):
+        with pytest.raises(ConfigError, match="only planar arms"):
             command()
 
 
@@ -169,8 +169,8 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
         ('name = "joint2"', 'name = "elbow"', 'no joint "elbow"'),
         ("swing = [0.9", "swing = [3.9", "outside its position_limit"),
         ("speed = [4.8", "speed = [48.0", "velocity_limit"),
-        ("[experiment]", "[experiment]\npilot = true", "only planar arms have a pilot"),
-        ('friction = "stribeck"', 'friction = "auto"', "only for planar arms yet"),
+        ("[experiment]", "[experiment]\npilot = true", "only planar arms support the pilot"),
+        ('friction = "stribeck"', 'friction = "auto"', "only for planar arms so far"),
         ('drive = "lag"', 'drive = "lag"\nripple = true', "model.ripple = true"),
         ("[stabiliser]", "[stabilizer]", "stabili"),
         ('urdf = "open_manipulator_x_like.urdf"\nrest', 'urdf = "none.urdf"\nrest', "cannot be read"),

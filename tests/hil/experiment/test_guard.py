@@ -74,7 +74,58 @@ def test_a_current_that_does_not_follow(arm: Arm) -> None:
 
 def test_a_motor_that_only_takes_work_out_turns_the_wrong_way(arm: Arm) -> None:
     braking = STILL._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0))
-    assert look(Guard(arm()), *[braking] * 12) is Cause.WRONG_SIGN
+    falling = [braking._replace(position=(-1.57 - 0.0075 * n, 0.0)) for n in range(12)]
+    assert look(Guard(arm()), *falling) is Cause.WRONG_SIGN
+
+
+def test_a_goal_that_falls_is_slew_limited_like_one_that_rises(arm: Arm) -> None:
+    guard = Guard(arm())
+    assert guard.clamp([-5.0, 0.3]) == pytest.approx([-100 / 400, 100 / 400])
+    assert guard.clamp([5.0, -0.3]) == pytest.approx([0.0, 0.0])
+    assert guard.clamp([-0.1, 0.2]) == pytest.approx([-0.1, 0.2])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_jump_is_one_in_either_direction_and_what_the_velocity_limit_allows_is_none(arm: Arm, sign: float) -> None:
+    most = 1.5 * 20.0 * (1 / 400 + 0.001) + 0.01
+    assert look(Guard(arm()), STILL, STILL._replace(position=(-1.57, sign * (most + 0.001)))) is Cause.JUMP
+    possible = STILL._replace(position=(-1.57, sign * (most - 0.001)))
+    assert look(Guard(arm()), STILL, possible) is Cause.FROZEN, "its velocity says that it stood still"
+
+
+def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> None:
+    """The elbow swings the shoulder along: what the shoulder's motor takes out, the elbow's put in."""
+    taken = {"goal_current": (0.4, 0.7), "current": (0.4, 0.7), "velocity": (-3.0, 9.0)}
+
+    def states(count: int) -> list[State]:
+        position = [(-1.57 - 0.0075 * n, 0.0225 * n) for n in range(count)]
+        return [STILL._replace(position=each, **taken) for each in position]
+
+    guard = Guard(arm())
+    for state in states(60):
+        guard.look(state)
+    alone = [state._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0)) for state in states(60)]
+    guard = Guard(arm())
+    for state in alone[:11]:
+        guard.look(state)
+    assert look(guard, alone[11]._replace(goal_current=(0.45, 0.0), current=(0.45, 0.0))) is Cause.WRONG_SIGN
+
+
+def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:
+    given = "[stabiliser]\nstiffness = [1.0, 1.0]\ndamping = [0.1, 0.1]\n\n[experiment]\n"
+    guard = Guard(arm(("[experiment]\n", given)))
+    for n in range(60):
+        guard.look(
+            STILL._replace(
+                goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0), position=(-1.57 - 0.0075 * n, 0.0)
+            )
+        )
+
+
+def test_lost_torque_is_measured_against_what_the_configuration_plans(arm: Arm) -> None:
+    """0.8 N m at 1.8 N m/A: a third of that is worth speaking of."""
+    off = STILL._replace(goal_current=(0.15, 0.0))
+    assert look(Guard(arm()), *[off] * 14) is Cause.NOT_FOLLOWING
 
 
 def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
@@ -93,6 +144,26 @@ def test_late_deadlines_stop_before_a_short_watchdog_acts(arm: Arm) -> None:
         guard.late()
     with pytest.raises(SafetyStop, match="13 deadlines in a row were missed, 32 ms without a command"):
         guard.late()
+
+
+def test_deadlines_missed_again_and_again_stop_though_never_many_in_a_row(arm: Arm) -> None:
+    guard = Guard(arm())
+    with pytest.raises(SafetyStop, match=r"More than 20 % of the deadlines are missed.*latency") as stop:
+        for _ in range(40):
+            guard.late()
+            guard.look(STILL)
+    assert stop.value.cause is Cause.LATE
+    guard = Guard(arm())
+    for _ in range(100):  # one stall of ten deadlines, then a second without any
+        for _ in range(10):
+            guard.late()
+        for _ in range(400):
+            guard.look(STILL)
+    guard = Guard(arm())
+    for _ in range(500):  # one in eight
+        guard.late()
+        for _ in range(7):
+            guard.look(STILL)
 
 
 def test_motion_before_the_start(arm: Arm) -> None:

@@ -74,7 +74,7 @@ def fault(ports: list[Any], kind: FaultKind, **options: Any) -> None:
 
 def turn_round(ports: list[Any], joint: int) -> None:
     bus = ports[0].bus
-    bus.plant = SpiedPlant(bus.plant, Spy(turned=joint))
+    bus.plant = bus._joints._plant = SpiedPlant(bus.plant, Spy(turned=joint))
 
 
 def stall(ports: list[Any], seconds: float) -> None:

@@ -103,7 +103,7 @@ def test_pinocchio_has_the_same_inverse_dynamics(identified: Path, name: str) ->
     data = engine.createData()
     q, dq, ddq = motions(len(model.joints))
     ours = model.rigid_body_torque(q, dq, ddq)
-    # URDF has no place for the armature: it is named, and whoever uses the file adds it.
+    # URDF cannot represent the armature: it is named, and whoever uses the file adds it.
     ours[:, -1] -= model.values.get("armature_2", 0.0) * ddq[:, -1]
     theirs = np.array([pinocchio.rnea(engine, data, *row) for row in zip(q, dq, ddq, strict=True)])
     assert np.abs(theirs - ours).max() < 1e-6 * np.abs(ours).max()
@@ -151,7 +151,7 @@ def test_what_has_no_place_is_said_and_written_down(identified: Path, name: str)
     if name == "urdf":
         assert "armature_2" in said and "offset_1" in said and "torque per goal of elbow = 1.8 N m/A" in said
     text = path.read_text(encoding="utf-8")
-    assert all(f"No place in this format for {sentence}" in text for sentence in left)
+    assert all(f"Not representable in this format: {sentence}" in text for sentence in left)
 
 
 def test_names_that_xml_does_not_like(identified: Path) -> None:

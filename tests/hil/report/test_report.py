@@ -103,12 +103,12 @@ def test_a_run_without_held_out_or_period_leaves_those_sections_out(identified: 
 def test_the_verdict_is_the_results_own(identified: Path, trust: str, tone: str, title: str) -> None:
     path = identified / "result.json"
     result = json.loads(path.read_text(encoding="utf-8"))
-    result["verdict"] = {"trust": trust, "weakest": "coupling", "sentences": ["Joint 2 has play.", "Mend it."]}
+    result["verdict"] = {"trust": trust, "weakest": "coupling", "sentences": ["Joint 2 has play.", "Fix it."]}
     result["warnings"] = ["The supply sagged."]
     path.write_text(json.dumps(result), encoding="utf-8")
     section = verdict(RunData.load(identified))
     assert section.tone == tone and title in section.title
-    assert section.bullets[:3] == ("Joint 2 has play.", "Mend it.", "Warning: The supply sagged.")
+    assert section.bullets[:3] == ("Joint 2 has play.", "Fix it.", "Warning: The supply sagged.")
     assert title in make_page(RunData.load(identified))
 
 

@@ -112,7 +112,7 @@ def test_a_healthy_arm_is_ready(arm: Arm) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "what", "level", "mend"),
+    ("change", "what", "level", "fix"),
     [
         ((SERVO_2, SERVO_2 + "return_delay_us = 500\n"), "return delay", Level.WARNING, "--return-delay-us 0"),
         ((SERVO_2, SERVO_2 + 'registers = { "Drive Mode" = 8 }\n'), "drive mode", Level.STOP, "torque on"),
@@ -128,19 +128,19 @@ def test_a_healthy_arm_is_ready(arm: Arm) -> None:
     ],
 )
 def test_what_would_stop_an_experiment_is_found_with_how_to_mend_it(
-    arm: Arm, change: tuple[str, str], what: str, level: Level, mend: str
+    arm: Arm, change: tuple[str, str], what: str, level: Level, fix: str
 ) -> None:
     found = look(arm(change))
     finding = next(finding for (where, each), finding in found.items() if each == what and finding.level is level)
-    assert mend in finding.mend
+    assert fix in finding.fix
     if level is Level.STOP:
-        assert "Fix the servo problems above first" in found["bus", "rate"].mend
+        assert "Fix the servo problems above first" in found["bus", "rate"].fix
 
 
 def test_a_rate_that_the_bus_cannot_hold_is_a_stop_with_the_rate_that_it_can(arm: Arm) -> None:
     found = look(arm(("rate = 400.0", "rate = 1200.0")))
     assert found["bus", "rate"].level is Level.STOP
-    assert found["bus", "rate"].mend.startswith("Set experiment.rate to at most 900")
+    assert found["bus", "rate"].fix.startswith("Set experiment.rate to at most 900")
 
 
 def test_an_arm_that_needs_two_writes_is_found(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +149,7 @@ def test_an_arm_that_needs_two_writes_is_found(arm: Arm, monkeypatch: pytest.Mon
     monkeypatch.setattr(FakeBus, "write", lambda bus, data: write(bus, data[: 7 + (data[5] | data[6] << 8)]))
     finding = look(arm())["bus", "rate"]
     assert finding.level is Level.STOP
-    assert finding.mend == "Set port.one_write = false and port.fast_sync_read = true."
+    assert finding.fix == "Set port.one_write = false and port.fast_sync_read = true."
 
 
 def test_check_changes_nothing(arm: Arm, ports: list[Any]) -> None:

@@ -1,0 +1,74 @@
+"""What of an estimate cannot be, or contradicts what the configuration says of the arm: checks that cost nothing."""
+
+import numpy as np
+
+from hil.config.schema import Config
+from hil.estimator.identify import Estimate
+
+DEVIATIONS = 4.0  # standard errors
+LENGTH_TOLERANCE = 0.05  # of the link's length, which is measured with a ruler
+FLAT = 0.02  # of the largest commanded torque: less gravity than that is none
+RATIO = 0.35  # from 1: torque constants differ by less
+
+
+def doubts(config: Config, estimate: Estimate, largest_torque: float) -> tuple[str, ...]:
+    """One sentence for each thing that does not agree. largest_torque: that was commanded [N m]."""
+    found = [*_length(config, estimate), *_weight(config, estimate, largest_torque), *_constants(estimate)]
+    return tuple(found)
+
+
+def _length(config: Config, estimate: Estimate) -> list[str]:
+    """coupling gravity / gravity_2 is the length of link 1, which a ruler tells."""
+    length = _link_length(config)
+    if length is None or estimate.model.joints != 2 or not config.arm.gravity:
+        return []
+    value = estimate.parameters
+    coupling, weight = value["coupling"], value["gravity_2"]
+    if not coupling or not weight:
+        return []
+    found = coupling * config.arm.gravity / weight
+    at = [estimate.names.index(name) for name in ("coupling", "gravity_2")]
+    slope = np.array([found / coupling, -found / weight])
+    std = float(np.sqrt(max(0.0, slope @ estimate.covariance[np.ix_(at, at)] @ slope)))
+    if not abs(found - length) > max(DEVIATIONS * std, LENGTH_TOLERANCE * length):
+        return []
+    return [
+        f"coupling * gravity / gravity_2 = {found:.3g} +- {std:.1g} m should be the length of link 1, {length:.3g} m: "
+        "arm.gravity, the plane's tilt or that length is wrong, or the model is incomplete."
+    ]
+
+
+def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[str]:
+    """Gravity's direction and whether there is any."""
+    said = []
+    for joint in range(1, estimate.model.joints + 1):
+        value = estimate.parameters[f"gravity_{joint}"]
+        std = float(estimate.std[estimate.names.index(f"gravity_{joint}")])
+        sure = abs(value) > DEVIATIONS * std and abs(value) > FLAT * largest_torque
+        if not config.arm.gravity:
+            if sure:
+                said.append(
+                    f"arm.gravity = 0, but gravity_{joint} is {value:.3g} +- {std:.1g} N m: the arm does not lie flat."
+                )
+        elif sure and value < 0.0:
+            said.append(
+                f"gravity_{joint} is {value:.3g} N m, negative: zero_ticks is half a turn off, or direction is wrong."
+            )
+    return said
+
+
+def _constants(estimate: Estimate) -> list[str]:
+    ratio = estimate.parameters.get("torque_scale_2", 1.0)
+    if abs(np.log(max(ratio, 1e-6))) < np.log1p(RATIO):
+        return []
+    return [
+        f"The second joint's torque seems to be {ratio:.2g} times what its torque constant says: look at model and "
+        "torque_constant of both joints."
+    ]
+
+
+def _link_length(config: Config) -> float | None:
+    """Of link 1 [m], where somebody gave it."""
+    if config.known is not None and config.known.length_1 is not None:
+        return config.known.quantities()["length_1"].value
+    return None if config.arm.link_lengths is None else config.arm.link_lengths[0]

@@ -1,0 +1,94 @@
+"""Position against velocity, sample by sample: frozen readings are seen soon, healthy and laggy ones never."""
+
+import math
+from collections.abc import Callable
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil.experiment.consistency import Consistency
+
+RATES = (20, 100, 400, 1000)
+STEP = math.tau / 4096
+TICK = 0.229 * math.tau / 60
+
+
+def quantised(value: float, step: float) -> float:
+    return round(value / step) * step
+
+
+def seen_after(
+    rate: int, position: Callable[[float], float], velocity: Callable[[float], float], start: float = 0.0
+) -> float:
+    """When it is seen [s], infinite within six seconds where it is not."""
+    look = Consistency()
+    for index in range(6 * rate):
+        now = start + index / rate
+        if look.look(quantised(position(now), STEP), quantised(velocity(now), TICK), 1 / rate):
+            return now
+    return math.inf
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("speed", [0.7, 3.0, 15.0])
+def test_an_encoder_that_freezes_while_the_joint_moves(rate: int, speed: float) -> None:
+    frozen_at = 1.0
+    when = seen_after(rate, lambda now: speed * min(now, frozen_at), lambda now: speed)
+    assert 0.0 < when - frozen_at <= 0.1 + 1e-9
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("speed", [1.0, 6.0])
+def test_a_velocity_that_stays_at_zero(rate: int, speed: float) -> None:
+    when = seen_after(rate, lambda now: speed * now, lambda now: speed if now < 1.0 else 0.0)
+    assert 0.0 <= when - 1.0 <= 0.15 + 1e-9
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize(("scale", "lag"), [(0.5, 0.0), (1.5, 0.0), (-1.0, 0.0), (1.0, 0.15)])
+def test_a_velocity_that_is_scaled_turned_round_or_old(rate: int, scale: float, lag: float) -> None:
+    def speed(now: float) -> float:
+        return 4.0 * math.sin(math.tau * now)
+
+    def felt(now: float) -> float:
+        return speed(now) if now < 2.0 else scale * speed(now - lag)
+
+    when = seen_after(rate, lambda now: -4.0 / math.tau * math.cos(math.tau * now), felt)
+    assert 0.0 <= when - 2.0 <= 0.25 + 2 / rate, "a sine at its zero: it takes a while until there is something to see"
+
+
+@pytest.mark.parametrize("rate", RATES)
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    lag=st.floats(0.0, 0.02),
+    scatter=st.floats(0.0, 0.7),
+    amplitude=st.floats(0.0, 1.0),
+)
+def test_healthy_joints_are_never_stopped(rate: int, seed: int, lag: float, scatter: float, amplitude: float) -> None:
+    """Multisines up to a quarter of the rate, a filtered velocity, an encoder that scatters, joints at rest."""
+    random = Random(seed)
+    lag = min(lag, 0.5 / rate) if rate < 100 else lag
+    waves = [(random.uniform(0.1, min(5.0, rate / 4.2)), random.uniform(0, math.tau)) for _ in range(6)]
+
+    def position(now: float) -> float:
+        moved = sum(math.sin(math.tau * f * now + phase) for f, phase in waves)
+        return amplitude / 6 * moved + random.gauss(0.0, scatter * STEP)
+
+    def velocity(now: float) -> float:
+        late = now - lag
+        return amplitude / 6 * sum(math.tau * f * math.cos(math.tau * f * late + phase) for f, phase in waves)
+
+    assert seen_after(rate, position, velocity) == math.inf
+
+
+def test_after_a_lost_reply_it_begins_anew() -> None:
+    look = Consistency()
+    for index in range(400):
+        assert not look.look(0.01 * index, 4.0, 0.0025)
+    look.lost()
+    assert not look.look(9.0, 4.0, 0.0025), "the way over lost replies is not its affair"
+    for index in range(400):
+        assert not look.look(9.0 + 0.01 * (index + 1), 4.0, 0.0025)

@@ -1,0 +1,82 @@
+"""What servos tell of themselves: each thing that can be wrong, and what is nothing out of the ordinary."""
+
+from collections.abc import Callable
+
+import pytest
+
+from hil.config.schema import Config
+from hil.drivers.state import Status
+from hil.errors import Cause
+from hil.experiment.status_check import StatusCheck
+
+Arm = Callable[..., Config]
+FINE = Status(watchdog=4, goal=0.1, tick=1.0, torque=True, hardware_error=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause", "said"),
+    [
+        ({"torque": False}, Cause.TORQUE_OFF, "Torque Enable reads 0"),
+        ({"hardware_error": 32}, Cause.ALERT, "overload"),
+        ({"watchdog": 255}, Cause.WATCHDOG, "heard nothing for 80 ms"),
+        ({"watchdog": 0}, Cause.WATCHDOG, "no longer watched: its Bus Watchdog reads 0, it was armed with 4"),
+        ({"watchdog": 5}, Cause.WATCHDOG, "no longer watched"),
+    ],
+)
+def test_what_one_status_shows(arm: Arm, change: dict[str, object], cause: Cause, said: str) -> None:
+    wrong = StatusCheck(arm()).look(1, FINE._replace(**change), 0.1, 1.0)
+    assert wrong is not None and wrong[0] is cause and said in wrong[1]
+
+
+def test_what_a_short_status_leaves_out_is_not_wrong(arm: Arm) -> None:
+    assert StatusCheck(arm()).look(0, FINE._replace(torque=None, hardware_error=None), 0.1, 1.0) is None
+
+
+def test_a_servo_without_watchdog_where_the_user_accepts_it(arm: Arm) -> None:
+    accepted = arm(("[experiment]\n", "[safety]\nallow_no_watchdog = true\n\n[experiment]\n"))
+    assert StatusCheck(accepted).look(0, FINE._replace(watchdog=0), 0.1, 1.0) is None
+    assert StatusCheck(accepted).look(0, FINE._replace(watchdog=255), 0.1, 1.0) is not None
+
+
+def test_a_goal_may_get_lost_once_but_not_twice_in_a_row(arm: Arm) -> None:
+    check = StatusCheck(arm())
+    lost = FINE._replace(goal=0.05)
+    assert check.look(0, lost, 0.1, 1.0) is None
+    assert check.look(1, lost, 0.1, 1.0) is None, "each joint by itself"
+    assert check.look(0, FINE, 0.1, 1.0) is None
+    assert check.look(0, lost, 0.1, 1.0) is None
+    wrong = check.look(0, lost, 0.1, 1.0)
+    assert wrong is not None and wrong[0] is Cause.GOALS_LOST and "holds 0.050 A where 0.100 A was sent" in wrong[1]
+
+
+def readings(check: StatusCheck, clock: Callable[[float], float], until: float) -> tuple[float, str] | None:
+    """Every 35 ms; when it is seen that replies are not of now."""
+    for index in range(int(until / 0.035)):
+        now = 0.035 * index
+        wrong = check.look_at_clock(0, clock(now), now)
+        if wrong is not None:
+            assert wrong[0] is Cause.STALE
+            return now, wrong[1]
+    return None
+
+
+@pytest.mark.parametrize("ppm", [-5000, 0, 5000])
+def test_a_clock_that_drifts_and_wraps_is_fine(arm: Arm, ppm: float) -> None:
+    def clock(now: float) -> float:
+        return int(1e3 * ((30.0 + now * (1 + 1e-6 * ppm)) % 32.768)) * 1e-3
+
+    assert readings(StatusCheck(arm()), clock, 70.0) is None
+
+
+def test_requests_that_leave_late_now_and_then_are_fine(arm: Arm) -> None:
+    assert readings(StatusCheck(arm()), lambda now: now + (0.02 if 0.5 < now % 1 < 0.6 else 0.0), 10.0) is None
+
+
+def test_replies_that_are_held_up_are_seen_in_two_readings(arm: Arm) -> None:
+    found = readings(StatusCheck(arm()), lambda now: now - (0.008 if now > 1.0 else 0.0), 3.0)
+    assert found is not None and 1.0 < found[0] < 1.08 and "8 ms off" in found[1]
+
+
+def test_a_reboot_is_seen_by_the_servos_clock(arm: Arm) -> None:
+    found = readings(StatusCheck(arm()), lambda now: now + 7.0 if now < 1.0 else now - 1.0, 3.0)
+    assert found is not None and found[0] < 1.1 and "rebooted" in found[1]
