@@ -7,7 +7,7 @@ overhead_ms       wall time of an empty run with one worker, scheduler and write
 same              whether 1, 2 and 4 workers gave the same rows to the last digit, timings aside
 lost_after_kill   rows missing or double after five kills of a worker and one of the whole engine (then --resume)
 bytes_a_run       of Parquet, identifications with their default columns
-worker_mb         largest memory of a worker over the empty runs, and how much it grew from their first tenth to their end
+worker_mb         largest memory of a worker over the empty runs; worker_mb_growth: from their first tenth to their end
 rows              of the empty runs, all of them
 """
 

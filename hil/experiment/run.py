@@ -176,8 +176,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if bus.port.latency_measured:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: this adapter was measured to hold replies back for "
-            f"{bus.port.latency * 1e3:.0f} ms, which allows at most {1 / slowest:.0f} Hz. Lower the rate, or use a wired "
-            "adapter with a short latency, such as a U2D2."
+            f"{bus.port.latency * 1e3:.0f} ms, which allows at most {1 / slowest:.0f} Hz. Lower the rate, or use a "
+            "wired adapter with a short latency, such as a U2D2."
         )
 
 

@@ -17,9 +17,9 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
-from hil.drivers.settings import put_back, read_settings
 from hil.drivers.shield import signals_held_back
 from hil.errors import RunFolderError
 from hil.setup import settings_file

@@ -6,9 +6,9 @@ from hil.drivers.errors import BusShared, NoReply, ServoFault, WrongReply, Wrong
 from hil.drivers.joint import Joint
 from hil.drivers.packet import Framer, HardwareError
 from hil.drivers.port import Port
+from hil.drivers.preparation.settings import arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import Mode
-from hil.drivers.settings import arms_itself
 
 LISTEN_S = 0.05
 """How long the bus must be quiet before this program speaks on it for good [s]."""
