@@ -83,7 +83,8 @@ class TorqueOff:
 
     def __str__(self) -> str:
         if not self.unconfirmed:
-            return f"Torque is off on all {len(self.confirmed)} servos, read back."
+            servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
+            return f"Torque is off on {servos}, read back."
         names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
         alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
         if alone:

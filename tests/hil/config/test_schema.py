@@ -78,7 +78,7 @@ def test_one_joint_has_no_ratio_of_torque_constants() -> None:
 
 def test_all_faults_are_told_at_once() -> None:
     text = change("rate = 400.0", "rate = -1").replace("id = 2", "id = 300", 1)
-    with pytest.raises(ConfigError, match=r"(?s)2 faults:.*joints\[2\]\.id.*experiment\.rate"):
+    with pytest.raises(ConfigError, match=r"(?s)2 errors:.*joints\[2\]\.id.*experiment\.rate"):
         parse_config(text, Path("arm.toml"))
 
 
