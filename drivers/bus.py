@@ -42,13 +42,13 @@ _INTERRUPTS_BORNE = 5
 
 @dataclass(frozen=True)
 class BusConfig:
-    """Where the servos are and how they are talked to.
+    """Location of the servos and how to communicate with them.
 
     url: device or pyserial URL. one_write: Sync Write and group read leave in one write; False where `hil check` finds
     that an arm needs two. fast_sync_read: use it where every servo's firmware has it. slow_every: cycles from one
     reading of tick or voltage and temperature to the next. watchdog_required: refuse firmware without Bus Watchdog.
-    take_over: let an arm that somebody holds sink slowly, then cut its torque; else it is refused.
-    interval: s from one exchange to the next, 0 where there is no fixed rate; servos then tell no status.
+    take_over: take over an arm whose torque is on: let it sink slowly, then cut torque; otherwise refuse it.
+    interval: s from one exchange to the next, 0 where there is no fixed rate; servos then report no status.
     """
 
     url: str
@@ -73,7 +73,7 @@ class BusConfig:
 
 @dataclass(frozen=True)
 class TorqueOff:
-    """How the attempt to cut torque ended: joints read back as off, why the others could not be confirmed, and which of
+    """Result of the attempt to cut torque: joints read back as off, why the others could not be confirmed, and which of
     all have no Bus Watchdog.
     """
 
@@ -128,7 +128,7 @@ class ServoBus:
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check who answers and that nobody holds the arm, bring every servo into its mode.
+        """Open the port, check who answers and that nobody holds the arm, set every servo's mode.
 
         Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting, TorqueHeld; the port is closed then.
         """
@@ -177,7 +177,7 @@ class ServoBus:
     def check_identity(self) -> None:
         """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel.
 
-        The first to answer tells how slow the adapter is, where it is slower than its kind says.
+        The first reply also reveals whether the adapter is slower than its type suggests.
         """
         learn_latency(next(iter(self._servos.values())))
         for joint, servo in self._servos.items():
@@ -202,7 +202,7 @@ class ServoBus:
         self._without_watchdog.add(joint)
 
     def release_held(self, ours: Collection[Joint] = ()) -> None:
-        """See to it that no servo has torque before anything is written: raises TorqueHeld, or with
+        """Ensure that no servo has torque before anything is written: raises TorqueHeld, or with
         `BusConfig.take_over` lets the arm sink. ours: joints that a program of this user left behind, cut at once.
         """
         for joint in ours:
@@ -213,7 +213,7 @@ class ServoBus:
         refuse_held(self._servos)
 
     def prepare(self) -> None:
-        """Bring every servo into its mode with torque off, and prepare the exchange.
+        """Set every servo's mode with torque off, and prepare the exchange.
 
         Raises ServoFault, BusShared where another master is heard, and WrongSetting where a register forbids an
         experiment and changing it is the user's decision.
@@ -238,7 +238,7 @@ class ServoBus:
         self._exchange = exchange
 
     def knows_fast_sync_read(self) -> bool:
-        """Whether every servo's firmware has Fast Sync Read."""
+        """Whether every servo's firmware supports Fast Sync Read."""
         return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
 
     def make_exchange(
@@ -246,7 +246,7 @@ class ServoBus:
     ) -> Exchange:
         """An exchange with these servos, sent one way or the other; reads their Return Delay Times first.
 
-        status: whether the servos tell their status now and then, where there is time for it.
+        status: whether the servos report their status periodically, if time allows.
         """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
@@ -271,7 +271,7 @@ class ServoBus:
         )
 
     def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Spans | None, int]:
-        """What the servos tell of themselves and the cycles from one time to the next; None where there is no time."""
+        """The status registers read and the number of cycles between reads; None if there is no time."""
         interval, modes, count = self.config.interval, [drive.mode for drive in self._drives], len(self._drives)
         if not interval:
             return None, 0
@@ -303,7 +303,7 @@ class ServoBus:
         """Send goals, one per joint [A, or V under PWM], and read the arm's state.
 
         A silent servo is marked missing. Raises PortLost; BusShared when another master's instructions are heard again
-        and again; ValueError for a goal that is no number.
+        and again; ValueError for a goal that is not a number.
         """
         if self._in_pairs and len(goals) == len(self.joints):
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
@@ -322,7 +322,7 @@ class ServoBus:
             raise ServoFault(" ".join(faults))
 
     def _faults(self, joint: Joint) -> str:
-        """What is wrong with the servos of a joint that raised its alert."""
+        """The faults of the servos of a joint that raised its alert."""
         texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
         return " ".join(filter(None, texts))
 
@@ -337,7 +337,7 @@ class ServoBus:
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
-        """Torque on inside the block, off after it, however it is left.
+        """Torque is on inside the block and off after it, however the block is left.
 
         watchdog: seconds without a packet after which a servo stops by itself (20 ms steps, at most 2.54 s).
         Raises TorqueNotOff on leaving when a servo could not be confirmed off; `torque_off_report` tells which.
@@ -382,7 +382,7 @@ class ServoBus:
 
         After each servo that cannot be confirmed all are told again: it may hear though it cannot answer, and while it
         was asked the others' watchdogs heard packets and waited. Signals are held back until it is done; an interrupt
-        that comes all the same is raised when all servos were tried and `torque_off_report` is there.
+        that still arrives is raised after all servos have been tried and `torque_off_report` is there.
         """
         interrupts: list[BaseException] = []
         with signals_held_back():
@@ -413,8 +413,9 @@ class ServoBus:
         return tuple(confirmed), tuple(unconfirmed)
 
     def _torque_off_at_once(self) -> None:
-        """To all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s where one is
-        silent. A Sync Write, since what else is on the bus may be held by somebody. Twice, since a packet may be lost.
+        """Torque off to all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s
+        where one is
+        silent. A Sync Write, since other servos on the bus may be in use. Twice, since a packet may be lost.
         """
         entry = self._servos[self._drives[0]].table["Torque Enable"]
         body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")

@@ -1,6 +1,6 @@
 """Time as a parameter: everything that waits takes a Clock.
 
-The in-process fake bus brings a clock of its own on which sleeping costs nothing; see `hil.fakes.bus.clock`.
+The in-process fake bus has its own clock, on which sleeping costs nothing; see `hil.fakes.bus.clock`.
 """
 
 import time

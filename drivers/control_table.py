@@ -1,4 +1,4 @@
-"""Control tables: which register stands where in which model.
+"""Control tables: the registers and addresses of each model.
 
 Read from the `.model` files that the `dynamixel-sdk` package ships (one per model, tab separated), so that no table is
 copied here. They hold addresses and sizes; what a register means is in the ROBOTIS e-Manual.

@@ -6,13 +6,13 @@ DriverError
 │   └── NotPermitted    the port exists, but this user may not open it
 ├── PortLost            the port was open and then failed: cable pulled, adapter gone
 ├── NoReply             a servo did not answer: wrong ID, wrong baud rate, no power
-├── WrongReply          a servo answered with something that is not an answer to the question
+├── WrongReply          a servo's reply does not match the request
 ├── ServoRefused        a servo answered with an error code: access, range, limit
 ├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
 ├── BusShared           another program is master of the same bus
 ├── WrongModel          another model, or one whose firmware is too old, answers at this ID
 ├── WrongSetting        a register holds a value with which no experiment may start
-│   └── TorqueHeld      torque is on already: somebody holds or drives the arm
+│   └── TorqueHeld      torque is already on: another program holds or drives the arm
 └── TorqueNotOff        a servo could not be confirmed to be without torque
 """
 
@@ -20,7 +20,7 @@ DriverError
 class DriverError(Exception):
     """Anything that went wrong between the computer and the servos.
 
-    last_samples: what an experiment had recorded last before it, where one was running.
+    last_samples: the last samples an experiment recorded before it, if one was running.
     """
 
     last_samples: object = None
@@ -47,7 +47,7 @@ class NoReply(DriverError):
 
 
 class WrongReply(DriverError):
-    """The answer was damaged or not one to the question. Example: two servos with the same ID talk at once."""
+    """The reply was corrupted or did not match the request. Example: two servos with the same ID reply at once."""
 
 
 class ServoRefused(DriverError):
@@ -59,7 +59,7 @@ class ServoFault(DriverError):
 
 
 class BusShared(DriverError):
-    """Somebody else sends instructions on this bus. Example: a controller board plugged in beside the adapter."""
+    """Another master sends instructions on this bus. Example: a controller board plugged in beside the adapter."""
 
 
 class WrongModel(DriverError):
@@ -71,7 +71,7 @@ class WrongSetting(DriverError):
 
 
 class TorqueHeld(WrongSetting):
-    """A servo has torque on before anybody asked for it. Example: another program holds the arm up."""
+    """A servo already has torque on. Example: another program holds the arm up."""
 
 
 class TorqueNotOff(DriverError):

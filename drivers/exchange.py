@@ -6,9 +6,9 @@ its own, all in the same write.
 A Sync Write has no reply, so the group read that follows it leaves in the same write: one transaction of the adapter
 instead of two. All packets are prepared once; a cycle packs the goals and one CRC.
 
-Which registers come back may change from cycle to cycle: `spans[0]` mostly, and every `slow_every`-th time one of the
+The registers read may change from cycle to cycle: `spans[0]` mostly, and every `slow_every`-th time one of the
 others, in turn. All spans should hold what the control needs; the slow ones hold more. Every `status_every`-th time
-it is `status`, with the registers that say whether the servos are still driven.
+it is `status`, with the registers that show whether torque is still on.
 """
 
 import struct
@@ -155,11 +155,11 @@ class Exchange:
         return Reply(before, self._now(), span, servos)
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
-        """Of answers that came sooner than the wire can carry them: is it an earlier request that they answer?
+        """Handle replies that arrive sooner than the wire allows: they may answer an earlier request.
 
         A reply that comes twice lies there when the next request is sent, and from then on every answer is one cycle
-        old. Where the true answer follows it is taken. Where none does the far end is no wire (a pty), and after a few
-        such times nothing is doubted any more.
+        old. Where the true answer follows it is taken. If none follows, the far end is not a real wire (a pty), and
+        after a few such cases the check is dropped.
         """
         received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
         if not received:

@@ -21,7 +21,8 @@ class Joint:
     direction: +1 or -1, the joint's sense of rotation against the servo's.
     zero_ticks: Present Position at which the joint's angle is zero.
     mode: what a goal is, a current [A] or a voltage [V]. Raises ValueError for a current that the servo does not have.
-    near: about where the joint is when the bus is opened [rad], which tells its turn; None: as Present Position says.
+    near: about where the joint is when the bus is opened [rad], which determines its turn; None: as Present Position
+    indicates.
     seconds: further servos of the same model on this joint. A goal is shared out between all of them, and the measured
     current (under PWM the voltage) is their sum; angle and velocity are the first one's.
     """

@@ -1,8 +1,8 @@
-"""The USB adapter's latency timer: how long a reply may lie in the adapter before it is passed on.
+"""The USB adapter's latency timer: how long the adapter may hold back a reply.
 
-FTDI adapters (U2D2 among them) hold what they receive until 62 bytes are there or a timer has run out, 16 ms from the
-factory, which limits a cycle to 60 Hz. On Linux the timer is a file of the tty's in sysfs, which only root may write;
-the port's "low latency" flag sets it to 1 ms too, and any user of the port may set that one.
+FTDI adapters (U2D2 among them) buffer what they receive until 62 bytes have arrived or a timer has expired, 16 ms from
+the factory, which limits a cycle to 60 Hz. On Linux the timer is a file of the tty's in sysfs, which only root may
+write; the port's "low latency" flag sets it to 1 ms too, and any user of the port may set that one.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A serial port that cannot wedge: any pyserial URL, bounded reads, one error when the cable is gone.
+"""A serial port that cannot hang: any pyserial URL, bounded reads, one error when the cable is unplugged.
 
 `open_port` opens one. `Port` works through pyserial and so on anything that pyserial can open; `DescriptorPort`
 does the reading and writing of a local device itself, at half of pyserial's cost per cycle.
@@ -39,7 +39,7 @@ class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
     After PortLost the same object may be used again, and fails again as long as the device is gone; a cable that was
-    plugged in again needs a new port. `latency` is the longest that a reply may lie in the adapter [s].
+    plugged in again needs a new port. `latency` is the longest time the adapter may hold back a reply [s].
     """
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
@@ -60,7 +60,7 @@ class Port:
         return not self.url.startswith("socket://")
 
     def wire_time(self, count: int) -> float:
-        """Seconds that `count` bytes take on the wire (8 data bits, start and stop)."""
+        """Wire time [s] of `count` bytes (8 data bits, start and stop)."""
         return count * 10 / self.baud
 
     def write(self, data: bytes) -> None:
@@ -71,7 +71,7 @@ class Port:
             raise self._lost(error) from error
 
     def read(self, count: int, timeout: float) -> bytes:
-        """Up to `count` bytes: fewer when they have not come after `timeout` [s]."""
+        """Up to `count` bytes: fewer if they have not arrived within `timeout` [s]."""
         try:
             # Setting the timeout makes pyserial look at the terminal's settings, so only when it changes.
             if self._serial.timeout != timeout:
@@ -83,8 +83,8 @@ class Port:
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
         """`write`, then `read` until `timeout` [s] after `start` [s, on the port's clock]: the control cycle's way.
 
-        What was there before is dropped: a repeated or late answer would answer this request, and each after it one
-        cycle late.
+        Pending input is dropped: otherwise a repeated or late reply would be taken for this one, and every later reply
+        would be one cycle late.
         """
         if self.has_input():
             self.discard_input()
@@ -99,7 +99,7 @@ class Port:
             raise self._lost(error) from error
 
     def discard_input(self) -> None:
-        """Throw away what has been received and not read."""
+        """Discard received bytes that have not been read."""
         try:
             self._serial.reset_input_buffer()
         except _FAILURES as error:
@@ -201,7 +201,7 @@ class DescriptorPort(Port):
         super().close()
 
     def _read_on(self, received: bytes, count: int, deadline: float) -> bytes:
-        """The rest of what comes in pieces, or of the wait: poll counts whole milliseconds, select does not."""
+        """Read the rest of a fragmented reply; select, because poll counts whole milliseconds."""
         while len(received) < count:
             remaining = max(0.0, deadline - time.perf_counter())
             if not select.select([self._descriptor], [], [], remaining)[0]:
@@ -218,7 +218,7 @@ class DescriptorPort(Port):
             )
 
     def _write_rest(self, data: bytes) -> None:
-        """Write what the device did not take at once, as it makes room."""
+        """Write what the device did not accept at once, as its buffer drains."""
         deadline = time.perf_counter() + self.wire_time(len(data)) + _WRITE_PATIENCE_S
         try:
             while data:

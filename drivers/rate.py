@@ -1,4 +1,4 @@
-"""A fixed rate from absolute deadlines: what runs late once does not shift what comes after it."""
+"""A fixed rate from absolute deadlines: one late cycle does not delay later ones."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from hil.drivers.clock import Clock
 class Tick(NamedTuple):
     """One deadline [s, on the clock], the time at which its wait ended, and whether it was missed.
 
-    Missed means a whole interval or more late: nothing should be done for it any more.
+    Missed means a whole interval or more late: it should be skipped.
     """
 
     deadline: float

@@ -8,10 +8,10 @@ some ms."""
 
 
 class SdkPort:
-    """`dynamixel-sdk` on our open port. What an adapter that hears itself gives back of an instruction is left out.
+    """`dynamixel-sdk` on our open port. The echo of an adapter that receives its own transmissions is removed.
 
-    Against its own: reads wait instead of polling, time is the port's clock, and a failure cannot leave the port marked
-    as in use, after which torque could never be switched off. Method names are the SDK's.
+    Unlike the SDK's own port, reads wait instead of polling, time is the port's clock, and a failure cannot leave the
+    port marked as in use, after which torque could never be switched off. Method names are the SDK's.
     """
 
     def __init__(self, port: Port) -> None:

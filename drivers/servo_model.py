@@ -54,8 +54,8 @@ class Stall(NamedTuple):
 class Published(NamedTuple):
     """A torque constant as published: the middle of the figures, and the lowest and the highest of them.
 
-    Uncertain whatever the spread: stall torque is the peak that a servo reaches, friction included, and a servo of the
-    same model can differ from it by tens of percent. Where it matters, measure it with a known weight.
+    Uncertain regardless of the spread: stall torque is the peak that a servo reaches, friction included, and a servo of
+    the same model can differ from it by tens of percent. Where it matters, measure it with a known weight.
     """
 
     value: float

@@ -1,4 +1,4 @@
-"""What is known of a servo's friction and rotor before it was looked at: medians as shares of stall torque, and spread.
+"""Prior knowledge of a servo's friction and rotor: medians as fractions of stall torque, and spread.
 
 From identified X-series servos: Rhoban's bam (dry friction of 1.2 to 2.5 % of stall torque, small servos up to 7 %),
 published models of XM430 arms (armature 0.005 to 0.012 kg m^2, viscous 0.02 to 0.06 N m s/rad at 4.1 N m). Plastic

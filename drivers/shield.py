@@ -1,4 +1,4 @@
-"""Work that no signal may cut short: signals that come while it lasts are delivered when it is over.
+"""Critical sections: signals that arrive inside are delivered afterwards.
 
 A Ctrl-C raises KeyboardInterrupt wherever the program happens to be, also between the two servos whose torque is being
 cut. A program that uses the driver as a library has no handlers that would only take note of it, so the driver itself

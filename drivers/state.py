@@ -27,7 +27,7 @@ class Slow(NamedTuple):
 
 
 class Status(NamedTuple):
-    """What a servo tells of itself a few times in 0.1 s, beside its state.
+    """Status that a servo reports a few times per 0.1 s besides its state.
 
     watchdog: Bus Watchdog [20 ms], 255 when it acted. goal: the register of the goal [A, or V under PWM]. tick: the
     servo's own clock [s], which wraps at 32.768 s. torque: Torque Enable; hardware_error: Hardware Error Status; both
@@ -99,7 +99,7 @@ _DRIVEN = ("Torque Enable", "Hardware Error Status")
 
 
 def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, whole: bool) -> Spans:
-    """What says whether a servo is still driven and watched, and its state.
+    """The registers that show whether torque and watchdog are still on, plus the state.
 
     mode: how all servos are driven, or how each is. whole: from Torque Enable on; else without what stands in front of
     Bus Watchdog, which takes half of the bytes.
@@ -126,7 +126,7 @@ class Converter:
         ]
 
     def ticks(self, goals: Sequence[float]) -> list[int]:
-        """The nearest goals in ticks. Raises ValueError for a goal that is no number."""
+        """The nearest goals in ticks. Raises ValueError for a goal that is not a number."""
         try:
             return [round(goal / unit) for goal, unit in zip(goals, self._drive_units, strict=True)]
         except (ValueError, OverflowError):
@@ -227,7 +227,7 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
 
 def _told(statuses: Sequence[Status | None]) -> Status | None:
-    """What the servos of one joint tell as one: the goal is the sum, what is wrong with one is wrong with it."""
+    """The combined status of one joint's servos: the goal is the sum, what is wrong with one is wrong with it."""
     told = [status for status in statuses if status is not None]
     if len(told) < len(statuses):
         return None

@@ -91,7 +91,7 @@ class GroupRead(Protocol):
         ...
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
-        """What is to be found among stuffed, damaged, foreign or missing answers; whether nothing more is to come."""
+        """The answers found among stuffed, damaged, foreign or missing answers; whether nothing more is to come."""
         ...
 
 

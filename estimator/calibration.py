@@ -7,7 +7,7 @@ to the last link at a known distance changes the arm by amounts that are known i
     (one joint: gravity_1 + M d g, inertia_1 + M d^2 + J)
 
 Both periods are fitted at once, with the second's parameters the first's plus these, and each joint's torque as
-commanded times an unknown factor: true over supposed torque constant.
+commanded times an unknown factor: the ratio of true to assumed torque constant.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ ADDED = {
 
 @dataclass(frozen=True)
 class KnownMass:
-    """What was bolted to the last link, on the line from its joint through its centre of mass."""
+    """A mass bolted to the last link, on the line from its joint through its centre of mass."""
 
     mass: float
     """[kg]"""
@@ -49,7 +49,7 @@ class KnownMass:
     """Of link 1, joint to joint [m]; of an arm of two joints."""
 
     def change(self, gravity: float, joints: int) -> dict[str, float]:
-        """What it adds to the base parameters [SI]; raises ModelError for values that no mass has."""
+        """The change of the base parameters [SI]; raises ModelError for values that no mass can have."""
         if not (self.mass > 0.0 and self.distance > 0.0 and self.inertia >= 0.0):
             raise ModelError(
                 f"a mass of {self.mass:g} kg at {self.distance:g} m with inertia {self.inertia:g} kg m^2: mass and "
@@ -94,7 +94,7 @@ def calibrate(
     """Torque constants of all joints from two settled periods.
 
     Args:
-        without: the arm as it is.
+        without: the arm without the mass.
         with_mass: the arm with the mass.
         first: the estimate of `without` under the assumed torque constants; its model is used for both.
         known: the mass.
@@ -140,7 +140,7 @@ def calibrate(
 
 
 class _TwoRuns:
-    """Residuals of both periods: log factors, the parameters' coordinates, the two starting states."""
+    """Residuals of both periods: log factors, the parameters' coordinates, the two initial states."""
 
     def __init__(
         self,
@@ -162,7 +162,7 @@ class _TwoRuns:
         self._state_scale = np.repeat([options.angle_scale, velocity], periods[0].joints)
 
     def start(self) -> Array:
-        """From the first run's estimate; the second begins where it was measured to."""
+        """From the first run's estimate; the second period starts from its measured state."""
         joints, rate = self.periods[0].joints, self.periods[1].rate
         filled = self.periods[1].filled()
         value = self._first.value.copy()
@@ -193,7 +193,7 @@ class _TwoRuns:
         return Quadratic(float(np.sum(here * here)), *normal_equations(jacobian, here))
 
     def residual(self, x: Array) -> Array:
-        """Simulated less measured positions of both periods in units of their noise."""
+        """Simulated minus measured positions of both periods in units of their noise."""
         joints = self.periods[0].joints
         factor = np.exp(x[:joints])
         value = self.coordinates.values(x[joints : joints + self.size])

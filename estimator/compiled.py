@@ -1,7 +1,7 @@
 """Compiled loops whose cache notices a change in any source that is compiled into them.
 
 numba keeps compiled code beside the source and looks at the date of that one file. What a loop inlines from other
-modules, and the constants it takes from them, may then be older than the sources: fits would go on with yesterday's
+modules, and the constants it takes from them, may then be older than the sources: fits would continue with outdated
 equations.
 """
 
@@ -17,7 +17,7 @@ FOLDERS = ("models", "simulation", "chain")
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Any:
-    """`function` compiled without the interpreter's lock, kept on file until a source in FOLDERS changes."""
+    """`function` compiled without the interpreter's lock, cached on disk until a source in FOLDERS changes."""
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     # numba has no public name for this; without it the cache would look at one file's date only, as numba's does.
     on_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)

@@ -1,12 +1,12 @@
 """What can go wrong in the estimator, as a tree.
 
 EstimationError
-├── ExcitationError       the multisine asked for cannot be built
-├── RecordingError        the samples are no settled period of an experiment
+├── ExcitationError       the requested multisine cannot be built
+├── RecordingError        the samples are not a settled period of an experiment
 │   ├── ShapeError        arrays whose sizes do not fit together
 │   └── StandstillError   a joint never moved
 ├── ModelError            no such friction or drive model, or no such number of joints
-├── UnidentifiableError   the data cannot tell some parameters apart
+├── UnidentifiableError   the data do not separate some parameters
 ├── ConvergenceError      the likelihood found no minimum
 └── PeriodicityError      the simulated arm does not settle into periodic motion
 """
@@ -37,11 +37,11 @@ class ModelError(EstimationError):
 
 
 class UnidentifiableError(EstimationError):
-    """The regression is singular: the motion does not tell some parameters apart."""
+    """The regression is singular: the motion does not separate some parameters."""
 
 
 class ConvergenceError(EstimationError):
-    """The likelihood's iterations ended without a minimum: model or starting values are far from the data."""
+    """The likelihood's iterations ended without a minimum: the model or the initial guess is far from the data."""
 
 
 class PeriodicityError(EstimationError):

@@ -1,4 +1,4 @@
-"""The estimator's front door: a settled period in, parameters with standard errors and predictions out."""
+"""Entry point of the estimator: settled periods in, parameters with standard errors and predictions out."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,10 +27,10 @@ class Estimate:
     """What settled periods say of the arm.
 
     `std` and `covariance` hold what position errors leave open, scaled by the residual as it is and widened
-    where it is correlated (`hil.estimator.fit.covariance`), so that rounding is in them as it came out (a residual of
-    0.2887 encoder steps RMS is rounding alone). They hold nothing of what repeats in every sample: an error of
+    where it is correlated (`hil.estimator.fit.covariance`), so that they include the actual rounding errors (a residual
+    of 0.2887 encoder steps RMS is rounding alone). They do not include systematic errors: an error of
     the torque constant, by which all parameters of a joint scale, of the encoder's zero or linearity, or of the
-    model. A residual well above 0.29 steps says that the model lacks something and that the parameters may be
+    model. A residual well above 0.29 steps means that the model is incomplete and that the parameters may be
     off by more than `std`.
     """
 
@@ -93,8 +93,8 @@ def identify(
 
     Args:
         periods: one settled period, or several of one arm, which are fitted together.
-        model: what the motion is explained with.
-        coarse: for trying models: one that leaves much more than the noise is not fitted to its last digits.
+        model: the model to fit.
+        coarse: for trying models: one whose residual is well above the noise is not fitted to full convergence.
         starts: parameters by name [SI], of another experiment or of arms like this one; further initial guesses,
             nothing more.
         near: where a minimum is known to be close: the only initial guess, for a fraction of the time.
@@ -140,7 +140,7 @@ def predict(
     pose: Array | None = None,
     settling: SettlingOptions = SETTLING,
 ) -> Array:
-    """Predict the settled period that another multisine brings about; no measurement of it is used.
+    """Predict the settled period under another multisine, without using measurements of it.
 
     The arm starts at rest and is simulated until its motion repeats.
 

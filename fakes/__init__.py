@@ -1,8 +1,8 @@
-"""Servos that exist only as bytes: control tables, a half-duplex bus, and a simulated arm behind it."""
+"""Simulated servos at byte level: control tables, a half-duplex bus, and a simulated arm behind it."""
 
 
 def register() -> None:
-    """Teach pyserial the URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Harmless when repeated."""
+    """Register with pyserial the URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Harmless when repeated."""
     import serial
 
     if __name__ not in serial.protocol_handler_packages:
@@ -10,7 +10,7 @@ def register() -> None:
 
 
 def register_for(url: str) -> None:
-    """`register` if `url` is one of a fake; on the way to a real arm nothing of pyserial is touched."""
+    """`register` if `url` is one of a fake; for a real arm pyserial is left untouched."""
     if url.startswith("fake://"):
         register()
 

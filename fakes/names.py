@@ -1,4 +1,4 @@
-"""Fake arms by name: those that come with hil for other people's programs, and the arms of its own configurations."""
+"""Fake arms by name: those shipped with hil for use by other programs, and the arms of its own configurations."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def arm_names() -> tuple[str, ...]:
 
 
 def find_arm(path: Path | str) -> Path:
-    """The file that a person means: `path` itself, or where it is a bare name and no file, the arm of that name."""
+    """`path` itself or, if it is a bare name and not a file, the file of the arm of that name."""
     path = Path(path)
     if path.name != str(path) or path.suffix or path.exists():
         return path

@@ -54,7 +54,7 @@ class Clock:
 
 
 class Counts(NamedTuple):
-    """What a server has done so far."""
+    """Statistics of a server."""
 
     packets: int
     damaged: int

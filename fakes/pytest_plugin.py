@@ -1,4 +1,4 @@
-"""Fake Dynamixel arms for anybody's tests. pytest finds this plugin by itself where hil is installed.
+"""Fake Dynamixel arms for any test suite. pytest finds this plugin by itself where hil is installed.
 
     def test_my_driver(fake_arm):
         port = fake_arm()                          # a pyserial port onto two XM430-W350, IDs 1 and 2, in virtual time

@@ -18,7 +18,7 @@ _PATIENCE_S = 5.0
 
 
 class NoHand(OSError):
-    """Nobody serves a fake arm at this terminal. The message says which and what to do."""
+    """No fake arm is served at this terminal. The message says which and what to do."""
 
 
 def socket_path(terminal: str) -> Path:
@@ -41,7 +41,7 @@ class HandSocket:
         return self._socket.fileno()
 
     def answer(self, bus: FakeBus) -> None:
-        """Do what was asked, and say how it went."""
+        """Carry out the request and report the outcome."""
         with suppress(BlockingIOError):
             request, asker = self._socket.recvfrom(_MOST_BYTES)
             said = _do(request.decode("utf-8", "replace"), bus)
@@ -55,9 +55,9 @@ class HandSocket:
 
 
 def ask_hand(device: Path | str, request: str) -> None:
-    """Have the hand at a terminal, or a link to it, do something.
+    """Send a request to the hand at a terminal, or a link to it.
 
-    Raises NoHand where nobody serves it, ValueError with what is wrong with the request.
+    Raises NoHand if no arm is served there, ValueError for an invalid request.
     """
     served = socket_path(str(Path(device).resolve()))
     with (

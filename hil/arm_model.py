@@ -17,7 +17,7 @@ _CHUNK = 16384  # samples worked on together: their temporaries stay in the proc
 
 @dataclass(frozen=True)
 class JointFacts:
-    """What a model knows of a joint beside its dynamics.
+    """What a model knows about a joint besides its dynamics.
 
     mode: "current", whose goals are A, or "pwm", whose goals are V. torque_per_goal: N m/A or N m/V at the output
     shaft. goal_limit: A or V. position_limit: rad. velocity_limit: rad/s.
@@ -65,7 +65,7 @@ class ArmModel:
         return torque.reshape(q.shape)
 
     def rigid_body_torque(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """As `inverse_dynamics`, without friction and offset: what a simulator's links alone would need."""
+        """As `inverse_dynamics`, without friction and offset: the torque that a simulator's links alone need."""
         q, dq, ddq = self._motion(q=q, dq=dq, ddq=ddq)
         return np.asarray(np.moveaxis(self._rigid_body(*(_joints_first(x) for x in (q, dq, ddq))), 0, -1))
 
@@ -75,8 +75,8 @@ class ArmModel:
         return np.asarray(np.moveaxis(self._gravity(_joints_first(q)), 0, -1))
 
     def friction_torque(self, dq: ArrayLike) -> Array:
-        """Friction (..., joints) [N m] at velocities dq (..., joints) [rad/s], without offset and without what grows
-        with load.
+        """Friction (..., joints) [N m] at velocities dq (..., joints) [rad/s], without offset and load-dependent
+        friction.
         """
         (dq,) = self._motion(dq=dq)
         velocity = _joints_first(dq)
@@ -101,7 +101,8 @@ class ArmModel:
     def forward_dynamics(self, q: ArrayLike, dq: ArrayLike, torque: ArrayLike) -> Array:
         """Accelerations (..., joints) [rad/s^2] under motor torques (..., joints) [N m] of joints that move.
 
-        At rest friction is what holds the joint, which a formula of velocity cannot tell: it counts as none there.
+        At rest, static friction takes any value that holds the joint, which no function of velocity can give: it is
+        taken as zero.
         """
         q, dq, torque = self._motion(q=q, dq=dq, torque=torque)
         torque = torque * np.stack([self._ripple(j, q[..., j - 1]) for j in range(1, len(self.joints) + 1)], axis=-1)
@@ -115,11 +116,11 @@ class ArmModel:
         return np.asarray(torque / [self.torque_per_goal(number) for number in range(1, len(self.joints) + 1)])
 
     def torque_scale(self, joint: int) -> float:
-        """Of `joint`, from 1: true over supposed torque, as far as the first joint's is right."""
+        """Of `joint`, from 1: ratio of true to assumed torque, given that the first joint's is correct."""
         return self.values.get(f"torque_scale_{joint}", 1.0)
 
     def torque_per_goal(self, joint: int) -> float:
-        """Of `joint`, from 1: what was supposed, times torque_scale [N m/A, or N m/V in pwm mode]."""
+        """Of `joint`, from 1: the assumed value times torque_scale [N m/A, or N m/V in pwm mode]."""
         return self.joints[joint - 1].torque_per_goal * self.torque_scale(joint)
 
     def _motion(self, **arrays: ArrayLike) -> list[Array]:

@@ -1,7 +1,7 @@
 """An identified arm in space as a model to use; see `hil.arm_model`. Needs numpy only.
 
-Newton and Euler's equations with the base parameters in the place of the links' own: what is not among them is zero,
-which moves alike. A mass of zero is therefore no statement about a link.
+Newton-Euler equations with base parameters instead of the links' own: all others are zero, which gives the
+same dynamics. A mass of zero therefore says nothing about a link.
 """
 
 from dataclasses import dataclass
@@ -16,8 +16,9 @@ _INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2)
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where the joints are: of each joint's frame, rotation (3, 3) and translation (3,) [m] in that of the link before
-    at angle zero, and its axis in its own; gravity in the base's frame (3,) [m/s^2]."""
+    """Joint geometry: rotation (3, 3) and translation (3,) [m] of each joint's frame relative to the previous link's at
+    angle
+    zero, and the joint axis in its own frame; gravity in the base's frame (3,) [m/s^2]."""
 
     rotation: Array
     translation: Array
@@ -29,7 +30,7 @@ class Geometry:
 class ChainArmModel(ArmModel):
     """The dynamics of an identified arm in space.
 
-    `values` holds its base parameters; `groups` says what each of them is made of.
+    `values` holds its base parameters; `groups` gives the linear combination that each stands for.
     """
 
     geometry: Geometry

@@ -18,7 +18,7 @@ def new_figure(width: float, height: float, dpi: int = 130) -> "Figure":
         raise MissingExtra("Drawing needs the package matplotlib: pip install 'hil[png]'.") from error
 
     class ShownFigure(Figure):
-        """Without pyplot nobody else tells IPython how to show a figure."""
+        """A figure that IPython can display without pyplot."""
 
         def _repr_png_(self) -> bytes:
             data = io.BytesIO()

@@ -24,7 +24,7 @@ from enum import Enum
 
 
 class Cause(Enum):
-    """What the guard saw. Where the arm can still be felt and driven, a stop may brake first."""
+    """What the guard saw. Where sensing and drive still work, a stop may brake first."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"
@@ -55,7 +55,7 @@ class Cause(Enum):
 class HilError(Exception):
     """Root of hil's own errors.
 
-    last_samples: what had been recorded last before it (rows of hil.runs.recording), where an experiment was running.
+    last_samples: the last rows recorded before it (see hil.runs.recording), if an experiment was running.
     """
 
     exit_code = 1
@@ -99,7 +99,7 @@ class ExportError(HilError):
 
 
 class ExperimentError(HilError):
-    """The experiment could not be finished. What was recorded is on file."""
+    """The experiment could not be finished. The recording so far is on disk."""
 
 
 class SafetyStop(ExperimentError):
@@ -111,7 +111,7 @@ class SafetyStop(ExperimentError):
 
 
 class StopRequested(ExperimentError):
-    """Somebody asked for the stop. Example: Ctrl-C."""
+    """A stop was requested. Example: Ctrl-C."""
 
 
 class NoSafeTorque(ExperimentError):
@@ -119,11 +119,11 @@ class NoSafeTorque(ExperimentError):
 
 
 class NotSettled(ExperimentError):
-    """Successive periods never became alike. Example: a joint that slips, or a cable that drags."""
+    """The motion never became periodic. Example: a joint that slips, or a cable that drags."""
 
 
 class DidNotMove(ExperimentError):
-    """A joint stood still for a whole period. Example: torque below what friction holds; a jammed gear."""
+    """A joint stood still for a whole period. Example: torque below static friction; a jammed gear."""
 
 
 class RecordingCutShort(ExperimentError):

@@ -123,7 +123,7 @@ def _file(path: Path) -> Path:
 
 
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
-    """Every term must be there and known: a model that left one out would be wrong without a word."""
+    """Every term must be present and known: a model that dropped one would be silently wrong."""
     if joints not in RIGID_BODY:
         raise ResultError(f"{path}: an arm of {joints} joints; this version of hil has models of one and two.")
     needed = set(base_names(joints))

@@ -1,4 +1,4 @@
-"""Torque that was on before anybody asked for it: told apart, refused, or taken over so that the arm sinks slowly."""
+"""Torque found already on: recognised and refused, or taken over so that the arm sinks slowly."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ _STILL_TICKS = 2  # of Present Velocity
 def is_held(servo: Servo) -> bool:
     """Whether it has torque on that holds or drives it; raises as `Servo.read`.
 
-    A tripped Bus Watchdog has set its goal to nothing: in current and PWM mode its joint is free.
+    A tripped Bus Watchdog has zeroed its goal: in current and PWM mode its joint is free.
     """
     if not servo.read("Torque Enable"):
         return False
@@ -64,5 +64,5 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
 
 
 def _what_drives(servo: Servo) -> str:
-    """The goal that limits what the motor gives in the servo's present mode."""
+    """The goal that limits the motor's output in the servo's present mode."""
     return "Goal Current" if servo.read("Operating Mode") == Mode.CURRENT else "Goal PWM"

@@ -1,4 +1,4 @@
-"""What is done before the control cycle: the adapter's delay, a quiet bus, each servo in its mode without torque."""
+"""Preparation for the control cycle: adapter delay, quiet bus, each servo in its mode without torque."""
 
 from contextlib import suppress
 
@@ -28,9 +28,9 @@ TIME_BASED_PROFILE = 0x04
 
 
 def learn_latency(servo: Servo) -> None:
-    """Wait longer for every reply from here on where this servo's come late, as over Bluetooth or a network.
+    """Wait longer for every later reply if this servo's replies are slow, as over Bluetooth or a network.
 
-    The port's `latency` is raised to what is measured where that is more than its kind of adapter should take.
+    The port's `latency` is raised to the measured value if that exceeds what this kind of adapter should need.
     """
     port, usual = servo.port, servo.port.latency
     trips = _trips(servo)
@@ -56,7 +56,7 @@ def _trips(servo: Servo) -> list[float]:
 
 
 def check_quiet(port: Port) -> None:
-    """Raise BusShared when somebody else's instructions are heard."""
+    """Raise BusShared if another master's instructions are received."""
     port.discard_input()
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
     asked = sorted({packet.id for packet in heard if not packet.is_status})
@@ -65,7 +65,7 @@ def check_quiet(port: Port) -> None:
 
 
 def shared(what: str) -> BusShared:
-    """The error of a bus on which another master does something."""
+    """The error for a bus with another active master."""
     return BusShared(
         f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
         "other's packets, and the other's goals would move the arm too: end that program, or unplug that controller."
@@ -108,7 +108,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
 
 
 def fault_text(joint: Joint, cause: str) -> str:
-    """What to say of a servo that raised its alert."""
+    """The message for a servo that raised its alert."""
     return (
         f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
         "find the cause, then power-cycle it."

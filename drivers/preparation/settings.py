@@ -1,9 +1,9 @@
 """What a servo is set to: the registers that an experiment changes, and those that the servo itself changes with them.
 
-Operating Mode and Current Limit are EEPROM: what a program leaves there is there after a power cycle, and the next
+Operating Mode and Current Limit are EEPROM: values written there survive a power cycle, and the next
 program's plain Torque Enable drives the full current of the wrong mode. A change of Operating Mode resets goals and
 gains (ROBOTIS e-Manual, Operating Mode). Goal Position is left out: a servo takes its present position for it when
-torque comes on, and an old one must never move an arm.
+torque comes on, and an old value must never move an arm.
 """
 
 from collections.abc import Mapping

@@ -1,1 +1,1 @@
-"""Methods of others on the same data."""
+"""Other published methods on the same data."""

@@ -1,9 +1,9 @@
-"""Other methods on the same settled period, each tuned and timed: what a reader should compare with.
+"""Other methods on the same settled period, each tuned and timed, for comparison.
 
 All get the same positions and the same commands. Their torque is the command as it reaches the motors, with the
-delay that this project's own first stage found; none has to guess it. Each method's settings (cut-off, width of
-the Coulomb step, process noise) are searched, and the setting kept is the one whose simulation is nearest to the
-recording; the time counted is that of the kept setting alone.
+delay found by this project's first stage, so that none has to guess it. Each method's settings (cut-off, width of
+the Coulomb step, process noise) are searched, and the one whose simulation is closest to the
+recording is kept; only its run time counts.
 """
 
 import time
@@ -36,7 +36,7 @@ Setting = tuple[float, float]
 
 @dataclass(frozen=True)
 class Peer:
-    """What one method found."""
+    """Result of one method."""
 
     name: str
     parameters: dict[str, float]
@@ -52,7 +52,7 @@ class Peer:
 
 
 def joined(period: SettledPeriod, periods: int) -> Recording:
-    """The settled period `periods` times end to end, as a recording of held commands."""
+    """The settled period repeated `periods` times, as a recording of held commands."""
     count = period.samples * periods
     return Recording(
         np.arange(count) / period.rate,
@@ -68,7 +68,7 @@ def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -
     """IDIM-LS, RLS, EKF, UKF and the paper's linearised lines on one settled period, as each is done.
 
     `length` [m] of link 1 and `gravity` [m/s^2] are for the paper's method, which needs them to tell inertias
-    apart; None leaves it out on an arm of two joints.
+    apart; with None it is skipped on an arm of two joints.
     """
     recording = joined(period, 1)
     delay = fit_lines(period).delay

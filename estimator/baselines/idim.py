@@ -1,7 +1,8 @@
-"""Filtered inverse-dynamics least squares (IDIM-LS), the field's workhorse, as a start and as a peer.
+"""Filtered inverse-dynamics least squares (IDIM-LS), the standard method of the field, used for the initial guess and
+for comparison.
 
 Position is low-pass filtered forwards and backwards, differentiated by central differences, the regressor
-evaluated, regressor and torque filtered alike and decimated, and one weighted linear least squares solved:
+evaluated, regressor and torque filtered identically and decimated, and one weighted linear least squares solved:
 Gautier and Poignet, "Extended Kalman filtering and weighted least squares dynamic identification of robot",
 Control Engineering Practice 9 (2001) 1361; Swevers, Verdonck, De Schutter, "Dynamic model identification
 for industrial robots", IEEE Control Systems 27 (2007) 58.
@@ -37,7 +38,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class InverseDynamics:
-    """What the regression found."""
+    """Result of the regression."""
 
     names: tuple[str, ...]
     """Base parameters."""
@@ -96,7 +97,7 @@ def fit_inverse_dynamics(
     delay: float = 0.0,
     position_cutoff: float | None = None,
 ) -> InverseDynamics:
-    """IDIM-LS over all `recordings`, each joint weighted by what a first solution left of its torque.
+    """IDIM-LS over all `recordings`, each joint weighted by its torque residual in a first solution.
 
     `cutoff` [Hz] of regressors and torques, `position_cutoff` [Hz] of the positions that the regressors are made of
     (the same if none is given), `coulomb_width` [rad/s] of the Coulomb step, `delay` [s] of the torque. Raises

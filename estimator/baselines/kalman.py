@@ -1,11 +1,11 @@
-"""Extended and unscented Kalman filters whose state holds the parameters: peers that see positions only.
+"""Extended and unscented Kalman filters whose state includes the parameters: baselines that use positions only.
 
 State: angles, velocities, base parameters. Between samples the arm is integrated by Runge-Kutta steps under the
-mean motor torque; parameters stand still but for a little process noise; a sample corrects all. EKF: Gautier
-and Poignet, Control Engineering Practice 9 (2001) 1361, here with a Jacobian by differences of the integrated
+mean motor torque; parameters are constant except for a little process noise; each sample corrects the whole state. EKF:
+Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with a Jacobian by differences of the integrated
 step. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric points.
 
-The filters get every advantage that keeps them what they are: the likelihood's dynamics, a start from filtered
+The filters get every fair advantage: the likelihood's dynamics, a start from filtered
 least squares with honest spread, the recording several times over with what the last pass found, and noise
 levels that a caller may search (`hil.estimator.baselines.compare` does).
 """
@@ -37,7 +37,7 @@ Filter = Literal["ekf", "ukf"]
 
 @dataclass(frozen=True)
 class Filtered:
-    """What the filter knows after its last sample."""
+    """State of the filter after its last sample."""
 
     names: tuple[str, ...]
     value: Array
@@ -57,7 +57,7 @@ def fit_by_kalman(
     """Run the filter over `recording` PASSES times.
 
     `start`: base parameters (parameters,) [SI]. `coulomb_width` [rad/s] of friction's step. `velocity_noise`
-    [rad/s per sqrt(s)]: the process noise, what the model may be wrong by. `delay` [s] of the torque. Raises
+    [rad/s per sqrt(s)]: the process noise, which accounts for model error. `delay` [s] of the torque. Raises
     ConvergenceError when the filter diverges.
     """
     joints = recording.joints
@@ -90,7 +90,7 @@ def fit_by_kalman(
 
 
 def _scales(names: tuple[str, ...], start: Array) -> Array:
-    """The largest of each kind of parameter, as a unit for all of the kind."""
+    """The largest parameter of each kind, as the scale for all of that kind."""
     groups = dict.fromkeys(("coupling", "armature"), "inertia") | dict.fromkeys(TORQUES, "torque")
     kinds = [groups.get(name.split("_")[0], name.split("_")[0]) for name in names]
     largest = {kind: max(abs(v) for v, k in zip(start, kinds, strict=True) if k == kind) for kind in kinds}
@@ -113,7 +113,7 @@ def _accelerations(p: Any, width: float, q1: float, q2: float, v1: float, v2: fl
 
 
 def _advance(x: Any, t1: float, t2: float, dt: float, substeps: int, p: Any, width: float, joints: int) -> None:
-    """Carry the angles and velocities at the head of `x` on by `dt`, classical Runge-Kutta."""
+    """Advance the angles and velocities at the head of `x` by `dt`, classical Runge-Kutta."""
     q1, v1 = x[0], x[joints]
     q2 = x[1] if joints == 2 else 0.0
     v2 = x[joints + 1] if joints == 2 else 0.0

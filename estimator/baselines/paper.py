@@ -4,8 +4,8 @@ Zhu, Man, Cao, Zheng, Wang, "Parameter Estimation for Robotic Manipulator System
 brackets are its equations; docs/paper.md walks through them and lists the errors in print.
 
 The arm is two point masses at the ends of two links, linearised about hanging. As printed, (16) and (17), it obeys
-q' = A q + B u: first order. Right is q'' = A q + B u, and without friction that never settles; so the corrected arm
-has viscous friction, (s^2 D + s F + K) q = u. `order` chooses between the two.
+q' = A q + B u: first order. The correct form is q'' = A q + B u, which never settles without friction; so the corrected
+arm has viscous friction, (s^2 D + s F + K) q = u. `order` chooses between the two.
 """
 
 from dataclasses import dataclass, replace
@@ -57,7 +57,7 @@ class PaperArm:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Cosines of torque: which harmonics, and what on which joint."""
+    """Cosines of torque: the harmonics, and the amplitudes per joint."""
 
     lines: npt.NDArray[np.int64]
     """Harmonics of FUNDAMENTAL (lines,)."""
@@ -74,7 +74,7 @@ def own_lines() -> Excitation:
     """Table 2 on joint 1, and on joint 2 the same amplitudes one harmonic higher.
 
     As printed, (19), both joints have the same torque on the same lines; then only sums of the two columns of the
-    transfer function are seen and A1 of (33) is singular. One harmonic apart is the least change that resolves it.
+    transfer function are seen and A1 of (33) is singular. One harmonic apart is the smallest change that resolves this.
     """
     lines, amplitude = np.array(LINES), np.array(AMPLITUDES)
     nothing = np.zeros_like(amplitude)
@@ -97,7 +97,7 @@ def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
 
 
 def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, seed: int) -> Array:
-    """One fundamental period of the settled angles (2, samples) [rad], with the paper's noise on them."""
+    """One fundamental period of the settled angles (2, samples) [rad], with the paper's noise added."""
     samples = round(rate / FUNDAMENTAL)
     turn = np.exp(1j * np.outer(excitation.frequency, np.arange(samples) / rate))
     clean = (response(arm, excitation, order) @ turn).real
@@ -125,8 +125,8 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
     Joint i's coefficients obey (s^2 + a1 s + a0) q_i = (b11 s + b10) u1 + (b21 s + b20) u2 for the first-order
     plant; (52) to (58) solve that for joint 1 and (63) to (69) for joint 2, line by line, real and imaginary part,
     with the noisy q_i on both sides. m1 is then read from joint 1's six coefficients and m2 from joint 2's, as the
-    masses whose coefficients are nearest, each in relation to its own size. `known`: lengths and inertias; its masses
-    are the scale only. Noise in the regressors drives the coefficients towards zero, however much data there is.
+    masses whose coefficients are closest in relative terms. `known`: lengths and inertias; its masses
+    only set the scale. Noise in the regressors drives the coefficients towards zero, however much data there is.
     Raises ModelError when both joints share their lines: the columns of (33) coincide.
     """
     s = 1j * excitation.frequency
@@ -160,7 +160,8 @@ def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm
     """m1 and m2 (and friction, for the second order) that make the measured coefficients most likely.
 
     The noise of a Fourier coefficient is normal and alike on all lines, whatever it was in time, so the likelihood is
-    the sum of squares of measured less predicted coefficients. `known`: lengths, inertias, and where to start.
+    the sum of squared differences between measured and predicted coefficients. `known`: lengths, inertias and initial
+    guess.
     """
 
     def arm(x: Array) -> PaperArm:

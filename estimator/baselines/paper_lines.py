@@ -1,8 +1,8 @@
 """The seed paper's idea on a servo arm's settled period: linear response, line by line, about hanging.
 
 Its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
-linearised at (-pi/2, 0). It applies to small swings without dry friction; on anything else it shows what the
-linearisation costs. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
+linearised at (-pi/2, 0). It applies to small swings without dry friction; elsewhere it shows the error
+of linearisation. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from hil.estimator.errors import ModelError
 
 @dataclass(frozen=True)
 class LinearisedEstimate:
-    """What the linear response says."""
+    """Estimate from the linear response."""
 
     parameters: dict[str, float]
     """Base parameters by name [SI]; friction is viscous alone."""

@@ -1,8 +1,8 @@
-"""Recursive least squares on causally filtered signals, the on-line peer.
+"""Recursive least squares on causally filtered signals, the on-line baseline.
 
 Position passes a causal low-pass filter and is differenced, the regressor evaluated and filtered again; the torque
-passes the same filter twice, so that both lag alike. Every sample then corrects the parameters once: Ljung, System
-Identification (1999), section 11.2, with a forgetting factor of 1, the best for an arm that does not change.
+passes the same filter twice, so that both have the same lag. Every sample then corrects the parameters once: Ljung,
+System Identification (1999), section 11.2, with a forgetting factor of 1, the best for an arm that does not change.
 """
 
 from collections.abc import Sequence

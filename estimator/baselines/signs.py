@@ -42,7 +42,7 @@ class Signs:
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Columns that seem reversed. residual, residual_given: RMS of the torque left over its RMS, worst joint."""
+    """Columns that seem reversed. residual, residual_given: relative RMS of the torque residual, worst joint."""
 
     signs: Signs
     residual: float
@@ -54,7 +54,7 @@ class Suspicion:
 def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
     """The reversal that explains the recordings much better than the signs given; None where there is none.
 
-    Says nothing, rather than raise, where filtered inverse dynamics cannot be solved.
+    Returns None, rather than raising, where filtered inverse dynamics cannot be solved.
     """
     joints = recordings[0].joints
     given = _fit(recordings, Signs((1,) * joints, (1,) * joints))
@@ -74,7 +74,7 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
 
 
 def _combinations(joints: int) -> Iterator[Signs]:
-    """Every reversal but none, fewest columns first. A mirrored arm is the same arm: joint 1's position stays."""
+    """All reversals, fewest columns first. A mirrored arm is the same arm: joint 1's position stays."""
     every = (
         Signs(torque, (1, *position))
         for torque in product((1, -1), repeat=joints)
@@ -93,7 +93,7 @@ def _fit(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | Non
 
 
 def _impossible(fitted: InverseDynamics) -> tuple[str, ...]:
-    """Inertias and friction that are negative by more than chance."""
+    """Inertias and friction that are significantly negative."""
     bad = fitted.value < -_STANDARD_ERRORS * fitted.std
     return tuple(
         name for name, negative in zip(fitted.names, bad, strict=True) if negative and name.startswith(_POSITIVE)

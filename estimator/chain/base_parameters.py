@@ -1,9 +1,9 @@
-"""What torque and motion of a chain can tell apart: base parameters, and what each of them is made of.
+"""Base parameters of a chain: the combinations that torque and motion determine.
 
 Columns of the regressor of random motions are taken one after the other, from the base outwards and within a link
-first moments, inertias, rotor and mass. A column that those before it can make up says nothing new: its parameter is
-added to theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay short, `moment_x_3 +
-0.124 mass_4`, since a link's mass is felt as a moment of the link before.
+first moments, inertias, rotor and mass. A column that depends linearly on those before it adds no information: its
+parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay short,
+`moment_x_3 + 0.124 mass_4`, since a link's mass is felt as a moment of the link before.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ NOTHING = 1e-9
 class BaseParameters:
     """The base parameters of a chain.
 
-    Each bears the name of the one parameter that it is when all that is grouped with it is zero.
+    Each is named after the parameter to which it reduces when the others in its group are zero.
     """
 
     chain: Chain
@@ -36,7 +36,7 @@ class BaseParameters:
 
     @classmethod
     def of(cls, chain: Chain, seed: int = 1) -> "BaseParameters":
-        """Those of this chain."""
+        """The base parameters of this chain."""
         Y = _random_regressor(chain, seed)
         norm = np.linalg.norm(Y, axis=0)
         kept: list[int] = []
@@ -76,7 +76,7 @@ class BaseParameters:
 
     @cached_property
     def groups(self) -> tuple[str, ...]:
-        """What each is made of, as `moment_x_3 + 0.124 mass_4`."""
+        """The combination that each stands for, such as `moment_x_3 + 0.124 mass_4`."""
         every = parameter_names(self.chain.joints)
         return tuple(_sum(name, every, row) for name, row in zip(self.names, self.grouping, strict=True))
 
@@ -86,7 +86,7 @@ class BaseParameters:
         return base
 
     def as_all(self, base: Array) -> Array:
-        """All parameters (11 joints,) that move like these base parameters: the others are zero."""
+        """A full parameter vector (11 joints,) with the same dynamics as these base parameters: the others are zero."""
         every = np.zeros(TERMS * self.chain.joints)
         every[self.columns] = base
         return every

@@ -1,6 +1,6 @@
 """Unconstrained coordinates of a chain's parameters: positive ones are exponentials, base parameters and offsets plain.
 
-A base parameter is a sum that may have either sign; that the mass matrix stays positive is for the fit to look after.
+A base parameter is a sum that may have either sign; the fit must keep the mass matrix positive definite.
 """
 
 from collections.abc import Mapping

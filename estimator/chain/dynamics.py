@@ -70,7 +70,7 @@ def regressor(
 
 
 def places(joints: int, chosen: Columns) -> Columns:
-    """Where each link's parameters stand among the chosen ones (joints, 11); the others behind all of these."""
+    """Index of each link's parameters among the chosen ones (joints, 11); the others point past the end."""
     column = np.full(TERMS * joints, chosen.size)
     column[chosen] = np.arange(chosen.size)
     return column.reshape(joints, TERMS)

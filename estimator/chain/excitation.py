@@ -2,7 +2,7 @@
 Brussel, IEEE Transactions on Robotics and Automation 13 (1997) 730).
 
 Played as the torque that a rough model of the arm needs for it, with a spring and a damper in software around it. Of
-paths with random phases the one is taken that leaves the base parameters most certain, all together.
+several paths with random phases, the one that determines the base parameters best overall is chosen.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The geometry of a serial arm: where its joints are. Everything else about it is to be identified."""
+"""The geometry of a serial arm: the placement of its joints. Everything else is to be identified."""
 
 from dataclasses import dataclass
 
@@ -24,8 +24,8 @@ class Chain:
     Link i's frame is that of joint i, which turns with it. At angle zero it stands at `translation[i]`, turned by
     `rotation[i]`, in the frame of the link before, the first in the base's.
 
-    Raises ShapeError for arrays that do not fit together, ModelError for too many joints and for rotations and axes
-    that are none.
+    Raises ShapeError for arrays that do not fit together, ModelError for too many joints and for invalid rotations
+    and axes.
     """
 
     rotation: Array

@@ -1,4 +1,4 @@
-"""The chain estimator's front door: settled periods in, parameters with standard errors out."""
+"""Entry point of the chain estimator: settled periods in, parameters with standard errors out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ BELIEVED = 0.5  # of the prior's standard deviation: what data leave wider than 
 
 @dataclass(frozen=True)
 class ChainEstimate:
-    """What settled periods say of a spatial arm; members as of `hil.estimator.identify.Estimate`."""
+    """Estimate of a spatial arm from settled periods; members as in `hil.estimator.identify.Estimate`."""
 
     model: ChainModel
     names: tuple[str, ...]
@@ -69,7 +69,7 @@ class ChainEstimate:
 def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
-    `prior` decides what the data leave open, and `ChainEstimate.from_prior` names it. Raises ModelError when `model`
+    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. Raises ModelError when `model`
     has another number of joints than a period, ConvergenceError.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)

@@ -10,8 +10,8 @@ linear), forces (moment, force). The derivatives follow Singh, Russo and Wensing
 so that twelve numbers of each body stand for its 36. The regressor is that of Atkeson, An and Hollerbach, International
 Journal of Robotics Research 5 (1986) 101, in link frames.
 
-Every formula is linear in the links' inertial parameters, so that base parameters, with all others zero, serve as well
-as those of real links.
+Every formula is linear in the links' inertial parameters, so base parameters, with all others zero, work as well as
+those of real links.
 """
 
 import math
@@ -28,7 +28,7 @@ MASS, MOMENT, INERTIA, MOMENTUM, FLOW, FORCE, BODY = 0, 1, 4, 10, 13, 22, 28
 
 
 def room(joints: int) -> Any:
-    """Arrays that the functions below work in: frames, motions, bodies and what follows from them.
+    """Work arrays of the functions below: frames, motions, bodies and what follows from them.
 
     frame    of each link, rotation by rows and origin (joints, 12)
     motion   joint axis; velocity; acceleration, gravity as one upwards; axis' derivative by time; axis carried by the
@@ -257,8 +257,8 @@ def _flow(b: Any, trace: float, w: Any, out: Any) -> None:
 def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
     """Regressor Y (joints, columns) of the accelerations a that `accelerate` was last given.
 
-    column (joints, 11): of each link's parameters and of the armature, where it stands in Y; a column that nobody
-    wants is one that nobody reads. Entries that are always zero are left alone."""
+    column (joints, 11): of each link's parameters and of the armature, where it stands in Y; unwanted columns
+    are written but never read. Entries that are always zero are left alone."""
     frame, motion = room[0], room[1]
     n = a.size
     for i in range(n):

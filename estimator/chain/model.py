@@ -1,4 +1,4 @@
-"""Which friction and drive the likelihood fits to a chain, and the names of all parameters."""
+"""Friction and drive model of a chain, and the names of all parameters."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -23,7 +23,7 @@ class ChainModel:
     """The chain's equations with these terms, which are those of `hil.estimator.models.model.Model`.
 
     `zeros`: errors of the encoders' zeros, of all joints but the first, which shows under gravity only;
-    `torque_scale`: of all joints but the first, whose torque constant is believed. Raises ModelError.
+    `torque_scale`: of all joints but the first, whose torque constant is trusted. Raises ModelError.
     """
 
     base: BaseParameters
@@ -73,7 +73,7 @@ class ChainModel:
 
     @property
     def description(self) -> str:
-        """In words, for a person."""
+        """Human-readable description."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 

@@ -1,9 +1,10 @@
-"""What stage 2 minimises for a chain: squares of measured minus foreseen positions, and of base parameters minus prior.
+"""Objective of stage 2 for a chain: squared one-step-ahead prediction errors of positions, plus squared deviations of
+base parameters from the prior.
 
-The simulation is drawn to the measured angles by an observer, so that it stays with an arm that falls without feedback:
-each position is foreseen from the past measurements and the model (the prediction error method; Ljung, System
-Identification, 2nd ed. 1999, chapter 7). Its gains are the estimator's own, whatever feedback the robot had. Stiff, it
-stays with any motion and says little; soft, it says nearly all that a free simulation would.
+An observer keeps the simulation close to the measured angles, even for an arm that is unstable without feedback:
+each position is predicted from past measurements and the model (the prediction error method; Ljung, System
+Identification, 2nd ed. 1999, chapter 7). Its gains are the estimator's own, whatever feedback the robot had. Stiff
+gains follow any motion but carry little information; soft gains carry nearly as much as an open-loop simulation.
 """
 
 from collections.abc import Iterator
@@ -58,7 +59,7 @@ class ChainProblem:
         return (x[first : first + size] * self.state_scale).reshape(2, -1)
 
     def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
-        """What the simulation takes, with this delay and lag."""
+        """The simulation's input, with this delay and lag."""
         delay, lag = parameters.get("delay", 0.0), parameters.get("lag", 0.0)
         torque, slopes = torque_and_slopes(
             period.torque, period.rate, period.command_to_sample, self.steps, delay=delay, lag=lag
@@ -101,7 +102,7 @@ class ChainProblem:
         return Quadratic(cost, normal, gradient)
 
     def minimise(self, x: Array, ftol: float, damping: float | None = None) -> Minimum:
-        """Minimise the sum of squares from `x`, until it falls by less than `ftol` of it."""
+        """Minimise the sum of squares from `x`, until its relative decrease is less than `ftol`."""
 
         def limits(point: Array) -> tuple[Array, Array]:
             least, most = np.full(point.size, -LONGEST), np.full(point.size, LONGEST)
@@ -111,7 +112,7 @@ class ChainProblem:
         return minimise(self.evaluate, x, ftol, damping, move=self.coordinates.moved, limits=limits)
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
-        """Foreseen positions of each period (joints, samples) [rad]; None where a motion runs away."""
+        """Predicted positions of each period (joints, samples) [rad]; None where a motion diverges."""
         parameters = self.parameters(x)
         found = []
         for index, period in enumerate(self.periods):
@@ -143,8 +144,8 @@ class ChainProblem:
     def _pieces(
         self, x: Array, index: int, period: SettledPeriod, parameters: dict[str, float]
     ) -> Iterator[tuple[slice, Array | None, Array]]:
-        """Piece after piece of a period: which samples, foreseen minus measured (samples, joints), 0 where missing,
-        None where the motion runs away, and derivatives by parameters and first state."""
+        """Piece after piece of a period: which samples, predicted minus measured (samples, joints), 0 where missing,
+        None where the motion diverges, and derivatives by parameters and first state."""
         run = self.run_of(period, parameters)
         names = self.coordinates.names
         simulation = Simulation(self.model.base, parameters, self.start(x, index), self.gain(period), names)

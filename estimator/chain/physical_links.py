@@ -1,8 +1,9 @@
-"""Links of real mass that move like identified base parameters, as near as possible to those of a description.
+"""Physically consistent links with the identified base parameters, as close as possible to those of a description.
 
 Each link is the exponential map of ten numbers (log-Cholesky; Rucker and Wensing, IEEE Robotics and Automation Letters
 7 (2022) 8250): its pseudo-inertia is U U' with U upper triangular of positive diagonal, so that every one of them has a
-distribution of mass. Base parameters fix sums of these only; what they leave open is drawn weakly to the description.
+distribution of mass. Base parameters fix sums of these only; what they leave open is regularised weakly towards the
+description.
 """
 
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ _UPPER = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 @dataclass(frozen=True)
 class PhysicalLinks:
-    """Links that some distribution of mass has."""
+    """Physically consistent links."""
 
     links: Array
     """In the order of LINK_TERMS (joints, 10) [SI]."""

@@ -1,4 +1,4 @@
-"""The motion that given parameters foretell, no measurement entering: the arm under its own feedback."""
+"""Open-loop prediction of a motion from given parameters, without measurements: the arm under its own feedback."""
 
 import math
 
@@ -18,10 +18,11 @@ NEVER = 1e6  # N m
 
 
 def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeriod) -> Array:
-    """Angles (joints, samples) [rad] of this settled period: started where it starts, at rest, simulated until the
-    start is forgotten, under its commands and its feedback.
+    """Angles (joints, samples) [rad] of this settled period: starting at rest at its first position and simulated until
+    the
+    transient has decayed, under its commands and its feedback.
 
-    Raises PeriodicityError where the motion runs away.
+    Raises PeriodicityError if the motion diverges.
     """
     joints, samples = period.joints, period.samples
     excitation, feedback = _commands(period)

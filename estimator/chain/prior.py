@@ -1,4 +1,4 @@
-"""What a description of the arm says of its base parameters: a weak prior, for what the data say nothing about."""
+"""A weak prior on the base parameters from a description of the arm, for what the data do not determine."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ ARMATURE = 0.02  # kg m^2: standard deviation of a rotor's inertia that nobody k
 
 @dataclass(frozen=True)
 class Prior:
-    """Base parameters that are likely before any data."""
+    """Prior distribution of the base parameters."""
 
     value: Array
     """(base parameters,) [SI]."""

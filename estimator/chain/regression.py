@@ -1,8 +1,8 @@
-"""Filtered inverse dynamics for chains: linear least squares on any recording, the classic of the field.
+"""Filtered inverse dynamics for chains: linear least squares on any recording, the classical method.
 
 Positions and torques are filtered alike, differentiated, and put into the regressor (Gautier, Janot, Vandanjon, IEEE
 Transactions on Control Systems Technology 21 (2013) 428). It needs no simulation, so it is also the way for a torque
-that was measured and not commanded; where the position is quantised it is biased, and far less exact than stage 2.
+that was measured and not commanded; where the position is quantised it is biased and much less accurate than stage 2.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ def fit_filtered(
 ) -> tuple[Array, Array]:
     """Values and standard errors, if the residual were white, of `ChainModel.linear_names` [SI].
 
-    `cutoff` [Hz] of the filter, `delay` [s] of the torque. Raises RecordingError for what cannot be filtered so.
+    `cutoff` [Hz] of the filter, `delay` [s] of the torque. Raises RecordingError if the recording cannot be filtered.
     """
     rows = [_rows(recording, model, cutoff, delay) for recording in recordings]
     Y = np.concatenate([columns for columns, _ in rows], axis=1)

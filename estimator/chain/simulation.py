@@ -1,4 +1,4 @@
-"""The motion of a chain and how it changes with every parameter: what the likelihood asks for."""
+"""Simulated motion of a chain and its sensitivities to all parameters, as the likelihood needs them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ AT_ONCE = 8
 
 @dataclass(frozen=True)
 class ChainRun:
-    """What a simulation takes from a recording: one sample after another, each with its steps."""
+    """A simulation's input from a recording: the samples in order, each with its integration steps."""
 
     torque: Array
     """Mean motor torque over each step after each sample, without the scale (samples, steps, joints) [N m]."""
@@ -36,7 +36,7 @@ PIECE = 256  # samples whose derivatives stay in the processor's cache
 
 
 class Simulation:
-    """A simulation that goes on piece by piece, with derivatives by the parameters `names` and then by the angles and
+    """A simulation that advances piece by piece, with derivatives by the parameters `names` and then by the angles and
     velocities at the first sample, unless there are no names.
 
     `parameters` by name [SI]; `start` (2, joints) [rad, rad/s] at the first sample; `gain` (2, joints): of the
@@ -86,7 +86,7 @@ class Simulation:
         return state
 
     def go_on(self, run_: ChainRun, piece: slice) -> tuple[Array | None, Array]:
-        """Angles (samples, joints) [rad] of the next `piece` of the samples, None where the motion runs away, and their
+        """Angles (samples, joints) [rad] of the next `piece` of the samples, None if the motion diverges, and their
         derivatives (samples, joints, causes)."""
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)

@@ -1,7 +1,7 @@
 """Stage 1 for chains: linear least squares on the Fourier lines of settled periods, with a weak prior.
 
-As `hil.estimator.fit.stage1`, with the chain's regressor. Where the motion says nothing of a base parameter, the prior
-decides.
+As `hil.estimator.fit.stage1`, with the chain's regressor. Where the motion does not determine a base parameter, the
+prior does.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ PASSES = 3
 
 @dataclass(frozen=True)
 class ChainLinear:
-    """What the regression found."""
+    """Result of the regression."""
 
     value: Array
     """In the order of `ChainModel.linear_names` [SI]."""
@@ -36,7 +36,7 @@ class ChainLinear:
 
 
 def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainLinear:
-    """Estimate what torque is linear in from settled periods."""
+    """Estimate the parameters in which torque is linear from settled periods."""
     lines = [lines_of(period.filled()) for period in periods]
     highest = list(map(cut_off, lines))
     motions = tuple(

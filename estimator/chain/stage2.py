@@ -1,8 +1,8 @@
-"""Stage 2 for chains: maximum likelihood of every position as foreseen from the past, from stage 1.
+"""Stage 2 for chains: maximum likelihood of one-step-ahead position predictions, starting from stage 1.
 
-The observer starts stiff, where stage 1's parameters are good enough to stay with the motion, and is softened while the
-fit follows. Most iterations use coarse integration steps; the last ones use fine steps. How large the errors are is
-itself estimated, joint by joint, before the last digits, and samples far outside are downweighted there (Huber).
+The observer starts stiff, so that stage 1's parameters can follow the motion, and is softened as the fit
+improves. Most iterations use coarse integration steps; the last ones use fine steps. The noise level of each
+joint is itself estimated before the final iterations, in which outliers are downweighted (Huber).
 """
 
 from collections.abc import Sequence
@@ -155,7 +155,7 @@ def _problem(
 def _towards_prior(problem: ChainProblem, x: Array, options: ChainOptions) -> Array:
     """Stage 1's point, moved towards the prior until the arm there can be simulated.
 
-    Where the data say little of some inertias, those found may be of no arm: its mass matrix is not positive.
+    Where the data hardly determine some inertias, the estimates may be unphysical, with an indefinite mass matrix.
     """
     count = problem.model.base.count
     likely = problem.prior.value / problem.coordinates.scales[:count]
@@ -174,7 +174,7 @@ def _steps(periods: Sequence[SettledPeriod], longest: float) -> int:
 def _weights(
     periods: Sequence[SettledPeriod], positions: Sequence[Array], outlier: float
 ) -> tuple[tuple[Array, ...], int]:
-    """Weights by how large each joint's errors turned out, and the number of samples far outside them."""
+    """Weights by how large each joint's errors turned out, and the number of outliers."""
     weights = []
     outliers = 0
     for period, position in zip(periods, positions, strict=True):

@@ -31,8 +31,8 @@ def noise_power(lines: Lines) -> Array:
     """Mean |c|^2 of the noise in one line (joints,), from the upper half of the lines, where nothing was
     excited.
 
-    The median of an exponentially distributed power is log 2 of its mean, and shrugs off single lines. Odd and even
-    lines are looked at apart: rounding of a motion whose second half mirrors its first has no even lines at all.
+    The median of an exponentially distributed power is log 2 of its mean, and is robust to single lines. Odd and even
+    lines are evaluated separately: rounding of a motion whose second half mirrors its first has no even lines at all.
     """
     upper = np.abs(lines[:, lines.shape[1] // 2 :]) ** 2
     medians = [np.median(upper[:, first::2], axis=1) for first in (0, 1)]
@@ -41,10 +41,10 @@ def noise_power(lines: Lines) -> Array:
 
 
 def white_noise(position: Array) -> Array:
-    """Standard deviation of what is white in one period of angles (joints, samples), in their unit (joints,).
+    """Standard deviation of the white noise in one period of angles (joints, samples), in their unit (joints,).
 
-    From the upper quarter of the lines, far above any motion. A ramp between the ends is taken off first: where the
-    period does not close, because the arm drifts, its jump is in every line.
+    From the upper quarter of the lines, far above any motion. A linear trend is removed first: if the period does
+    not close because the arm drifts, the jump spreads over all lines.
     """
     samples = position.shape[1]
     ramp = (position[:, -1:] - position[:, :1]) * (np.arange(samples) / max(1, samples - 1))
@@ -64,7 +64,7 @@ def cut_off(lines: Lines) -> int:
 
 
 def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) -> PeriodicMotion:
-    """The motion that the lines up to `harmonics` make, differentiated exactly by j k w0."""
+    """The motion reconstructed from the lines up to `harmonics`, differentiated exactly by j k w0."""
     kept = np.zeros_like(lines)
     kept[:, : harmonics + 1] = lines[:, : harmonics + 1]
     turn = 1j * fundamental * np.arange(lines.shape[1])
@@ -73,8 +73,8 @@ def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) ->
 
 
 def held_lines(command: Array, rate: float, delay: float) -> Lines:
-    """Lines of a command (joints, samples) that is held from each sample to the next and comes `delay` [s]
-    late.
+    """Lines of a command (joints, samples) with zero-order hold between samples and a delay of `delay`
+    [s].
 
     Holding scales line k by sinc(f_k / rate) and delays it by half a sample. `delay` may be negative.
     """

@@ -1,4 +1,4 @@
-"""Whether an arm has settled: how far successive periods of a periodic experiment still differ."""
+"""Whether an arm has settled: the difference between successive periods of a periodic experiment."""
 
 from dataclasses import dataclass
 
@@ -21,8 +21,8 @@ class Settling:
 def period_difference(position: Array) -> Settling:
     """Compare each period of `position` (periods, joints, samples) [rad] with the one before.
 
-    Missing samples are NaN and left out of both; a joint with nothing left to compare counts as infinitely far. Raises
-    ShapeError for fewer than two periods.
+    Missing samples are NaN and left out of both; for a joint with no samples to compare the difference is infinite.
+    Raises ShapeError for fewer than two periods.
     """
     if position.ndim != 3 or position.shape[0] < 2:
         raise ShapeError(f"position is {position.shape}: must be (periods, joints, samples) with at least two periods")
@@ -39,8 +39,8 @@ def period_difference(position: Array) -> Settling:
 def settling_difference(former: Array, latest: Array) -> float:
     """How far a period, (joints, samples) [rad], is from the one before: RMS over the motion's RMS, the worst joint.
 
-    Only the later halves are compared. Where they agree the former period ended settled, so all of the latest one is,
-    even though the former began with the transient of the ramp: a whole period of arm time is saved.
+    Only the later halves are compared. If they agree, the previous period ended settled, so the whole latest one is
+    settled even though the previous one began with the ramp's transient: this saves a whole period of arm time.
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())

@@ -1,4 +1,4 @@
-"""A recording of any motion: torque and position at the times they were really taken."""
+"""A recording of any motion: torque and position at the actual sampling times."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -21,11 +21,11 @@ MOST_TORQUE = 1e4  # N m
 
 @dataclass(frozen=True)
 class Recording:
-    """Torque and position of an arm in any motion: ramps, swing-ups, what another tool recorded.
+    """Torque and position of an arm in any motion: ramps, swing-ups, recordings of other tools.
 
     Positions that are missing are NaN. Raises ShapeError for arrays that do not fit together, RecordingError
-    for times that do not ascend, values that are not finite, gaps and values that no arm in SI units has,
-    StandstillError for a joint that moved by hardly more than its encoder's step.
+    for times that do not increase, values that are not finite, gaps and values that are implausible in SI units,
+    StandstillError for a joint that moved by hardly more than its encoder step.
     """
 
     time: Array

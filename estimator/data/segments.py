@@ -1,4 +1,4 @@
-"""A recording cut into segments on the grid of its simulation, each with its own start and its motor torque."""
+"""A recording cut into segments on the grid of its simulation, each with its own initial state and motor torque."""
 
 from dataclasses import dataclass
 

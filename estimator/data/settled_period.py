@@ -27,7 +27,7 @@ class SettledPeriod:
 
     Raises ShapeError for arrays that do not fit together, RecordingError for values that are not finite,
     for a rate or position step that is not positive and for a period with too few samples, StandstillError
-    for a joint that moved by hardly more than its encoder's step.
+    for a joint that moved by hardly more than its encoder step.
     """
 
     rate: float
@@ -85,7 +85,7 @@ class SettledPeriod:
 
 
 def without_spikes(period: SettledPeriod) -> SettledPeriod:
-    """The same period with single wild readings (a bit lost on the bus, say) marked as missing.
+    """The same period with single wild readings (such as a bit error on the bus) marked as missing.
 
     A reading is wild when it is further than SPIKE encoder steps, and than SPIKE times what is usual, from the
     median of itself and its two neighbours on either side.

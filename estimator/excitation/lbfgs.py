@@ -1,8 +1,8 @@
 """Smooth minimisation by limited-memory BFGS (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 7.5).
 
-Written out for one reason: a seed must give the same wave everywhere. A library's own takes its products from a BLAS
-that adds them up in another order on another processor, and after a few hundred evaluations the torque differs by up
-to 4e-4 of its peak (docs/dependencies.md).
+Implemented here for one reason: a seed must give the same wave on every machine. A library's own takes its products
+from a BLAS that adds them up in another order on another processor, and after a few hundred evaluations the torque
+differs by up to 4e-4 of its peak (docs/dependencies.md).
 """
 
 from collections import deque

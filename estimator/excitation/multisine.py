@@ -65,7 +65,7 @@ class Multisine:
 
 
 def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tuple[tuple[int, ...], ...]:
-    """Share the harmonics of 1/`period` [s] that lie in `band` [Hz] out between the joints in turn.
+    """Assign the harmonics of 1/`period` [s] within `band` [Hz] to the joints in turn.
 
     Raises ExcitationError when the band has fewer lines than joints.
     """

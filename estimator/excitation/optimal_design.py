@@ -2,7 +2,7 @@
 
 The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period: inverse information
 of the positions, the state at the first sample unknown too. They are worked out on a model of the arm, a pilot's. The
-search is a (1+1) evolution strategy with a step that follows its luck (Rechenberg's rule of success): first the shape
+search is a (1+1) evolution strategy with step-size control by Rechenberg's success rule: first the shape
 of the amplitude spectra and how far each joint goes, then the phases too. Every candidate is scaled to the limits.
 Source of the criterion: Pronzato and Pazman, "Design of experiments in nonlinear models", 2013, chapter 5 (E and
 minimax criteria).
@@ -52,7 +52,7 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """The same arm with friction's step no narrower than LEAST_WIDTH: quicker to simulate, much the same optimum."""
+    """The same arm with friction's step no narrower than LEAST_WIDTH: faster to simulate, same optimum nearly."""
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")
@@ -62,7 +62,7 @@ def smoothed(physics: Physics) -> Physics:
 
 @dataclass(frozen=True)
 class Problem:
-    """What a candidate is judged by."""
+    """Objective and constraints of the design."""
 
     physics: Physics
     names: tuple[str, ...]

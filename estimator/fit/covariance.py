@@ -1,12 +1,12 @@
-"""Standard errors that hold when the residual is not white: the sandwich N^-1 S N^-1.
+"""Standard errors that remain valid when the residual is not white: the sandwich N^-1 S N^-1.
 
 N = J'WJ is the information, S the scatter of the score J'Wr. Independent errors have S = N; rounding of a slow
-joint, and what a model lacks, are correlated over samples, which S sees when the score's products are summed
+joint, and model error, are correlated over samples, which S sees when the score's products are summed
 over lags (Newey and West, Econometrica 55 (1987) 703). Bartlett's kernel of L lags is the sum over all windows
 of L samples of the window's own score times itself, over L: one pass, whatever L.
 
-What a model lacks is more than correlated: it is the same at every reversal, so that no number of samples averages
-it out, and what of it looks like a parameter leaves no residual at all. So the part of the residual that is not
+Model error is more than correlated: it repeats at every reversal, so that averaging does not remove it,
+and the part that resembles a parameter leaves no residual at all. So the part of the residual that is not
 white widens the errors further: 1.4 standard deviations reach as far as the parameters can move before the motion
 changes, RMS, by as much as that part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
@@ -105,7 +105,7 @@ def robust_covariance(
     recording cannot prove that its errors cancel. Without `scatter` that of independent errors of variance 1.
     `structured` is the part of the sum of squares that is a model's error. `precision` (coordinates,) is what a prior
     has put into the normal equations: it stays as it is where the errors of measurement are larger than independent
-    ones. Infinite for a coordinate that leaves no trace.
+    ones. Infinite for a coordinate without influence on the residual.
     """
     prior = np.zeros(len(at.normal)) if precision is None else (1.0 - FAINT_PRIOR) * precision
     norm = np.sqrt(np.diag(at.normal))

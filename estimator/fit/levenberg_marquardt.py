@@ -1,4 +1,4 @@
-"""Nonlinear least squares by Levenberg-Marquardt on normal equations, so that no Jacobian is ever whole."""
+"""Nonlinear least squares by Levenberg-Marquardt on normal equations, so that the full Jacobian is never stored."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where the sum of squares is least."""
+    """Minimum of the sum of squares."""
 
     x: Array
     """Coordinates (coordinates,)."""
@@ -54,16 +54,16 @@ def minimise(
 ) -> Minimum:
     """Minimise a sum of squares from `start`, coordinates of the size of 1.
 
-    Damped steps are short along directions that hardly show and end too early there: near the end, `damping` should
-    start at `options.min_damping`.
+    Damped steps are short along weakly determined directions and terminate too early there: near the end, `damping`
+    should start at `options.min_damping`.
 
     Args:
-        evaluate: the sum at a point; one that is not finite counts as too large.
+        evaluate: the sum at a point; a non-finite sum counts as too large.
         start: coordinates (coordinates,).
-        ftol: ends when a step lowers the sum, or would, by less than this share of it.
-        damping: to begin with; by default `options.initial_damping`.
+        ftol: stop when the actual or predicted relative decrease of a step is below this.
+        damping: initial damping; by default `options.initial_damping`.
         at: the sum at `start`, if it is known.
-        move: takes coordinates and a step to where the step leads.
+        move: applies a step to coordinates.
         limits: gives the least and the most that each coordinate may change in a step from a point; by default
             `options.max_step` either way.
         options: limits of the iteration.
@@ -114,7 +114,7 @@ def _improve(
     limits: tuple[Array, Array],
     options: MinimiserOptions,
 ) -> tuple[tuple[Array, Quadratic] | None, float, int]:
-    """A better point, or None when there is none in sight; the next step's damping; and the points tried."""
+    """A better point, or None if there is none; the next step's damping; and the points tried."""
     tried = 0
     while damping < options.max_damping:
         step = _step(at.normal, at.gradient, damping, *limits)

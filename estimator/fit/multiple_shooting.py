@@ -1,14 +1,15 @@
-"""Multiple shooting: maximum likelihood on any recording, cut into segments whose starting states are unknown.
+"""Multiple shooting: maximum likelihood on any recording, cut into segments with unknown initial states.
 
-Free simulation forgets nothing: on a long recording an error of the model, or the chaos of an arm that turns
-over, drowns what the parameters do. On a segment of a second it cannot. Bock, "Recent advances in parameter
+Open-loop simulation accumulates errors: on a long recording, model error or the chaos of a tumbling arm
+swamps the parameters' influence. On a segment of a second it does not. Bock, "Recent advances in parameter
 identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems
 (1983). The segments are not joined: noise that a rigid arm does not have, such as play and flexing, may
 move the state between them.
 
-Short segments come first: started far from the truth, they find it; longer ones then sharpen it. A segment whose
-residual is then larger than usual, because a joint stuck in it, say, as no smooth friction sticks, is downweighted by
-as much: with equal weights the segments that the model explains worst would decide.
+Short segments come first, since they converge from a poor initial guess; longer ones then refine the result. A segment
+whose residual is then larger than usual, because a joint stuck in it, say, as no smooth friction sticks, is
+downweighted
+accordingly: with equal weights the segments that the model explains worst would dominate.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,7 +39,7 @@ ALL = slice(None)
 
 @dataclass(frozen=True)
 class ShootingEstimate:
-    """What multiple shooting found."""
+    """Result of multiple shooting."""
 
     model: Model
     names: tuple[str, ...]
@@ -115,7 +116,7 @@ class Shooting:
         return segment.at_samples(np.concatenate((grid, end[:1].T), axis=1))
 
     def residual(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> Array:
-        """Simulated less measured positions of one segment in units of their noise (rows,)."""
+        """Simulated minus measured positions of one segment in units of their noise (rows,)."""
         segment = self.segments[number]
         position = self.position(
             segment, self._physics(coordinates, segment, shared), own.reshape(2, -1) * self.state_scale
@@ -151,7 +152,7 @@ class Shooting:
         return self._rows(number, segment.at_samples(grid)), columns.reshape(-1, columns.shape[2])
 
     def errors(self, coordinates: Coordinates, found: Segmented) -> Array:
-        """RMS of simulated less measured position, segment by segment (segments, joints) [rad]."""
+        """RMS of simulated minus measured position, segment by segment (segments, joints) [rad]."""
         rms = np.empty_like(self._trust)
         for number, (segment, own) in enumerate(zip(self.segments, found.own, strict=True)):
             rows = self.residual(coordinates, number, found.shared, own).reshape(self._model.joints, -1)
@@ -182,7 +183,7 @@ class Shooting:
         return Physics.of(values | {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)})
 
     def _noise(self, number: int) -> Array:
-        """How far a segment's samples are taken to be off (joints, 1) [rad]."""
+        """Assumed standard deviation of a segment's samples (joints, 1) [rad]."""
         noise: Array = self.noise / self._trust[number][:, None]
         return noise
 
@@ -223,7 +224,7 @@ def estimate_by_shooting(
     recordings give the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one
     offset a joint and recording, as of servos whose zero is set at every start; with gravity they are seen, without
     they are not. `of` takes some of each recording's segments and leaves the others for a check. Raises RecordingError
-    when nothing is long enough, ConvergenceError.
+    if no segment is long enough, ConvergenceError.
     """
     short, problem = (
         Shooting(recordings, model, part * length, zeros=zeros, of=of, options=options) for part in (options.short, 1.0)
@@ -289,7 +290,7 @@ def _samples(segment: RecordingSegment) -> Array:
 def _initial_guesses(
     problem: Shooting, coordinates: Coordinates, model: Model, base: Array, options: ShootingOptions
 ) -> Iterator[Array]:
-    """Shared coordinates to start from: `base`, and what it does not say of friction."""
+    """Initial shared coordinates: `base`, completed by guesses for friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), options.initial_width)
     for joint in range(1, model.joints + 1):

@@ -1,8 +1,8 @@
-"""The likelihood's minimum sought from several initial guesses, in coarse integration steps first.
+"""Minimisation of the likelihood from several initial guesses, with coarse integration steps first.
 
 Most iterations use coarse integration steps; fine steps decide between minima that the coarse ones cannot separate.
-How large the errors are is itself estimated, joint by joint, before the last iterations, and samples far outside are
-downweighted there (Huber): a few wild readings then cost nothing.
+The noise level of each joint is itself estimated before the final iterations, in which outliers are
+downweighted (Huber), so that a few wild readings do no harm.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ STRIBECK_TERMS = tuple(name for name, term in TERMS.items() if term.part == "str
 
 @dataclass(frozen=True)
 class Start:
-    """Where one initial guess led, in coarse integration steps."""
+    """Result from one initial guess with coarse integration steps."""
 
     tracking: Array
     """Coordinates of what fits the motion of the arm that springs hold to the measured one."""
@@ -37,7 +37,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Refined:
-    """Where tries led in fine integration steps, weighted by what the best of them leaves."""
+    """Results with fine integration steps, weighted by the residual of the best."""
 
     weighted: Objective
     outliers: int
@@ -95,7 +95,7 @@ class Search:
         return refined, replace(minimum, iterations=found.iterations + refined.iterations + minimum.iterations)
 
     def _multistart(self, guesses: Sequence[Array], springs: Array) -> list[Start]:
-        """From one guess after the other until the motion is explained. Raises ConvergenceError if none converges."""
+        """Try one guess after the other until the motion is explained. Raises ConvergenceError if none converges."""
         starts: list[Start] = []
         lost = ConvergenceError("no initial guess was given")
         enough = (self.options.hopeless_cost if self.coarse else 1.0) * self.options.explained_cost * self.samples
@@ -112,7 +112,7 @@ class Search:
         return starts
 
     def _from_guess(self, x: Array, springs: Array) -> Start:
-        """From a guess to the whole free motion, by way of the motion that springs hold to the measured one."""
+        """From a guess to the open-loop motion, by way of motion that springs keep close to the measured one."""
         options, rough = self.options, self.rough
         ftol = options.ftol_coarse if self.coarse else options.ftol_start
         tracking = replace(rough, tracking_stiffness=springs).minimise(x, options.ftol_coarse)
@@ -189,7 +189,7 @@ class Search:
         return Refined(weighted, outliers, best, cost, sum(found.iterations for found in ends))
 
     def _distinct(self, tries: Sequence[Minimum]) -> list[Minimum]:
-        """The best, and those that only finer steps can tell from it."""
+        """The best, and those that only finer steps can distinguish from it."""
         distinct: list[Minimum] = []
         for each in sorted(tries, key=lambda found: found.at.cost):
             cost = each.at.cost
@@ -230,7 +230,7 @@ def _best(tries: Sequence[Minimum]) -> Minimum:
 def _weights(
     periods: Sequence[SettledPeriod], positions: Sequence[Array], threshold: float
 ) -> tuple[tuple[Array, ...], int]:
-    """Weights by how large each joint's errors turned out, and the number of samples far outside them."""
+    """Weights by how large each joint's errors turned out, and the number of outliers."""
     weights = []
     outliers = 0
     for period, position in zip(periods, positions, strict=True):

@@ -1,4 +1,4 @@
-"""The products of least squares, compiled: they need neither BLAS nor a weighted copy of the Jacobian.
+"""The products of least squares, compiled: without BLAS or a weighted copy of the Jacobian.
 
 As fast as a BLAS held to one thread; its own threads make products of this size ten times slower on a busy machine, and
 the last digits of a fit would depend on their number (docs/dependencies.md).

@@ -1,4 +1,4 @@
-"""What the likelihood minimises: weighted squared residuals of several runs, measured minus simulated position."""
+"""The likelihood's objective: weighted squared residuals of several runs, measured minus simulated position."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Unconstrained coordinates for the likelihood: no step of it can leave the physical parameters.
+"""Unconstrained coordinates for the likelihood: no step can leave the physical range.
 
 What range a parameter has, its scale and its longest step is declared in `hil.estimator.models.terms`. Positive
 parameters are exponentials. Coupling is a share of its bound, sqrt(inertia_1 inertia_2) tanh(z), which every arm of
@@ -147,7 +147,7 @@ class Sizes:
     """[kg m^2]."""
 
     def of(self, scale: Scale | float) -> float:
-        """The number that a declared scale means here."""
+        """The value of a declared scale for this arm."""
         if not isinstance(scale, str):
             return scale
         return {

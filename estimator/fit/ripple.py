@@ -1,4 +1,4 @@
-"""Where torque ripple over the joint angle repeats: a scan that needs no starting value.
+"""Where torque ripple over the joint angle repeats: a scan that needs no initial guess.
 
 For each number of cycles a turn, torque times its sine and cosine are two more columns of the regression on
 Fourier lines; the one that explains most of what friction and dynamics leave is where the likelihood starts.

@@ -2,7 +2,7 @@
 
 A segment's own unknowns touch only its own residuals, so the normal equations have an arrow's shape: each
 segment's block is eliminated by itself (Schur complement), and its columns of the Jacobian are taken for all
-segments at once. Hundreds of starting states cost as much as four.
+segments at once. Hundreds of initial states cost as much as four.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ MIN_PART = 1e-4  # of a coordinate in such a direction, squared: less is roundin
 
 @dataclass(frozen=True)
 class Segmented:
-    """Where the sum of squares is least."""
+    """Minimum of the sum of squares."""
 
     shared: Array
     """(shared,)."""
@@ -128,9 +128,10 @@ def minimise_segmented(
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when a step gains less than
-    `ftol` of the sum, or after `options.max_iterations` when it gained less than `options.unfinished`. `residual` and
-    `derivative` are called from several threads; the result does not depend on their number. Raises ConvergenceError.
+    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when the relative decrease
+    of a step is below `ftol`, or after `options.max_iterations` when it gained less than `options.unfinished`.
+    `residual` and `derivative` are called from several threads; the result does not depend on their number. Raises
+    ConvergenceError.
     """
     with ThreadPoolExecutor(thread_count()) as threads:
         rows = _residuals(residual, shared, own, threads)

@@ -1,4 +1,4 @@
-"""Stage 1: linear least squares on the Fourier lines of settled periods. No starting values, no local
+"""Stage 1: linear least squares on the Fourier lines of settled periods. No initial guess, no local
 minima.
 
 The motion's lines up to where signal meets noise are differentiated exactly, the regressor evaluated on
@@ -23,7 +23,7 @@ DEFAULTS = LinearOptions()
 
 @dataclass(frozen=True)
 class LinearEstimate:
-    """What the regression found."""
+    """Result of the regression."""
 
     names: tuple[str, ...]
     """Base parameters."""

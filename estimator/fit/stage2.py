@@ -1,8 +1,8 @@
 """Stage 2: maximum likelihood, by least squares of measured minus simulated position over settled periods.
 
-With errors of position that are alike and independent from sample to sample, as rounding nearly is, the
-most likely parameters are those of the smallest weighted sum of squares. The state at the first sample of
-each run is unknown too: simulating until the motion is periodic would take two or more periods in place of one.
+If position errors are independent and identically distributed, as rounding errors nearly are,
+the most likely parameters minimise the weighted sum of squares. The state at the first sample of
+each run is unknown too: simulating until the motion is periodic would take two or more periods instead of one.
 `hil.estimator.fit.multistart` finds the minimum.
 """
 
@@ -51,7 +51,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Near:
-    """Where a minimum is known to be close: what a similar model found of the same periods."""
+    """A nearby minimum: the result of a similar model for the same periods."""
 
     parameters: Mapping[str, float]
     """By name [SI]; others start from their usual initial guess."""
@@ -75,8 +75,8 @@ def fit_runs(
         periods: settled periods of one arm.
         model: what is fitted.
         linear: stage 1's estimate of the same periods.
-        coarse: for trying a model: one that leaves much more than the noise is given up before its last digits.
-        starts: parameters by name [SI], further initial guesses that come before all others.
+        coarse: for trying a model: one whose residual is well above the noise is abandoned before full convergence.
+        starts: parameters by name [SI], further initial guesses, tried before all others.
         near: the only initial guess, where a minimum is known to be close.
         options: tolerances and limits.
 
@@ -178,7 +178,7 @@ def _guess(
     standstill: Mapping[str, float],
     options: LikelihoodOptions,
 ) -> Array:
-    """Parameters to start from [SI] (parameters,): stage 1's, and what it does not see."""
+    """Initial guess [SI] (parameters,): stage 1's values, and defaults for parameters it does not estimate."""
     known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | dict(ripple)
     known |= {f"{name}_{joint + 1}": value for name, value in standstill.items() for joint in range(model.joints)}
     if model.drive == "delay":

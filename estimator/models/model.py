@@ -24,17 +24,17 @@ class Model:
     Friction: `coulomb` is viscous v + coulomb tanh(v / coulomb_width); `stribeck` multiplies coulomb by 1 +
     stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level. Drive:
     `delay` is a pure delay of the torque on top of what `SettledPeriod` knows, `lag` a first-order lag, `delay_lag`
-    both. Options: `presliding` puts bristles that bend before they slip (`hil.estimator.simulation.bristles`) in the
-    place of any friction's coulomb_width. `asymmetry` adds viscous_asymmetry |v|: friction that differs with direction
+    both. Options: `presliding` puts bristles that bend before they slip (`hil.estimator.simulation.bristles`) instead
+    of any friction's coulomb_width. `asymmetry` adds viscous_asymmetry |v|: friction that differs with direction
     (of the Coulomb level, that is the offset). `ripple` multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles
     q) + ripple_cos cos(ripple_cycles q), ripple_cycles per turn of the joint. `zeros` adds the errors of the
-    encoders' zeros, true angle = measured angle + zero; the first joint's shows only under gravity. `torque_scale`
-    multiplies the second joint's torque: true over assumed torque constant, relative to the first joint's. One
-    unknown torque constant scales all parameters; of two, the ratio shows, since both joints feel the same masses.
-    `saturation` takes the share saturation torque^2 off the torque, `cable` adds cable_stiffness q to what holds the
-    joint (where it is slack is part of the offset), and `encoder` says that a joint at q is measured to be at q +
-    encoder_sin_once sin q + encoder_cos_once cos q + encoder_sin_twice sin 2q + encoder_cos_twice cos 2q. `lags` lets
-    the second joint's torque lag by lag + lag_difference.
+    encoders' zeros, true angle = measured angle + zero; the first joint's is observable only under gravity.
+    `torque_scale` multiplies the second joint's torque: true over assumed torque constant, relative to the first
+    joint's. One unknown torque constant scales all parameters; of two, the ratio is identifiable, since both joints
+    feel the same masses. `saturation` takes the share saturation torque^2 off the torque, `cable` adds cable_stiffness
+    q to what holds the joint (where it is slack is part of the offset), and `encoder` says that a joint at q is
+    measured to be at q + encoder_sin_once sin q + encoder_cos_once cos q + encoder_sin_twice sin 2q + encoder_cos_twice
+    cos 2q. `lags` lets the second joint's torque lag by lag + lag_difference.
 
     Raises ModelError for other names, for other than one or two joints, and for a torque_scale of one joint.
     """
@@ -79,7 +79,7 @@ class Model:
 
     @property
     def description(self) -> str:
-        """In words, for a person."""
+        """Human-readable description."""
         return " + ".join(
             (self.friction, *(each.replace("_", " ") for each in OPTIONS if each in self.options), self.drive)
         )

@@ -1,4 +1,4 @@
-"""Watches whether an arm's motion is one that its model allows, sample by sample and without accelerations.
+"""Checks sample by sample, without accelerations, whether an arm's motion is consistent with its model.
 
 The planar arm's equations, integrated once, are linear in its parameters and hold angles, velocities and torques alone:
 

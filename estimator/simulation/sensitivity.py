@@ -69,7 +69,7 @@ NUMBERS = 2 * BY_STATE + 24
 
 
 class Sensitive:
-    """A simulation that goes on piece by piece, so that long recordings need little memory.
+    """A simulation that advances piece by piece, so that long recordings need little memory.
 
     `start` (2, joints): angles [rad] and velocities [rad/s] at the first sample; `causes`: names of what to
     differentiate by, from CAUSES; `step` [s]: length of one integration step, cut into at most

@@ -7,7 +7,7 @@ last packet of that write, even where that lies ahead of the clock; between two 
 own loops and faults can act, and the plant's advance is split at the moment they do.
 
 When two speak at once, host and servo or two servos, both are lost: the later packet, and the former's bytes from there
-on. Which servos act and answer is the affair of `hil.fakes.bus.instructions`.
+on. Which servos act and answer is decided in `hil.fakes.bus.instructions`.
 """
 
 import math
@@ -86,7 +86,7 @@ class FakeBus:
 
     @property
     def baud(self) -> int:
-        """The host's baud. Servos set to another one make nothing of what they hear, and say nothing.
+        """The host's baud. Servos set to another rate understand nothing and stay silent.
 
         Set while a reply is on its way, what is left of it arrives as the garbage that a receiver makes of it.
         """
@@ -116,12 +116,12 @@ class FakeBus:
 
     @property
     def advanced_to(self) -> float:
-        """The time up to which plant and servos have lived [s on the clock]."""
+        """The time up to which plant and servos have been advanced [s on the clock]."""
         return self._now
 
     @property
     def collisions(self) -> int:
-        """How often host and servos, or two servos, spoke at once."""
+        """Number of collisions between host and servos, or between two servos."""
         return self._wire.collisions
 
     @property
@@ -205,7 +205,7 @@ class FakeBus:
     # Time
 
     def notice_faults(self) -> None:
-        """Let the faults happen whose time has come by the clock."""
+        """Trigger the faults that are due by the clock."""
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:
             self.advance(now)
@@ -295,7 +295,7 @@ class FakeBus:
             end(fault, self._servos, self._joints.of, self.plant)
 
     def _other_master_speaks(self, servo_id: int) -> None:
-        """Somebody else asks a servo for its Present Position; the host hears the question and the answer."""
+        """Another master reads a servo's Present Position; the host receives both request and reply."""
         request = encode(servo_id, Instruction.READ, b"\x84\x00\x04\x00")
         asked_by = self._wire.put(request, self._now)
         self._instructions.receive(Packet(servo_id, Instruction.READ, request[8:-2]), asked_by)
@@ -351,7 +351,7 @@ class FakeBus:
 
     @property
     def servos_refuse(self) -> bool:
-        """Whether a fault lasts by which servos refuse what they are told."""
+        """Whether an active fault makes servos refuse commands."""
         return bool(self.faults.on_answers)
 
     def fault_error(self, servo: Servo, now: float) -> int:

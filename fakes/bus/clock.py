@@ -1,4 +1,4 @@
-"""Virtual time: the clock on which a fake arm lives when nothing outside the process has to keep up with it."""
+"""Virtual time: the clock of a fake arm when nothing outside the process depends on it."""
 
 
 class VirtualClock:

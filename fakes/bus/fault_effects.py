@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def begin(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant, now: float) -> None:
-    """Do to servos and joints what the fault does; nothing for the kinds that are not about them.
+    """Apply the fault to servos and joints; nothing for kinds that do not concern them.
 
     joints: of each servo, which joint it moves. now: bus time [s].
     """
@@ -39,7 +39,7 @@ def begin(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: P
 
 
 def end(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant) -> None:
-    """Undo it, as far as it passes by itself: a heated servo stays hot, an error stays until a reboot."""
+    """Undo it where it passes by itself: a heated servo stays hot, an error stays until a reboot."""
     for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):
             continue

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 
 class FaultKind(StrEnum):
-    """Everything that can be made to go wrong."""
+    """Every kind of fault that can be injected."""
 
     LOST_REPLY = "lost_reply"
     CORRUPTED_REPLY = "corrupted_reply"
@@ -94,7 +94,7 @@ _LEAST_REPEAT_S = 1e-3
 
 
 class Fault(BaseModel):
-    """One thing that goes wrong. Immutable; `servo` is a bus ID at the time it begins, None is all of them."""
+    """One injected fault. Immutable; `servo` is a bus ID at the time it begins, None is all of them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -158,7 +158,7 @@ class Faults:
         self._repeats: list[tuple[float, Fault]] = []
 
     def add(self, *faults: Fault) -> None:
-        """Let these happen too. One whose time has passed begins at once."""
+        """Add faults. One whose time has passed begins at once."""
         self._to_come.extend(faults)
         self._look_ahead()
 

@@ -1,4 +1,4 @@
-"""A hand that moves joints of the fake arm whose torque is off, as the person does who calibrates an arm.
+"""A hand that moves joints of the fake arm whose torque is off, as a person calibrating an arm does.
 
     bus.hand.move(Move(servo=2, to=0.5))                        # joint of servo 2 to 0.5 rad, one second from now
     bus.hand.move(Move(servo=2, ticks=3000, at=4.0, duration=2.0))
@@ -7,7 +7,7 @@
 The same from TOML, `[[fake.moves]]` with the same keys, and from the command line: `--move 2:to=0.5,at=4`, and while
 the terminal is served `hil fake --at /tmp/arm --move 2:to=0.5`.
 
-The hand is stronger than friction and gravity and weaker than nothing here, so it lets go of a joint as soon as the
+The hand overcomes friction and gravity but never opposes motor torque, so it releases a joint as soon as the
 torque of one of its servos comes on, and does not take one whose torque is on.
 """
 
@@ -72,7 +72,7 @@ class Hand:
 
     @property
     def busy(self) -> bool:
-        """Whether it holds something or will."""
+        """Whether it holds a joint or has a pending move."""
         return bool(self._grips or self._to_come)
 
     @property

@@ -35,7 +35,7 @@ Part = tuple[int, int, int]
 
 
 class Line(Protocol):
-    """What stands between the servos and the world; `hil.fakes.bus.bus.FakeBus` is one."""
+    """Interface between the servos and the bus; `hil.fakes.bus.bus.FakeBus` is one."""
 
     @property
     def baud(self) -> int: ...
@@ -56,7 +56,7 @@ class Line(Protocol):
 
     @property
     def servos_refuse(self) -> bool:
-        """Whether a fault lasts by which servos refuse what they are told."""
+        """Whether an active fault makes servos refuse commands."""
         ...
 
     def fault_error(self, servo: Servo, now: float) -> int:

@@ -1,4 +1,4 @@
-"""The servos' ear: instruction packets out of the bytes on the wire."""
+"""Servo-side receiver: extracts instruction packets from the bytes on the wire."""
 
 from collections.abc import Iterator
 from struct import Struct

@@ -55,11 +55,11 @@ class StateReads:
         self._prepared: dict[bytes, tuple[_Part, ...]] = {}
 
     def forget(self) -> None:
-        """The servos' IDs are others now."""
+        """Forget the prepared requests, since the servos' IDs have changed."""
         self._prepared.clear()
 
     def sync_read(self, body: bytes, by_id: Mapping[int, Sequence[Servo]], now: float) -> list[Reply] | None:
-        """The replies to a Sync Read; None when it has to go the long way."""
+        """The replies to a Sync Read; None if it needs the general path."""
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
         replies = []
@@ -76,7 +76,7 @@ class StateReads:
         return replies or None
 
     def fast_sync_read(self, body: bytes, by_id: Mapping[int, Sequence[Servo]], now: float) -> list[Reply] | None:
-        """The pieces of the reply to a Fast Sync Read; None when it has to go the long way."""
+        """The pieces of the reply to a Fast Sync Read; None if it needs the general path."""
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
         size = 1 + len(parts) * (_SIZE + 4)

@@ -1,4 +1,4 @@
-"""What a serial receiver makes of bytes that were sent at another baud than its own."""
+"""What a serial receiver reads from bytes sent at a different baud rate."""
 
 _IDLE = 1
 _STOP = 9  # of the ten bits of a byte: start, eight data bits, stop

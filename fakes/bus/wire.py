@@ -94,7 +94,7 @@ class Wire:
         self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
 
     def occupy(self, until: float) -> None:
-        """A servo speaks and is not heard."""
+        """A servo transmits without being heard."""
         self.reply_by = max(self.reply_by, until)
 
     def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
@@ -142,7 +142,7 @@ class Wire:
         return last
 
     def cut(self, now: float) -> None:
-        """Nothing that is not there by `now` will ever come: the cable is out."""
+        """Drop everything that has not arrived by `now`: the cable is out."""
         kept = [segment._replace(data=segment.data[: segment.count_by(now)]) for segment in self._arriving]
         self._arriving = deque(segment for segment in kept if segment.data)
 

@@ -50,7 +50,7 @@ class GearedArm:
         self._rotors[joint].motor.jammed = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._rotors[joint].motor.held_at = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

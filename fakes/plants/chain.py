@@ -58,7 +58,7 @@ class SpatialChain:
         return list(map(float, self._state[3]))
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Hold a joint fast, or let it go."""
+        """Block a joint, or release it."""
         self._jam[joint] = JAM if jammed else 0.0
 
     def advance(self, until: float, current: Sequence[float]) -> None:

@@ -1,4 +1,4 @@
-"""Joints that know nothing of each other: each a link of its own on a drive of its own.
+"""Uncoupled joints: each is a separate link on its own drive.
 
     [fake]
     plant = "hil.fakes.plants.independent:make_plant"
@@ -10,7 +10,7 @@
     drives = [{ mass = 0.02, rotor_inertia = 8e-8, gear_ratio = 288.4, torque_constant = 0.35, viscous = 0.01 }]
 
 Each joint is described as an arm of one joint. Good enough for programs that talk to servos and move an arm; not for
-those that ask what the joints do to each other.
+those that depend on coupling between joints.
 """
 
 from collections.abc import Sequence
@@ -52,11 +52,11 @@ class Independent:
         return [joint.current[0] for joint in self._joints]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Hold a joint fast, or let it go."""
+        """Block a joint, or release it."""
         self._joints[joint].jam(0, jammed)
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._joints[joint].hold(0, velocity)
 
     def advance(self, until: float, current: Sequence[float]) -> None:

@@ -55,11 +55,11 @@ class MujocoPlant:
         return [float(current) for current in self._current]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Hold a joint fast, or let it go."""
+        """Block a joint, or release it."""
         self._jammed[joint] = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._held_at[joint] = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

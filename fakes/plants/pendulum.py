@@ -37,11 +37,11 @@ class Pendulum:
         return (self._motor.current,)
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Hold the joint fast, or let it go."""
+        """Block the joint, or release it."""
         self._motor.jammed = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._motor.held_at = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

@@ -1,4 +1,4 @@
-"""What moves behind the fake servos: the one interface a plant needs to stand there, and how to find one.
+"""Plants, the mechanisms behind the fake servos: their interface, and how to load one.
 
 A plant of your own is any object with the members of `Plant`, made by a function that takes the description's
 `plant_options` as keywords:
@@ -21,7 +21,7 @@ from hil.fakes.plants.two_link import TwoLink
 
 
 class PlantError(ValueError):
-    """A plant cannot be made, or gave something that is no state of an arm. The message says which and what is due."""
+    """A plant cannot be made, or returned an invalid state. The message says which and what is required."""
 
 
 class Plant(Protocol):
@@ -138,7 +138,7 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
 
 
 class CheckedPlant:
-    """A plant of somebody else's, whose state is looked at after every step. Raises PlantError."""
+    """A third-party plant whose state is checked after every step. Raises PlantError."""
 
     def __init__(self, plant: Plant, name: str) -> None:
         self._plant = plant

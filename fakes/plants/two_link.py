@@ -61,11 +61,11 @@ class TwoLink:
         return self._motors[0].current, self._motors[1].current
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Hold a joint fast, or let it go."""
+        """Block a joint, or release it."""
         self._motors[joint].jammed = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Take a joint in the hand and move it at `velocity` [rad/s], or let it go (None)."""
+        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._motors[joint].held_at = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:
@@ -179,7 +179,7 @@ def _about_joint(link: Link) -> float:
 
 
 def _until_zero(old: float, new: float) -> float:
-    """Part of the step after which the velocity is zero; 1 if it does not get there or starts there."""
+    """Fraction of the step after which the velocity is zero; 1 if it does not reach zero or starts there."""
     return old / (old - new) if old * new < 0.0 else 1.0
 
 
@@ -205,7 +205,7 @@ def _sticking(
 
 
 def _shrunk(impulse: float, limit: float) -> float:
-    """What of an impulse is left after friction took up to `limit` of it."""
+    """The impulse that remains after friction has absorbed up to `limit` of it."""
     if impulse > limit:
         return impulse - limit
     if impulse < -limit:

@@ -1,9 +1,9 @@
-"""What a servo does to its motor in each operating mode: PWM and current from goals, gains and profile.
+"""Motor control in each operating mode: PWM and current from goals, gains and profile.
 
 Source: the block diagrams and gain units of the ROBOTIS e-Manual (pages x/<model>, Velocity PI Gain, Position PID
 Gain): P gains count 1/128, I gains 1/65536, the D gain 1/16, feedforward gains 1/4 and 1/1. The period of the control
-loop (1 ms here), what exactly the D gain multiplies and the filters between are unsure, so a move looks right and is
-not the firmware's to the tick.
+loop (1 ms here), what exactly the D gain multiplies and the filters between are unsure, so a move is realistic but does
+not match the firmware to the tick.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What an encoder gets wrong of an angle: noise, and errors that repeat every turn.
+"""Encoder errors: noise, and errors that repeat every turn.
 
 A magnetic encoder whose magnet sits off the shaft's axis errs once a turn; a tilted magnet, or channels that differ in
 amplitude or are not in quadrature, err twice a turn.

@@ -1,4 +1,4 @@
-"""What a servo suffers from its own current: warmth and overload. Both are off unless described.
+"""Effects of a servo's own current: heating and overload. Both are off unless described.
 
 Source of the errors: ROBOTIS e-Manual, Shutdown and Hardware Error Status. How the firmware decides on an overload is
 not published (unsure): here it is a current held above a threshold for a time, which forgets as fast as it counts.

@@ -7,7 +7,7 @@ from hil.fakes.servo.registers import Model, Register
 
 
 class Memory:
-    """Registers as bytes. What may be written when, and what follows from it, is `hil.fakes.servo.servo`'s affair."""
+    """Registers as bytes. What may be written when, and its consequences, are decided in `hil.fakes.servo.servo`."""
 
     def __init__(self, model: Model) -> None:
         self.registers = model.registers

@@ -1,4 +1,4 @@
-"""What a servo knows of its supply and its warmth: registers, limits, and the shutdown that they cause."""
+"""A servo's supply and temperature monitoring: registers, limits, and the shutdown they cause."""
 
 from abc import ABC, abstractmethod
 
@@ -21,7 +21,7 @@ class Powered(ABC):
 
     @abstractmethod
     def _derive(self) -> None:
-        """Work out anew what depends on registers."""
+        """Recompute what depends on registers."""
 
     @property
     def supply_v(self) -> float:

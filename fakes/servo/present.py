@@ -1,4 +1,4 @@
-"""What a servo measures of its joint and puts into its present registers, in ticks."""
+"""A servo's measurements of its joint, stored in its present registers in ticks."""
 
 import math
 from collections.abc import Callable

@@ -1,7 +1,8 @@
-"""One fake servo: a control table as a state machine. It knows no bus and no plant; `hil.fakes.bus.bus` gives it both.
+"""One fake servo: a control table as a state machine. It knows neither bus nor plant; `hil.fakes.bus.bus` provides
+both.
 
 What it does is written in the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent this
-module decides as follows, choosing what asks more of a client:
+module decides as follows, choosing what is stricter for a client:
 
 - A write that covers several registers asks each of them: those that can be written are, and the status has the error
   of the first that refused. ROBOTIS' own example indirect_address writes Goal Position and an LED of 255 together and

@@ -1,4 +1,4 @@
-"""Where a servo wants to be right now: the trapezoidal profile between its last and its present goal."""
+"""A servo's trajectory: the trapezoidal profile between its last and its present goal."""
 
 from math import copysign, sqrt
 

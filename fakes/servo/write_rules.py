@@ -1,4 +1,4 @@
-"""Which registers hang together, and why a servo refuses a write to one of them."""
+"""Dependencies between registers, and reasons for refusing a write."""
 
 from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE

@@ -14,14 +14,14 @@ __all__ = ["CheckReport", "Finding", "Level", "check"]
 
 @dataclass(frozen=True, repr=False)
 class CheckReport:
-    """What was looked at, in order, on the arm of the file `config`."""
+    """The findings, in order, for the arm described by the file `config`."""
 
     config: Path
     findings: tuple[Finding, ...]
 
     @property
     def ready(self) -> bool:
-        """Whether nothing stops an experiment."""
+        """Whether nothing blocks an experiment."""
         return not self.problems
 
     @property
@@ -31,7 +31,7 @@ class CheckReport:
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """What does not stop it, but is not as it should be."""
+        """Findings that do not block it but are not as they should be."""
         return tuple(finding for finding in self.findings if finding.level is Level.WARNING)
 
     def to_json(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ __all__ = ["Rehearsal", "dry_run"]
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Rehearsal:
-    """What a dry run foretells. file: the configuration's, as the caller wrote it. found: everything it computed."""
+    """What a dry run predicts. file: the configuration's, as the caller wrote it. found: everything it computed."""
 
     file: Path
     config: Config
@@ -43,7 +43,7 @@ class Rehearsal:
 
     @property
     def prediction(self) -> Prediction:
-        """Of the configured torque; without one, of the largest safe one."""
+        """The prediction for the configured torque; without one, for the largest safe torque."""
         return self.found.largest.prediction if self.found.asked is None else self.found.asked
 
     def to_json(self) -> dict[str, Any]:
@@ -91,16 +91,16 @@ def dry_run(
 
     Args:
         config: TOML file of the arm, the name of a bundled one, or a loaded configuration.
-        result: run folder or result.json of a former identification, in place of [arm.prior].
+        result: run folder or result.json of an earlier identification, used instead of [arm.prior].
         arms: how many to simulate.
-        servos: also read the servos' limits and time the bus, with torque off.
+        servos: also read the servos' limits and measure bus timing, with torque off.
         on_progress: called with a `Progress` when the simulation begins.
 
     Raises:
         ConfigError: the configuration is wrong.
         ResultError: `result` holds no result.
         NoSafeTorque: no torque keeps all simulated arms within their limits.
-        hil.drivers.errors.DriverError: with `servos`, they do not answer.
+        hil.drivers.errors.DriverError: with `servos`, if they do not answer.
     """
     checked, shown = loaded(config)
     on_progress(Progress("simulation", "Simulating"))

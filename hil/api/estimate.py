@@ -27,8 +27,8 @@ def estimate(
     """Estimate an arm's parameters from a recording: `hil estimate` as a function.
 
     Args:
-        recording: a run folder or a `Run`, whose result.json is written anew; or one or more CSV files of one arm.
-        config: for CSV files, the TOML file whose [columns] says what is in them.
+        recording: a run folder or a `Run`, whose result.json is rewritten; or one or more CSV files of one arm.
+        config: for CSV files, the TOML file whose [columns] table describes them.
         all_samples: of a run, use every sample by multiple shooting; no settled period is needed.
         on_progress: called with a `Progress` when a new stage begins.
 

@@ -40,10 +40,10 @@ def identify(
     Args:
         config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
         out: run folder, which must be new or empty; runs/TIME-ARM unless given.
-        take_over: let an arm that another program holds sink slowly and take it over; hold it by hand.
+        take_over: take over an arm that another program holds, letting it sink slowly; support it by hand.
         on_progress: called with a `Progress` about 20 times a second while the arm moves, on a real bus by a thread of
-            its own. It cannot disturb the experiment: what comes too fast is dropped, and when it raises, that is
-            logged and it is not called again.
+            its own. It cannot disturb the experiment: reports that come too fast are dropped, and if it raises, the
+            exception is logged and it is not called again.
 
     Returns:
         The result, with the run folder as `run`; its report is in there too.
@@ -138,7 +138,7 @@ def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None)
 
 
 def _unused(path: Path) -> Path:
-    """`path`, or with a number after it: a program may start two runs within a second."""
+    """`path`, or `path` with a number appended: a program may start two runs within a second."""
     number = 2
     tried = path
     while tried.exists():

@@ -1,4 +1,4 @@
-"""What a long call tells while it runs."""
+"""Progress reports of a long call."""
 
 import logging
 from collections.abc import Callable
@@ -38,7 +38,7 @@ OnProgress = Callable[[Progress], None]
 
 
 def forgiving(listener: OnProgress) -> OnProgress:
-    """The same, but its first exception is logged and it is not called again: nothing disturbs an arm under torque."""
+    """Wrap a callback: after its first exception, which is logged, it is not called again."""
     failed = False
 
     def tell(progress: Progress) -> None:
@@ -55,4 +55,4 @@ def forgiving(listener: OnProgress) -> OnProgress:
 
 
 def ignore(_: Progress) -> None:
-    """For a caller who does not listen."""
+    """A callback that does nothing."""

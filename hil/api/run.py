@@ -32,7 +32,7 @@ _SHOWN = ("position", "residual")
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Identification(SettledResult):
-    """An identified arm: everything in its result.json, and the run folder that holds it."""
+    """An identified arm: the contents of its result.json, and its run folder."""
 
     run: Path = field(metadata=_ON_FILE_ELSEWHERE)
 
@@ -42,15 +42,15 @@ class Identification(SettledResult):
         return model_of(self, self.run)
 
     def plot(self, *names: str) -> Any:
-        """Pictures of the report below each other, as a matplotlib figure that a notebook shows.
+        """Plots of the report, stacked in one matplotlib figure that a notebook displays.
 
         Args:
-            names: of the pictures, such as "residual_1", "friction_2" or "correlation", or how they begin; without any,
-                measured and predicted positions and what is left of them.
+            names: of the pictures, such as "residual_1", "friction_2" or "correlation", or their prefixes; by default,
+                measured and predicted positions and their residuals.
 
         Raises:
             MissingExtra: matplotlib is not installed.
-            ValueError: no picture has such a name; the message lists those there are.
+            ValueError: no plot has such a name; the message lists the available ones.
         """
         from hil.report.pictures import figures
         from hil.report.png import draw_figures
@@ -65,7 +65,7 @@ class Identification(SettledResult):
         return draw_figures(chosen or list(found.values()))
 
     def report(self, out: str | PathLike[str] | None = None) -> Path:
-        """Write the HTML report, into the run folder unless `out` names a file; where it is."""
+        """Write the HTML report, into the run folder unless `out` names a file. Returns its path."""
         from hil.report.page import FILE_NAME, write_report
         from hil.report.run_data import RunData
 
@@ -79,7 +79,7 @@ class Identification(SettledResult):
         """Write the arm or its recording as "urdf", "mjcf", "toml", "json", "csv", "parquet", "mcap" or "mat".
 
         Returns:
-            Where the file is, and what the format cannot represent, a sentence each.
+            The file's path, and one sentence per item that the format cannot represent.
 
         Raises:
             ExportError: the format cannot hold this arm, or a package for it is not installed.
@@ -96,7 +96,7 @@ class Estimation(ShootingResult):
     run: Path | None = field(default=None, metadata=_ON_FILE_ELSEWHERE)
 
     def plot(self) -> Any:
-        """The correlations of the parameters: which of them this motion can hardly tell apart. Raises MissingExtra."""
+        """The correlations of the parameters: which of them this motion hardly separates. Raises MissingExtra."""
         from hil.report.chart import Matrix
         from hil.report.png import draw_figures
         from hil.report.sections.correlation import correlations
@@ -111,7 +111,7 @@ class Estimation(ShootingResult):
 class Run:
     """A recorded run. samples: every sample taken (hil.runs.recording.sample_type); result: None before an estimate.
 
-    config: with the experiment that was really played. record: run.json. events: (time on the port's clock [s], what
+    config: with the experiment as it was actually played. record: run.json. events: (time on the port's clock [s], what
     happened). periods: by role, the settled periods as measured and as the model predicts them, after an estimate.
     """
 
@@ -176,7 +176,7 @@ def load_run(path: str | PathLike[str]) -> Run:
     Raises:
         RunFolderError: the folder holds no readable run.
         ResultError: its result.json is damaged, or from a newer hil.
-        ConfigError: its copy of the configuration is not valid any more.
+        ConfigError: its copy of the configuration is no longer valid.
     """
     run = RunFolder.open(Path(path))
     config = run.load_config()
@@ -192,7 +192,7 @@ def load_run(path: str | PathLike[str]) -> Run:
 
 
 def with_run(result: Result, run: Path) -> Identification | Estimation:
-    """The result, knowing where its run is."""
+    """The result, linked to its run."""
     if isinstance(result, SettledResult):
         return identification(result, run)
     assert isinstance(result, ShootingResult)
@@ -200,12 +200,12 @@ def with_run(result: Result, run: Path) -> Identification | Estimation:
 
 
 def identification(result: SettledResult, run: Path) -> Identification:
-    """A result that knows its run."""
+    """A result linked to its run."""
     return Identification(**_fields(result), run=run)
 
 
 def estimation(result: ShootingResult, run: Path | None) -> Estimation:
-    """The same of multiple shooting; without a run for recordings made elsewhere."""
+    """The same for multiple shooting; no run for recordings made elsewhere."""
     return Estimation(**_fields(result), run=run)
 
 

@@ -1,4 +1,4 @@
-"""The `hil` command: its subcommands in the order of its help, and what happens when one fails.
+"""The `hil` command: its subcommands in the order of its help, and its error handling.
 
 The modules imported here only say what a subcommand takes; those that do the work are imported inside it, so that
 `hil --help` answers at once.

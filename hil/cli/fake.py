@@ -1,4 +1,4 @@
-"""`hil fake`: a fake arm on a pseudo terminal until somebody ends it, or what a file's fake arm is made of."""
+"""`hil fake`: a fake arm on a pseudo-terminal until stopped, or a description of a file's fake arm."""
 
 import signal
 import sys
@@ -40,7 +40,7 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move limp joints of the fake arm that is served at `device`, or let go of them; raises ConfigError."""
+    """Move limp joints of the fake arm served at `device`, or release them; raises ConfigError."""
     try:
         for servo in release:
             ask_hand(device, f"release {servo}")

@@ -1,4 +1,4 @@
-"""The subcommands about fake arms: what they take. hil.cli.fake does the work, imported when it is asked to."""
+"""Arguments of the subcommands about fake arms. hil.cli.fake does the work and is imported on demand."""
 
 from pathlib import Path
 from typing import Annotated
@@ -39,7 +39,7 @@ def fake(
         typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="List the fault kinds and exit."),
     ] = False,
 ) -> None:
-    """Serve a fake arm to any program, in real time; without --pty, say what it is made of.
+    """Serve a fake arm to any program, in real time; without --pty, describe it.
 
     Arms by name: koch, viperx_300, open_manipulator_x, fake_two_link and the other fake arms that come with hil.
     """
@@ -59,7 +59,7 @@ def hand(
     ] = None,
     release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Release this servo's joint.")] = None,
 ) -> None:
-    """Move joints of a fake arm whose torque is off, as somebody does who calibrates an arm."""
+    """Move joints of a fake arm whose torque is off, as a person calibrating an arm does."""
     from hil.cli import fake as work
 
     work.move_by_hand(device, moves or [], release or [])

@@ -16,7 +16,7 @@ def init(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; accept every default.")] = False,
 ) -> None:
-    """Scan the bus, ask what it cannot tell, write a commented TOML file. Nothing is written to the servos."""
+    """Scan the bus, ask for the rest, write a commented TOML file. Nothing is written to the servos."""
     from hil.cli.terminal import Terminal
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port

@@ -71,7 +71,7 @@ def export(
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:
-    """Write the report of a run, into its folder unless told; where it is."""
+    """Write the report of a run, by default into its folder. Returns its path."""
     from hil.report import page
     from hil.report.run_data import RunData
 

@@ -69,7 +69,7 @@ def diff(
     ] = None,
     json_only: Json = False,
 ) -> None:
-    """What changed on an arm between two runs, and whether it is more than chance: is the gearbox wearing?"""
+    """What changed on an arm between two runs, and whether the change is significant: is the gearbox wearing?"""
     from hil.estimation.diff import diff_runs
 
     difference = diff_runs(before, after)

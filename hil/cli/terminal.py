@@ -1,4 +1,4 @@
-"""What a person sees while the arm moves: a progress bar with each joint's position and current. Quiet when asked."""
+"""What the user sees while the arm moves: a progress bar with each joint's position and current. Off with -q."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -46,7 +46,7 @@ class Terminal:
 
     @contextmanager
     def following(self, config: Path | None) -> Iterator[OnProgress]:
-        """Shows what a long call tells: a live view of the arm of `config` while it moves, else a spinner or a line."""
+        """Shows the progress of a long call: the arm of `config` while it moves, else a spinner or a line."""
         with ExitStack() as showing:
             watch: Watch | None = None
 
@@ -67,7 +67,7 @@ class Terminal:
 
     @contextmanager
     def scanning(self) -> Iterator[ScanWatch]:
-        """Servos as they answer, and on a terminal below them what is asked and how long it will take."""
+        """Shows servos as they answer and, on a terminal, the current baud rate and the time remaining."""
         if self.console.quiet:
             yield lambda _: None
             return

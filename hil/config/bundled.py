@@ -11,7 +11,7 @@ def bundled_configs() -> dict[str, Path]:
 
 
 def find_config(path: Path) -> Path:
-    """The file that a person means: `path` itself, or where it is a bare name and no file, the bundled one."""
+    """`path` itself or, if it is a bare name and not a file, the bundled file of that name."""
     is_name = path.name == str(path) and path.suffix == ""
     if not is_name or path.exists():
         return path

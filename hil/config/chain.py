@@ -1,4 +1,4 @@
-"""What a configuration of an arm in space must have, and what its URDF says of it."""
+"""Requirements on the configuration of a spatial arm, and the description from its URDF."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -94,7 +94,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
 
 
 def _changed(path: str) -> float:
-    """When the file was last written, so that a changed one is read anew."""
+    """The file's modification time, so that a changed file is read again."""
     try:
         return Path(path).stat().st_mtime
     except OSError:

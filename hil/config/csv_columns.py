@@ -1,6 +1,6 @@
 """What a recording made elsewhere needs beside its numbers: columns, units, and the arm's few facts.
 
-The same TOML as for an experiment will do, or a shorter one; tables that only the bus needs are not looked at.
+The same TOML as for an experiment will do, or a shorter one; tables that only the bus needs are ignored.
 
     [arm]
     gravity = 9.81
@@ -38,7 +38,7 @@ class _Table(BaseModel):
 
 
 class Columns(_Table):
-    """`[columns]`: which column is what, and in which unit."""
+    """`[columns]`: the meaning and unit of each column."""
 
     time: Column = "time"
     time_unit: Literal["s", "ms", "us"] = "s"
@@ -74,7 +74,7 @@ class Columns(_Table):
 
 
 class ArmFacts(BaseModel):
-    """`[arm]`, of which only gravity matters here."""
+    """`[arm]`, of which only gravity is used here."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 

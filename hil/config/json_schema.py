@@ -1,7 +1,7 @@
 """The JSON Schema of the TOML, from the models that check it: editors complete and check a file while it is typed.
 
 It says what a single value or table must be like. What values must agree on (a rest pose within the position limits, as
-many entries as joints) is found by `load_config` alone.
+many entries as joints) is checked only by `load_config`.
 """
 
 import json
@@ -50,7 +50,7 @@ def schema_text() -> str:
 
 
 def _without_null(value: Any) -> Any:
-    """TOML has no null: a key that may be None may only be left out."""
+    """TOML has no null: a key that may be None may only be omitted."""
     if isinstance(value, list):
         return [_without_null(each) for each in value]
     if not isinstance(value, dict):

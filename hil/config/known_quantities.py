@@ -1,4 +1,4 @@
-"""`[known]` in the TOML: lengths, masses and rotor inertias that somebody measured."""
+"""`[known]` in the TOML: lengths, masses and rotor inertias measured by the user."""
 
 from typing import Annotated, Self
 
@@ -20,7 +20,7 @@ Quantity = Annotated[float | Measured | None, Field(description="a number in SI 
 
 
 class KnownConfig(BaseModel):
-    """`[known]`: what a ruler, scales or a data sheet told. Each entry is a number or {value = .., std = ..}."""
+    """`[known]`: values from a ruler, scales or a data sheet. Each entry is a number or {value = .., std = ..}."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 

@@ -1,7 +1,7 @@
-"""Slips of unit: degrees for radians, millimetres for metres, mA for A. Such a file is valid, and dangerous.
+"""Unit mistakes: degrees for radians, millimetres for metres, mA for A. Such a file is valid, and dangerous.
 
-Every physical quantity is held against what a servo of that model could carry, generously: external gears, light
-plastic links and heavy test rigs pass; a factor that is a unit does not.
+Every physical quantity is compared, with a wide margin, with what a servo of that model could move: external gears,
+light plastic links and heavy test rigs pass; a factor due to a wrong unit does not.
 """
 
 import math
@@ -31,7 +31,7 @@ _LEVER_M = 0.05
 
 
 def implausible(config: "Config") -> Iterator[str]:
-    """One sentence for each quantity that looks like a slip of unit; nothing where all is well."""
+    """One sentence for each quantity that looks like a unit mistake; nothing if there is none."""
     for joint in config.joints:
         yield from _joint(joint)
     yield from _angles("arm.rest_pose", config.arm.rest_pose)
@@ -142,7 +142,7 @@ def _stall_torque(joint: "JointConfig") -> float:
 
 
 def _heaviest(stall_torque: float) -> float:
-    """kg that the servo could just hold at a very short lever."""
+    """Mass [kg] that the servo could just hold with a very short lever arm."""
     return stall_torque / (9.81 * _LEVER_M)
 
 

@@ -188,7 +188,7 @@ class JointConfig(_Table):
 
 
 class PriorConfig(_Table):
-    """`[arm.prior]`: best guesses before any identification; one value per joint. What is left out is guessed roughly
+    """`[arm.prior]`: best guesses before any identification; one value per joint. Missing values are guessed roughly
     from link lengths and servo models (hil.dry_run.prior), with `rough_spread` in place of `spread`.
     """
 
@@ -206,7 +206,7 @@ class PriorConfig(_Table):
 
 
 class ArmConfig(_Table):
-    """`[arm]`: what is known of the mechanism."""
+    """`[arm]`: what is known about the mechanism."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     urdf: str | None = Field(
@@ -279,7 +279,7 @@ class ExperimentConfig(_Table):
 
 
 class PathConfig(_Table):
-    """`[joint_path]`: of an arm in space, the path that excites it; band's upper end is its highest frequency."""
+    """`[joint_path]`: the path that excites a spatial arm; band's upper end is its highest frequency."""
 
     centre: list[float] = Field(description="rad per joint: centre of the path")
     swing: list[PositiveFloat] = Field(description="rad per joint: amplitude around the centre")
@@ -287,7 +287,7 @@ class PathConfig(_Table):
 
 
 class ModelConfig(_Table):
-    """`[model]`: what the estimator may explain the motion with."""
+    """`[model]`: the model terms that the estimator may use."""
 
     friction: Literal["auto"] | Friction = Field(
         "auto", description='"auto" also tries every term below and keeps those that the data support'
@@ -305,7 +305,7 @@ class ModelConfig(_Table):
 
     @property
     def fixed_friction(self) -> Friction:
-        """What fits that make no choice take: "stribeck" where the file says "auto"."""
+        """The model for fits without model selection: "stribeck" where the file says "auto"."""
         return "stribeck" if self.friction == "auto" else self.friction
 
     @model_validator(mode="after")
@@ -319,7 +319,7 @@ class ModelConfig(_Table):
 
 
 class SafetyConfig(_Table):
-    """`[safety]`: what stops the arm, beside the joints' own limits, and how."""
+    """`[safety]`: what stops the arm besides the joint limits, and how."""
 
     watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s without packets after which a servo stops by itself")
     allow_no_watchdog: bool = Field(
@@ -374,7 +374,7 @@ class StabiliserConfig(_Table):
 
 
 class Config(_Table):
-    """The whole file. `path` is where it was read from."""
+    """The whole file. `path` is the file it was read from."""
 
     path: Path = Field(exclude=True)
     port: PortConfig
@@ -392,7 +392,7 @@ class Config(_Table):
     @model_validator(mode="before")
     @classmethod
     def _usual_voltage(cls, values: Any) -> Any:
-        """Where no min_voltage is given: that of the model that takes least. 0 V is no supply for any of them."""
+        """Where no min_voltage is given: the lowest of the models' minimum voltages."""
         if not isinstance(values, dict) or not isinstance(values.get("safety", {}), dict):
             return values
         joints = values.get("joints")

@@ -10,8 +10,9 @@ Array = NDArray[np.float64]
 
 
 class ArmFileError(ValueError):
-    """A description of an arm cannot be read or is none of a serial arm. The message names file, element and what is
-    due."""
+    """A description of an arm cannot be read or does not describe a serial arm. The message names the file, the element
+    and what is
+    required."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,11 @@ class Body:
         return cls(0.0, np.zeros(3), np.zeros((3, 3)))
 
     def moved(self, rotation: Array, translation: Array) -> "Body":
-        """As seen from a frame in which its own frame is turned and shifted so."""
+        """Expressed in a frame in which its own frame has this rotation and translation."""
         return Body(self.mass, rotation @ self.centre + translation, rotation @ self.inertia @ rotation.T)
 
     def joined(self, other: "Body") -> "Body":
-        """One body of both, which are given in the same frame."""
+        """The two bodies, given in the same frame, as one."""
         mass = self.mass + other.mass
         if mass == 0.0:
             return Body(0.0, self.centre, self.inertia + other.inertia)
@@ -94,7 +95,7 @@ class ArmDescription:
     held: tuple[str, ...]
     """Movable joints that are not among the arm's, such as a gripper's: taken as held at zero."""
     doubts: tuple[str, ...]
-    """In words: what is odd about its inertias."""
+    """In words: what is implausible about its inertias."""
 
     @property
     def parameters(self) -> Array:

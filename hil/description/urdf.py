@@ -1,4 +1,4 @@
-"""URDF files: the branch of a tree that the arm's joints make up, with what is fixed to it merged into its links.
+"""URDF files: the branch of the tree formed by the arm's joints, with everything fixed to it merged into its links.
 
 Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are not opened.
 """
@@ -36,8 +36,8 @@ class _Joint:
 def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
     """The arm of these joints, from the base outwards; of all that turn if none are named.
 
-    Raises ArmFileError for what is no URDF of a serial arm: loops, joints that are not there, not in line or slide,
-    mimic joints among them, links without mass, axes that are not of length 1, units that are not SI.
+    Raises ArmFileError for anything that is not a URDF of a serial arm: loops, joints that are not there, not in line
+    or slide, mimic joints among them, links without mass, axes that are not of length 1, units that are not SI.
     """
     root = parse_urdf(path)
     bodies, physical = _links(root, path)
@@ -196,7 +196,7 @@ def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
 
 
 def _turns(joint: _Joint, tree: dict[str, _Joint]) -> bool:
-    """Whether it or something beyond it turns."""
+    """Whether this joint or one beyond it rotates."""
     if joint.kind in TURNING:
         return True
     return any(_turns(other, tree) for other in tree.values() if other.parent == joint.child and other.mimics is None)
@@ -252,7 +252,7 @@ def _way_to(tree: dict[str, _Joint], base: str, name: str, path: Path) -> list[_
 def _rigid(
     link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str], on_branch: set[str]
 ) -> tuple[Body, list[str], list[str]]:
-    """A link with all that does not move against it, the names of what that is, and of movable joints held."""
+    """A link merged with everything fixed to it, the names of the merged links, and of movable joints held fixed."""
     body, fixed, held = bodies[link], [], []
     for joint in tree.values():
         if joint.parent != link or joint.name in chosen:

@@ -34,7 +34,7 @@ _TORQUE_SHARE = 0.97
 
 @dataclass(frozen=True)
 class Amplitude:
-    """A safe amplitude: the plan, its peak torque (joints,) [N m], and what the dry run foresees of it."""
+    """A safe amplitude: the plan, its peak torque (joints,) [N m], and the dry run's prediction for it."""
 
     plan: Plan
     peak_torque: Array
@@ -49,7 +49,8 @@ def largest_amplitude(
     pose: Array | None = None,
     cap: Array | None = None,
 ) -> Amplitude:
-    """Scale each joint's torque until its peaks reach `share` of the limits but for safety.limit_chance of the arms.
+    """Scale each joint's torque until its peaks reach `share` of the limits, except in a fraction safety.limit_chance
+    of the arms.
 
     plan: its waves are scaled; by default low-crest multisines. pose: where the arm starts (joints,) [rad]. cap: the
     most torque (joints,) [N m], beside what the current limits allow. Raises NoSafeTorque when not even a small torque
@@ -79,7 +80,7 @@ def with_peaks(config: Config, peak_torque: Array) -> Plan:
 
 
 def _search(config: Config, base: Plan, ensemble: Ensemble, share: float, pose: Array | None, most: Array) -> Array:
-    """Joint by joint towards the limits; the joints pull at each other, so it takes some rounds."""
+    """Approach the limits joint by joint; the joints are coupled, so this takes several rounds."""
     torque = base.segments[0].peak_torque
     first = base.first_segment() if ensemble.source == "prior" else base
 
@@ -103,7 +104,7 @@ def _search(config: Config, base: Plan, ensemble: Ensemble, share: float, pose: 
 
 
 def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array) -> Array:
-    """Raise the joint that uses least of its limits, a little at a time, while all stay within."""
+    """Raise the joint that uses least of its limits in small steps while all stay within theirs."""
     reached = reached_with(torque)
     blocked = np.zeros(torque.size, dtype=bool)
     for _ in range(_LAST_ROUNDS):

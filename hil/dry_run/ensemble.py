@@ -1,4 +1,4 @@
-"""Arms that could be the one on the bench: drawn from a prior, or from a former result with its covariance."""
+"""Arms that could be the one on the bench: drawn from a prior, or from an earlier result with its covariance."""
 
 from dataclasses import dataclass
 
@@ -28,8 +28,8 @@ _MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2)
 class Ensemble:
     """Number of arms to simulate.
 
-    torque_scale: what a commanded torque really is, (arms, joints): the torque constant is a guess too. A result's
-    parameters are in units of the commanded torque, so there it is 1.
+    torque_scale: ratio of actual to commanded torque (arms, joints), since the torque constant is a guess too. A
+    result's parameters are in units of the commanded torque, so there it is 1.
     """
 
     physics: tuple[Physics, ...]
@@ -53,7 +53,7 @@ def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
 
 
 def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
-    """True over supposed torque constants (count, joints)."""
+    """Ratios of true to assumed torque constants (count, joints)."""
     random = np.random.default_rng((seed, 6))
     spread = np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
     drawn: Array = np.exp(np.sqrt(np.log1p(spread**2)) * random.standard_normal((count, len(config.joints))))
@@ -61,7 +61,7 @@ def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
 
 
 def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
-    """From a result, its covariance widened by what the residual says the model lacks.
+    """From a result, its covariance widened by the model error that the residual indicates.
 
     farther: range of motion that will be simulated over the range that the result was identified on.
     """
@@ -96,7 +96,7 @@ def nominal(result: Result) -> Physics:
 
 
 def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, float]:
-    """A draw moved into the range of real arms."""
+    """A draw moved into the physically possible range."""
     for name, value in drawn.items():
         if term_of(name).range in {"positive", "floor"}:
             centre = abs(known[name])

@@ -1,8 +1,8 @@
-"""The experiment simulated on an ensemble of arms: what will be reached, against each limit.
+"""The experiment simulated on an ensemble of arms: the predicted peaks compared with each limit.
 
-Every arm of the ensemble gets the very goal currents of the plan, rounded to the servos' ticks, ramps included, through
-lag and stabiliser, for as many periods as it takes to settle. Peaks are compared as shares of the way to their limit;
-an arm with any share of 1 or more is one that the guard would have stopped.
+Every arm of the ensemble gets exactly the goal currents of the plan, rounded to the servos' ticks, ramps included,
+through lag and stabiliser, for as many periods as settling takes. Peaks are expressed as fractions of the distance to
+their limit; an arm with any fraction of 1 or more is one that the guard would have stopped.
 """
 
 from dataclasses import dataclass
@@ -33,11 +33,12 @@ _LEAST_SPREAD = 2e-3
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a dry run foresees.
+    """The prediction of a dry run.
 
-    values: extreme values of every arm (arms, quantities, joints), in QUANTITIES and UNITS. shares: the same as shares
-    of the way from rest to the limit. limits: (quantities, joints). settled_after: periods, per arm, 0 where it is more
-    than max_settling_periods. shown: positions over time of a few arms (arms, joints, samples) [rad], then NaN.
+    values: extreme values of every arm (arms, quantities, joints), in QUANTITIES and UNITS. shares: the same as
+    fractions of the distance from rest to the limit. limits: (quantities, joints). settled_after: periods, per arm, 0
+    where it is more than max_settling_periods. shown: positions over time of a few arms (arms, joints, samples) [rad],
+    then NaN.
     """
 
     values: Array
@@ -56,7 +57,7 @@ class Prediction:
 
     @property
     def quantile(self) -> Array:
-        """Values that all peaks of an arm together stay within, in 99 of 100 arms (quantities, joints).
+        """Bounds that all peaks of an arm respect together in 99 of 100 arms (quantities, joints).
 
         One common number of deviations above the medians, so that it moves smoothly with the amplitude.
         """
@@ -66,7 +67,7 @@ class Prediction:
 
     @property
     def stop_chance(self) -> float:
-        """Chance that the guard stops the run: counted, or by the tail of the peaks, whichever is more."""
+        """Chance that the guard stops the run: the observed or the tail-estimated one, whichever is larger."""
         counted = float(np.mean((self.shares[:, :GUARDED] >= 1).any(axis=(1, 2))))
         return max(counted, min(1.0, float(self.limit_chance[:GUARDED].sum())))
 
@@ -83,7 +84,7 @@ class Prediction:
 
     @property
     def origin(self) -> Array:
-        """From where the way to a limit counts (quantities, joints)."""
+        """The points from which distances to the limits are measured (quantities, joints)."""
         origin = np.zeros_like(self.limits)
         origin[0] = origin[1] = self.rest
         return origin
@@ -113,8 +114,8 @@ def predict(
 ) -> Prediction:
     """Simulate `plan` on every arm of the ensemble.
 
-    pose: where the arm starts, at rest (joints,) [rad]; the rest pose unless given. briefly: one period of each
-    multisine only, for a search. shown: of how many arms the motion is kept.
+    pose: where the arm starts, at rest (joints,) [rad]; the rest pose unless given. briefly: only one period of
+    each multisine, for a search. shown: number of arms whose motion is kept.
     """
     commands = [commands_of(config, segment) for segment in plan.segments]
     start = np.array(config.arm.rest_pose) if pose is None else pose
@@ -174,12 +175,12 @@ def peaks_of(config: Config, position: Array, velocity: Array, current: Array) -
 
 
 def scaled_feedback(feedback: Feedback, scale: Array) -> Feedback:
-    """As an arm feels it whose torque constants are `scale` (joints,) times what was believed."""
+    """The feedback acting on an arm whose torque constants are `scale` (joints,) times the assumed ones."""
     return Feedback(feedback.stiffness * scale, feedback.damping * scale, feedback.pose, feedback.limit * scale)
 
 
 def _side_by_side(positions: list[Array]) -> Array:
-    """Positions (joints, samples) of arms that took different times, NaN after the end (arms, joints, samples)."""
+    """Positions (joints, samples) of runs of different lengths, padded with NaN (arms, joints, samples)."""
     if not positions:
         return np.empty((0, 0, 0), dtype=np.float32)
     longest = max(position.shape[1] for position in positions)

@@ -1,7 +1,7 @@
 """What is known of an arm before anything was identified: masses, lengths and friction, each with its spread.
 
-`[arm.prior]` gives what its author knows. The rest is guessed from link lengths by rules of thumb (below), which have
-no better source than a look at a few arms, and from the servo models (hil.drivers.servo_prior): both spread widely.
+`[arm.prior]` gives what its author knows. The rest is guessed from link lengths by rules of thumb (below), based only
+on a few arms, and from the servo models (hil.drivers.servo_prior): both have a wide spread.
 """
 
 from dataclasses import dataclass
@@ -103,9 +103,9 @@ def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
 
 
 def _generated(config: Config) -> Array:
-    """What turning motors take from the torque of an applied voltage, as viscous friction (joints,) [N m s/rad].
+    """Back-EMF at a given voltage, expressed as viscous friction (joints,) [N m s/rad].
 
-    A motor generates as many V s/rad as it gives N m/A before the gears' losses. Under current control: nothing.
+    The back-EMF constant [V s/rad] equals the torque constant [N m/A] before gear losses. Zero under current control.
     """
     emf = np.array([joint.joint.servo.torque_per_ampere.value / _GEAR_EFFICIENCY for joint in config.joints])
     per_volt = [joint.torque_per_goal if joint.drive_mode is Mode.PWM else 0.0 for joint in config.joints]

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Motion:
-    """What the arm did (joints, samples) [rad, rad/s, N m], and after how many periods of the first multisine it was
-    settled: 0 where it never was, which ends the experiment.
+    """What the arm did (joints, samples) [rad, rad/s, N m], and the number of periods of the first multisine until
+    it settled: 0 if it never did, which ends the experiment.
     """
 
     position: Array
@@ -29,7 +29,7 @@ class Motion:
 
 
 def commands_of(config: Config, segment: Segment) -> Commands:
-    """What is sent to the servos: goals in whole ticks, times the supposed torque constants."""
+    """The torques sent to the servos: goals rounded to ticks, times the assumed torque constants."""
     constant = np.array([joint.torque_per_goal for joint in config.joints])
     tick = np.array(
         [abs(joint.joint.drive_unit(12.0 if joint.joint.mode is Mode.PWM else 0.0)) for joint in config.joints]
@@ -44,10 +44,10 @@ def commands_of(config: Config, segment: Segment) -> Commands:
 def simulate_experiment(
     plan: Plan, commands: list[Commands], physics: Physics, scale: Array, feedback: Feedback, pose: Array
 ) -> Motion:
-    """All multisines, from rest in `pose` (joints,) [rad]. scale: true over supposed torque constant (joints,).
+    """All multisines, from rest in `pose` (joints,) [rad]. scale: ratio of true to assumed torque constants (joints,).
 
-    As on the bus, the periods of a multisine go on until one is like the one before; an arm that has not settled after
-    plan.max_settling_periods plays nothing more.
+    As on the bus, the periods of a multisine repeat until one matches the previous one; an arm that has not settled
+    after plan.max_settling_periods ends there.
     """
     arm = _Arm(plan, physics, scale, feedback, pose)
     settled_after = [arm.play_segment(each) for each in commands[:1]]
@@ -62,7 +62,7 @@ def simulate_experiment(
 
 
 class _Arm:
-    """The arm while it plays; what it did so far in `parts`."""
+    """The simulated arm during the experiment; `parts` holds its motion so far."""
 
     def __init__(self, plan: Plan, physics: Physics, scale: Array, feedback: Feedback, pose: Array) -> None:
         self._plan, self._physics, self._scale, self._feedback = plan, physics, scale[:, None], feedback
@@ -70,7 +70,7 @@ class _Arm:
         self.parts: list[Response] = []
 
     def play_segment(self, commands: Commands) -> int:
-        """Ramps and periods; after how many periods it was settled, 0 if never."""
+        """Play ramps and periods. Returns the number of periods until it settled, 0 if it never did."""
         self._play(commands.ramp_in)
         settled_after = self._settle(commands.period)
         if settled_after:

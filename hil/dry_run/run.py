@@ -20,7 +20,7 @@ SHOWN = 30
 
 
 def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos: bool = False) -> DryRun:
-    """Simulate the configured experiment. result: run folder or result.json of a former identification.
+    """Simulate the configured experiment. result: run folder or result.json of an earlier identification.
 
     Raises ConfigError, ResultError, RunFolderError, ExperimentError; with `servos`, DriverError.
     """
@@ -37,5 +37,5 @@ def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos
 
 
 def ensemble_of(config: Config, result: Path | None, arms: int) -> Ensemble:
-    """From the prior, or from a former result."""
+    """From the prior, or from an earlier result."""
     return prior_ensemble(config, arms) if result is None else result_ensemble(read_result(result), arms)

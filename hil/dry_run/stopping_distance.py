@@ -1,4 +1,4 @@
-"""How far beyond its position limits an arm goes when it is stopped, by each way in which a stop may come about.
+"""How far beyond its position limits an arm goes when it is stopped, for each kind of stop.
 
 The stop itself is simulated, gravity, friction and the joints' pull at each other included, on arms of an ensemble:
 
@@ -63,7 +63,7 @@ class Way(StrEnum):
 
 @dataclass(frozen=True)
 class Stopping:
-    """Largest way beyond a position limit over arms and starts, by the way of the stop, (joints,) [rad] each."""
+    """Largest overshoot beyond a position limit over arms and initial states, by kind of stop, (joints,) [rad] each."""
 
     planned: dict[Way, Array]
     passed: dict[Way, Array]
@@ -71,9 +71,9 @@ class Stopping:
 
 @dataclass(frozen=True)
 class _Start:
-    """state: as `respond` takes it (5 or 6, joints). goal: torque that the former goals command (joints,) [N m].
+    """state: as `respond` takes it (5 or 6, joints). goal: torque commanded by the previous goals (joints,) [N m].
 
-    jammed: a joint that something holds fast.
+    jammed: a joint that is blocked.
     """
 
     state: Array
@@ -127,7 +127,7 @@ def beyond_when_passed(
 def _farthest(
     stops: "_Stops", ways: Mapping[Way, _Commands], ensemble: Ensemble, starts: Callable[[Physics, Array], list[_Start]]
 ) -> dict[Way, Array]:
-    """The farthest over a few arms and their starts."""
+    """The largest overshoot over a few arms and their initial states."""
     few = ensemble.first(_ARMS)
 
     def one(arm: int) -> list[Array]:
@@ -209,7 +209,7 @@ def _moving(pose: Array, velocity: Array) -> Array:
 
 
 def _handed_on(physics: Physics, pose: Array, joint: int, outward: float, velocity: Array) -> Array:
-    """The velocities after the other joint has jammed: what it had is handed on to this one, at once."""
+    """The velocities after the other joint has jammed: its momentum is transferred to this one instantly."""
     p = dict(zip(CONSTANTS, physics.vector.tolist(), strict=True))
     across = p["coupling"] * float(np.cos(pose[1]))
     shared = p["inertia_2"] + across
@@ -220,7 +220,7 @@ def _handed_on(physics: Physics, pose: Array, joint: int, outward: float, veloci
 
 
 def _held(physics: Physics, joint: int) -> Physics:
-    """The arm with a joint that nothing moves: its rotor alone is given an inertia without end."""
+    """The arm with a joint that nothing moves: only its rotor gets an infinite inertia."""
     vector = physics.vector.copy()
     vector[CONSTANTS.index(("inertia_1", "armature_2")[joint])] += _IMMOVABLE
     return Physics(vector, physics.delay, physics.lag)
@@ -245,7 +245,7 @@ class _Stops:
         self._missed_for = math.ceil(missing_limit(config).seconds * rate) + _REACTION
 
     def farthest(self, physics: Physics, scale: Array, starts: list[_Start], commands: _Commands) -> Array:
-        """The largest way beyond a limit (joints,) [rad]."""
+        """The largest overshoot beyond a limit (joints,) [rad]."""
         reached = np.zeros_like(scale)
         for start in starts:
             arm = physics if start.jammed is None else _held(physics, start.jammed)

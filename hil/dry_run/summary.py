@@ -17,7 +17,7 @@ from hil.dry_run.stopping_distance import Stopping, Way
 
 @dataclass(frozen=True)
 class DryRun:
-    """asked: of experiment.peak_torque, where given. largest: of the largest safe torque. servos: what they said."""
+    """asked: for experiment.peak_torque, if given. largest: for the largest safe torque. servos: what was read."""
 
     source: str
     arms: int
@@ -136,7 +136,7 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
 
 
 def _percent(chance: float) -> str:
-    """Below a millionth of a percent the tail of a few hundred arms says nothing any more."""
+    """A percentage; below a millionth of a percent the tail of a few hundred arms is meaningless."""
     return "0 %" if chance < 1e-8 else f"{100 * chance:.2g} %"
 
 

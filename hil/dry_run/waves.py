@@ -1,4 +1,4 @@
-"""Which waves a full run plays: low-crest ones that use the room between the limits well, or designed ones."""
+"""Which waves a full run plays: low-crest ones that use the range well, or optimally designed ones."""
 
 from dataclasses import replace
 from itertools import product
@@ -21,8 +21,8 @@ _EVERY = 4  # samples looked at
 def roomy_plan(config: Config, physics: Physics) -> Plan:
     """The configuration's plan, each multisine played the way that uses most of the position range on `physics`.
 
-    How evenly an arm swings to both sides depends on the phases. Turned round in sign or in time, a wave is another one
-    with the same lines and peaks, and costs no design.
+    How evenly an arm swings to both sides depends on the phases. Reversing sign or time gives another wave with
+    the same lines and peaks at no design cost.
     """
     problem = design_problem(config, physics, ())
     plan = with_peaks(config, _torque_limits(config))

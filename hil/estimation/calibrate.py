@@ -23,7 +23,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class TorqueConstant:
-    """Found and supposed torque per goal of one joint, in `unit`: N m/A, or N m/V in pwm mode."""
+    """Identified and assumed torque per goal of one joint, in `unit`: N m/A, or N m/V in pwm mode."""
 
     value: float
     std: Spread
@@ -52,7 +52,7 @@ class CalibrationFit:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """What `hil calibrate` found, per joint by name, with the arm's parameters on the way."""
+    """What `hil calibrate` found, per joint by name, and the arm's parameters estimated along with it."""
 
     schema: int
     torque_per_goal: Mapping[str, TorqueConstant]

@@ -1,4 +1,4 @@
-"""From the run folder of an arm in space to its result: both stages, and the check on a path that was not used."""
+"""From the run folder of an arm in space to its result: both stages, and validation on a held-out path."""
 
 import time
 from pathlib import Path
@@ -125,7 +125,7 @@ def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quan
 def _verdict(
     config: Config, estimate: ChainEstimate, known: KnownChain, held_out: NDArray[np.float64] | None
 ) -> Verdict:
-    """Whether to trust it, the base parameter of which the recording shows least, and why."""
+    """Whether to trust it, the least well identified base parameter, and why."""
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]

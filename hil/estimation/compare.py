@@ -33,7 +33,7 @@ OURS_PLAIN = "hil_coulomb"
 class MethodResult:
     """One method's entry of compare.json: parameters and standard errors by name [SI], how long it took [s].
 
-    settings_tried: how many settings were tried, the best of which is shown. worst_relative_error: on a fake arm, of
+    settings_tried: how many settings were tried, of which the best is reported. worst_relative_error: on a fake arm, of
     inertias, gravity and friction. held_out_rms: free prediction of the other multisine over its motion, worst joint;
     None where the simulation under these parameters does not settle, or no other multisine was played.
     """
@@ -94,7 +94,7 @@ def all_methods(
 
 
 def link_length(config: Config) -> float | None:
-    """Of link 1 [m]: as the fake arm has it or [known] says; None when nobody knows."""
+    """Of link 1 [m]: as the fake arm has it or [known] says; None if unknown."""
     if config.known is not None and config.known.length_1 is not None:
         return config.known.quantities()["length_1"].value
     if config.is_fake and config.fake is not None and config.fake.arm is not None:

@@ -1,4 +1,4 @@
-"""A settled period as it would have been on time: what the computer's lateness did to it is taken back.
+"""A settled period as it would have been on time: the effect of the computer's lateness is corrected.
 
 Every goal leaves a little after its deadline, and the positions that answer it are as late. The estimator's grid is
 that of the deadlines. So each angle is moved by velocity times lateness, and each held torque becomes the mean of what

@@ -1,4 +1,4 @@
-"""What of an estimate cannot be, or contradicts what the configuration says of the arm: checks that cost nothing."""
+"""Cheap plausibility checks: values that are impossible or contradict the configuration."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ RATIO = 0.35  # from 1: torque constants differ by less
 
 
 def doubts(config: Config, estimate: Estimate, largest_torque: float) -> tuple[str, ...]:
-    """One sentence for each thing that does not agree. largest_torque: that was commanded [N m]."""
+    """One sentence per contradiction. largest_torque: the largest commanded torque [N m]."""
     found = [*_length(config, estimate), *_weight(config, estimate, largest_torque), *_constants(estimate)]
     return tuple(found)
 

@@ -63,7 +63,7 @@ def make_result(
 
 
 def arm_facts(config: Config) -> ArmFacts:
-    """What of the configuration a model needs to be used."""
+    """The part of the configuration that a model needs."""
     joints = tuple(
         JointFacts(
             name=joint.name,

@@ -1,4 +1,4 @@
-"""What the checks of an estimate found, as a result keeps it."""
+"""The findings of an estimate's checks, as stored in a result."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ def describe_verdict(judged: verdict.Verdict) -> Verdict:
 
 
 def describe_choice(choice: settled.Choice) -> ModelChoice:
-    """Which friction model was chosen of which, and what that gained and cost."""
+    """Which friction model was chosen of which, and its gain and cost."""
     return ModelChoice(
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,
@@ -73,7 +73,7 @@ def describe_choice(choice: settled.Choice) -> ModelChoice:
 
 
 def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
-    """The same for any data, judged by segments that were left out of the fit."""
+    """The same for unsettled data, judged on held-out segments."""
     return ModelChoice(
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,

@@ -1,4 +1,4 @@
-"""From a run folder to its result: settled period, both stages, the check on a multisine that was not used."""
+"""From a run folder to its result: settled period, both stages, and validation on a held-out multisine."""
 
 import logging
 import time

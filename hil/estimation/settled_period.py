@@ -101,5 +101,5 @@ def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
 
 
 def _drifting(position: NDArray[np.float64], within: float, wanted: int) -> int | None:
-    """The first of the last `wanted` periods, where all that is left of the settling is slow."""
+    """The first of the last `wanted` periods, where only slow drift remains."""
     return len(position) - wanted if settling_difference(position[-2], position[-1]) <= within else None

@@ -1,4 +1,4 @@
-"""What looks wrong in a recording but does not stop the estimation: said, with the joint and what to change."""
+"""Warnings about a recording that do not stop the estimation, each with the joint and the remedy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ LOST = 0.01  # of the samples
 
 
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
-    """One sentence for each thing."""
+    """One sentence per warning."""
     found = clipping_warnings(config, samples[samples["phase"] == Phase.PERIODIC])
     for index, joint in enumerate(config.joints):
         swing = float(np.nanmax(period.position[index]) - np.nanmin(period.position[index]))
@@ -37,7 +37,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
 
 
 def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
-    """Of joints that got less current than they were told."""
+    """Joints that got less current than commanded."""
     return [
         said
         for index, joint in enumerate(config.joints)
@@ -47,7 +47,7 @@ def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
 
 
 def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]) -> list[str]:
-    """Where a motor gets less current than it was told: its supply sags, or its own current limit is lower."""
+    """Where a motor gets less current than commanded: its supply sags, or its own current limit is lower."""
     # A lagging current loop is behind where the goal moves, not where it stays.
     large = (np.abs(goal) > LARGE * np.abs(goal).max()) & np.isfinite(measured)
     if not large.any():

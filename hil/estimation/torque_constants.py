@@ -1,4 +1,4 @@
-"""What the joints' torque constants leave open in a result, in sentences for terminal and report."""
+"""The uncertainty that the torque constants leave in a result, in sentences for terminal and report."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -52,7 +52,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
 
 
 def by_voltage_said(joints: Sequence[JointConfig]) -> str:
-    """What viscous friction holds where the joints are driven by voltage; empty where they are not."""
+    """What viscous friction includes for joints driven by voltage; empty otherwise."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
     return "Driven by voltage: the viscous friction includes the motor's back-EMF."

@@ -9,10 +9,10 @@ from hil.fakes.servo.registers import load_model
 
 
 def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] | None:
-    """The base parameters by name [SI]; None on a real arm, empty for a plant that says nothing of its own.
+    """The base parameters by name [SI]; None on a real arm, empty for a plant that does not state them.
 
     time: since the arm was switched on [s], for drives whose friction changes as they warm up. A joint driven by
-    voltage is braked by what its motor generates; that is part of its viscous friction.
+    voltage is braked by its back-EMF, which counts as viscous friction.
     """
     fake = config.fake
     if not config.is_fake or fake is None:

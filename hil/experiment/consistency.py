@@ -1,4 +1,4 @@
-"""Whether a joint's position and velocity tell of the same motion, on every sample.
+"""Whether a joint's position and velocity agree, on every sample.
 
 An encoder whose value freezes still answers, and a velocity that stays at zero is within every limit. But the two are
 measured together: what the velocity adds up to must be how far the position went. The difference of the two,
@@ -33,7 +33,7 @@ class Consistency:
         self._highest = self._lowest = 0.0
 
     def look(self, position: float, velocity: float, seconds: float) -> bool:
-        """The latest sample, `seconds` after the one before it; whether it contradicts itself."""
+        """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent."""
         former, self._position = self._position, position
         before, self._velocity = self._velocity, velocity
         if former is None:
@@ -53,5 +53,5 @@ class Consistency:
         return not -allowed <= self._apart <= allowed
 
     def lost(self) -> None:
-        """A reply is missing: begin anew with the next one."""
+        """A reply is missing: restart with the next one."""
         self._position = None

@@ -1,4 +1,4 @@
-"""Whether a motor carries what it is told to: seen from the current (or voltage) that each reply holds.
+"""Whether a motor carries the commanded current: judged by the current (or voltage) that each reply holds.
 
 A servo may have lost its torque in the middle of a run: rebooted, stopped by its watchdog, switched off by another
 program. Then its current is zero, whatever is commanded. How much current that takes from it depends on what is
@@ -36,7 +36,7 @@ _FEWEST = 2
 
 
 class Unfollowed(NamedTuple):
-    """A motor that does not carry what is commanded [A or V], for how long [s]."""
+    """A motor that does not carry the commanded value [A or V], for how long [s]."""
 
     goal: float
     carried: float

@@ -1,9 +1,9 @@
-"""Looks at every sample and stops the arm when a limit is passed or an answer makes no sense.
+"""Checks every sample and stops the arm when a limit is passed or a reply is inconsistent.
 
-Two joints cost a few us a sample: plain floats, one pass over the joints, everything known beforehand worked out once.
-What needs more than one sample is kept by modules of their own: `following` (does the motor carry what it is told),
-`consistency` (do position and velocity tell of the same motion), `status_check` (what servos tell of themselves in
-turn), `silence` (time without replies or commands).
+Two joints cost a few us a sample: plain floats, one pass over the joints, everything known beforehand computed once.
+What needs more than one sample is kept by modules of their own: `following` (does the motor carry the commanded
+current), `consistency` (do position and velocity agree), `status_check` (slow status
+registers), `silence` (time without replies or commands).
 """
 
 from collections.abc import Sequence
@@ -66,8 +66,8 @@ class Guard:
 
     planned: largest goal that the plan has for each joint [A, or V under PWM]; from the configuration where not given.
 
-    passive: whether the arm can give out no more work than was put in; True for an arm that starts from a stable rest
-    without stabiliser. Then motors that take work out of it all the time turn the wrong way.
+    passive: whether the arm cannot return more work than was put in; True for an arm that starts at stable rest
+    without a stabiliser. Motors that continually take work out of it then turn the wrong way.
     """
 
     def __init__(self, config: Config, planned: Sequence[float] | None = None) -> None:
@@ -141,7 +141,7 @@ class Guard:
         )
 
     def _judge_rate(self) -> None:
-        """Deadlines missed now and then add up where more than a share of them is; a single stall does not."""
+        """Stop if more than a certain share of deadlines is missed; a single stall does not count."""
         self._often_late = max(0.0, self._often_late - LATE_SHARE)
         if self._often_late >= max(_OFTEN_LATE, 0.5 * self._late_limit.seconds / self._interval):
             raise SafetyStop(
@@ -152,7 +152,7 @@ class Guard:
             )
 
     def look(self, state: State, watchdog_gap: float = 0.0) -> None:
-        """Raise SafetyStop when a limit is passed or an answer makes no sense.
+        """Raise SafetyStop when a limit is passed or a reply is inconsistent.
 
         watchdog_gap: s since the exchange before this one.
         """
@@ -335,7 +335,7 @@ class Guard:
                 )
 
     def _acted(self, seconds: float) -> str:
-        """What the servos did meanwhile."""
+        """What the servos' watchdogs did meanwhile."""
         watchdog = self._safety.watchdog
         if seconds < watchdog:
             return ""
@@ -351,12 +351,12 @@ def _told(seconds: float) -> str:
 
 
 def _measures_supply(joint: JointConfig) -> bool:
-    """Whether the measured current is not the motor's: then the motion and the servo's status must tell."""
+    """Whether the measured current is the supply's, not the motor's: then judge only motion and status."""
     return joint.drive_mode is Mode.CURRENT and joint.joint.servo.senses_supply
 
 
 def _planned(config: Config) -> list[float]:
-    """Largest goals that the configuration asks for [A or V]; where it leaves them open, the limits."""
+    """Largest goals that the configuration asks for [A or V]; where it leaves them open, the current limits."""
     peaks = config.experiment.peak_torque
     if peaks is None:
         return [joint.goal_limit for joint in config.joints]

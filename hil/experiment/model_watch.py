@@ -1,9 +1,9 @@
-"""The dry run's model beside the experiment: is the motion one that any arm like this could make?
+"""The dry run's model beside the experiment: is the motion consistent with any arm in the ensemble?
 
-What is known before the run is what the dry run knows: an ensemble of arms, from `[arm.prior]` or from a former result.
-Its mean and covariance, made wider, are where `hil.estimator.models.momentum_observer` begins. Without link lengths,
-with which no dry run is possible either, nothing is known but the torque that shall move the arm: then the first motion
-teaches the model, and only what comes after it is judged.
+Prior knowledge is that of the dry run: an ensemble of arms, from `[arm.prior]` or from an earlier
+result. Its mean and widened covariance are where `hil.estimator.models.momentum_observer` begins. Without
+link lengths (a dry run is then impossible too) only the required torque is known: the first
+motion trains the model, and only later motion is judged.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,8 @@ _STILL_RAD_S = 0.06
 
 
 class ModelWatch:
-    """Looks at every sample; None of `look` where all is well. arms: what is known of the arm, by default its prior.
+    """Looks at every sample; None of `look` where all is well. arms: prior knowledge of the arm, by default from the
+    configuration.
 
     planned: largest goal of each joint [A, or V under PWM].
     """
@@ -50,7 +51,7 @@ class ModelWatch:
         self._seen_at = 0.0
 
     def look(self, state: State) -> None:
-        """The latest sample; raises SafetyStop when no arm like this could have moved so."""
+        """Process the latest sample; raises SafetyStop if no arm in the ensemble could have moved like this."""
         if any(state.missing):
             return
         goal, self._goal = self._goal, state.goal_current
@@ -104,7 +105,7 @@ def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[
 
 
 def _hardly_known(largest: Array) -> Array:
-    """Standard deviations of the parameters of an arm of which only the torque that shall move it is known."""
+    """Standard deviations of the parameters of an arm of which only the required torque is known."""
     each = {"gravity": 3.0, "tilt": 1.0, "coulomb": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
     torque = [largest[-1] if name.endswith("_2") else largest[0] for name in NAMES]
     share = [each.get(name.rpartition("_")[0], 3.0) for name in NAMES]

@@ -1,4 +1,4 @@
-"""What Linux offers a loop that must be on time: asked for, used where it is given, and reported either way.
+"""What Linux offers a loop that must be on time: requested, used where granted, and reported either way.
 
 real-time scheduling   SCHED_FIFO: nothing but other real-time work may take the processor away
 locked memory          mlockall: no page of ours has to be fetched back in the middle of a cycle
@@ -9,7 +9,7 @@ no garbage collection  Python's collector is off inside the loop, and never look
 short thread switch interval     another thread of this process (the progress bar) hands the interpreter back in 50 us,
 not 5 ms
 
-Only the calling thread gets the first and the third. Everything is taken back at the end.
+Only the calling thread gets the first and the third. Everything is undone at the end.
 """
 
 import ctypes
@@ -29,7 +29,7 @@ _SWITCH_INTERVAL_S = 50e-6
 
 
 class Granted(NamedTuple):
-    """One thing asked for: whether it was given, and if not why and how to get it."""
+    """One requested real-time setting: whether it was granted, and if not, why and how to enable it."""
 
     name: str
     given: bool
@@ -41,7 +41,7 @@ class Granted(NamedTuple):
 
 @contextmanager
 def real_time() -> Iterator[list[Granted]]:
-    """Ask for all of it; the block runs with what was given, which is listed."""
+    """Request all settings; the block runs with those granted, which are listed."""
     with ExitStack() as undo:
         yield [step(undo) for step in (_fifo, _own_core, _lock_memory, _timer_slack, _no_collection, _short_turns)]
 

@@ -1,4 +1,4 @@
-"""Successive periods compared as they are played, so that no period ends in a burst of work.
+"""Successive periods compared as they are played, so that no burst of work is needed at the end of a period.
 
 The difference is that of `hil.estimator.data.periodicity.settling_difference`, summed sample by sample: at the end of a
 period only a few divisions are left. The former period lies in one buffer, which the latest one overwrites.

@@ -50,10 +50,10 @@ def run_experiment(
     plan: Plan | None = None,
     arms: Ensemble | None = None,
 ) -> str:
-    """Play the configuration's experiment and record it in `run`; the sentence about torque at the end.
+    """Run the configured experiment and record it in `run`. Returns a sentence on the final torque state.
 
-    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`. arms: what
-    is known of the arm, by default its prior.
+    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`. arms: prior
+    knowledge of the arm, by default from the configuration.
     Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
     """
     plan = plan_of(config) if plan is None else plan
@@ -83,7 +83,7 @@ def run_experiment(
 
 
 def _check_still_wanted(stop: StopRequest, torque: str) -> None:
-    """A request that came while torque was being cut: what is recorded stays, but nothing follows."""
+    """Honour a request that came while torque was being cut: the recording stays, but nothing follows."""
     try:
         stop.check()
     except StopRequested as request:
@@ -101,7 +101,7 @@ def _play(
     note: Note,
     arms: Ensemble | None,
 ) -> None:
-    """Torque on, stream, torque off; whatever stops it is kept among the events."""
+    """Torque on, stream, torque off; whatever stops it is logged as an event."""
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     try:
         # In this order: what _on_time does takes longer than the watchdog waits.
@@ -156,7 +156,7 @@ def _on_time(clock: Clock, note: Note) -> Iterator[None]:
 
 
 def _check_rate(config: Config, bus: ServoBus) -> None:
-    """What the wire and the adapter make impossible from the outset; `hil check` measures what is possible."""
+    """Refuse rates that the wire or the adapter rules out from the outset; `hil check` measures what is possible."""
     rate, wire = config.experiment.rate, bus.prepared.longest
     if wire > 1 / rate:
         raise WrongSetting(
@@ -194,7 +194,8 @@ def _wait_for_rest(bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """The arm must hang where the configuration says, or zero_ticks, direction or the arm is not as described.
+    """Check that the arm hangs where the configuration says; otherwise zero_ticks, direction or the arm itself is not
+    as described.
 
     Where the run before it has passed that check, friction may hold the arm twice as far away.
     """

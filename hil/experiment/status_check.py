@@ -1,7 +1,8 @@
-"""What servos tell of themselves beside their state: driven, watched, taking their goals, and answering of now?
+"""Servo status besides motion: is torque on, the watchdog armed, the goal accepted, the reply current?
 
-None of this shows in a reply's position and velocity, and in its current only where the servo has a sensor in its
-motor. The registers are read back a few times in 0.1 s (hil.drivers.bus), so each of these faults is seen in 0.1 s.
+None of this shows in a reply's position and velocity, and it shows in the current only if the servo has a motor current
+sensor. The registers are read back a few times in 0.1 s (hil.drivers.bus), so each of these faults is detected within
+0.1 s.
 """
 
 from hil.config.schema import Config
@@ -25,7 +26,7 @@ _GOALS_MISSED = 2
 
 
 class StatusCheck:
-    """Compares what servos tell with what they were told. `look` gives what is wrong, or None."""
+    """Compares reported with sent values. `look` returns what is wrong, or None."""
 
     def __init__(self, config: Config) -> None:
         self._armed = round(config.safety.watchdog / WATCHDOG_UNIT)
@@ -37,7 +38,7 @@ class StatusCheck:
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
-        """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. What is wrong, for a sentence."""
+        """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. Returns the fault as text."""
         if status.hardware_error:
             error = describe_error(HardwareError(status.hardware_error))
             return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle it."
@@ -82,7 +83,7 @@ class StatusCheck:
         """tick: the servo's own clock [s]; now: the computer's, before it asked [s].
 
         A servo's clock may be ahead of what is expected, since the request was late, but never behind: then the reply
-        is an old one. What is expected is the least that was seen, which may drift.
+        is an old one. The expected lead is the smallest observed one, which may drift.
         """
         behind, seen_at, readings, stale = self._clock[joint]
         offset = (tick - now) % _WRAP_S

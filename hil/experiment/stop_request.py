@@ -1,7 +1,7 @@
-"""Ctrl-C, SIGTERM and SIGHUP as a request that is seen between two samples and never forgotten.
+"""Ctrl-C, SIGTERM and SIGHUP as a request that is honoured between two samples and never lost.
 
 A signal that raised wherever the program happens to be could land inside the path that cuts torque. So while a servo
-may have torque the handlers only note the request; the stream sees it between two samples. A first signal brakes the
+may have torque the handlers only note the request; the stream checks it between two samples. A first signal brakes the
 arm, then cuts torque; a second one cuts at once; more change nothing. While no servo has torque a signal ends the
 program at once.
 
@@ -73,7 +73,7 @@ class StopRequest:
 
     @property
     def insisted(self) -> bool:
-        """Whether a second signal came: no more braking then."""
+        """Whether a second signal came: then braking ends."""
         return self._count > 1
 
     def _note(self, number: int, _frame: FrameType | None) -> None:

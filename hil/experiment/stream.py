@@ -1,6 +1,6 @@
-"""The experiment in time: at each tick one exchange, the guard looks, the recorder keeps.
+"""The real-time loop: at each tick one exchange, a guard check and a recorded sample.
 
-Played in order: rest; for each multisine a ramp in, periods until two successive ones are alike, the periods that will
+Played in order: rest; for each multisine a ramp in, periods until two successive ones match, the periods to
 be used, a ramp out; then no current until the arm is at rest. Where a stop allows it, the arm is braked before `run`
 raises; torque is cut by whoever switched it on.
 """
@@ -33,7 +33,7 @@ _LEAST_MOTION_STEPS = 4
 
 
 class Progress(NamedTuple):
-    """What a person watches: samples taken, of how many expected, the phase, and the latest state."""
+    """Progress for the user: samples taken, the number expected, the phase, and the latest state."""
 
     taken: int
     expected: int
@@ -50,8 +50,8 @@ class Stream:
     """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
 
     watch: called about 20 times a second with the progress. note: called with each event worth keeping. Neither may
-    block. arms: what is known of the arm, by default its prior. Make it before torque is on: it works out all that can
-    be worked out beforehand.
+    block. arms: prior knowledge of the arm, by default from the configuration. Create it before torque is on: it
+    precomputes everything it can.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Stream:
             raise ExperimentError(f"The arm is moving before the start: {moving}. Let it hang still, then start again.")
 
     def _play_periods(self, segment: Segment) -> None:
-        """Periods until one is like the one before it, which then is the first settled one; then the rest of them."""
+        """Play periods until one matches its predecessor, which is then the first settled one; then the rest."""
         samples = len(segment.period_current)
         repetition = self._repetition
         self._play_period(segment, 0)
@@ -149,7 +149,7 @@ class Stream:
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
-        """A joint that friction or something harder holds shows after one period, before minutes are spent on it."""
+        """Detect a joint held by friction or an obstacle after one period, before minutes are wasted."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 raise DidNotMove(
@@ -218,7 +218,7 @@ class Stream:
             self._guard.look_at_rest(state)
 
     def _brake(self) -> None:
-        """Brake until the arm is slow, cannot be felt, time is over, or somebody insists. Never raises."""
+        """Brake until the arm is slow, sensing fails, time is up, or a second signal comes. Never raises."""
         brake = Brake(self._config)
         state = self._state
         with suppress(DriverError):
@@ -245,6 +245,6 @@ class Stream:
 
 
 def _largest_goals(plan: Plan) -> list[float]:
-    """Of each joint [A, or V under PWM]; the guard finds what is no number before it is sent."""
+    """Of each joint [A, or V under PWM]; the guard rejects values that are not numbers."""
     peaks = [np.nan_to_num(np.abs(segment.period_current)).max(axis=0) for segment in plan.segments]
     return [float(peak) for peak in np.max(peaks, axis=0)]

@@ -1,10 +1,10 @@
-"""Arms drawn from what an identification leaves open, for domain randomisation: one file an arm, one table for all.
+"""Arms drawn from the posterior of an identification, for domain randomisation: one file an arm, one table for all.
 
 Drawn are the parameters from their covariance (a normal distribution), and one factor common to all torques, since the
 torque constant is known far less well than anything else: the motion shows the ratio of the joints' constants, so one
-factor is left, as uncertain as the best-known joint's. What a goal [A or V] gives is scaled with it, so that every
-drawn arm moves alike under the same goals as far as the recording tells. The draws are matched to the covariance: their
-mean and covariance are those stated, not those of a small sample.
+factor remains, as uncertain as that of the best-known joint. What a goal [A or V] gives is scaled with it, so that
+every drawn arm moves alike under the same goals as far as the recording tells. The draws are matched to the covariance:
+their mean and covariance are those stated, not those of a small sample.
 """
 
 from collections.abc import Sequence
@@ -93,7 +93,7 @@ def export_samples(
 
 
 def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:
-    """Names, means (names,) and covariance (names, names) [SI]; raises ExportError for what nothing is known of."""
+    """Names, means (names,) and covariance (names, names) [SI]; raises ExportError if the covariance is not finite."""
     result = source.result
     covariance = result.covariance.array()
     unseen = [name for name, row in zip(result.covariance.names, covariance, strict=True) if not np.isfinite(row).all()]

@@ -1,4 +1,4 @@
-"""Pilot, then full: small first, learn from what was seen, dry-run again, and raise the torque to the limits.
+"""Pilot, then full: start small, learn from the measured motion, dry-run again, and raise the torque to the limits.
 
 belief   arms that could be the real one, moved towards what each run shows
 gains    a stabiliser for arms that have no stable rest

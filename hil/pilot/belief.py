@@ -1,10 +1,10 @@
-"""What is thought of the arm: simulated arms that could be it, drawn from the prior and moved towards what was seen.
+"""Current belief about the arm: an ensemble of simulated arms, drawn from the prior and updated by measured motion.
 
 Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
-Computers and Geosciences 55 (2013) 3): every arm plays what the real one played, and is moved by the regression, over
-the arms, of parameters on motion, towards the motion that was measured. It needs no derivatives, no starting value and
-no motion that tells all parameters apart: what a motion says nothing of keeps the prior's spread. A joint that did not
-move tells too: arms that would have moved are moved towards more friction.
+Computers and Geosciences 55 (2013) 3): every arm plays what the real one played, and is updated towards the
+measured motion by regressing parameters on motion over the ensemble. It needs no derivatives, no initial guess and
+no motion that separates all parameters: what a motion does not determine keeps the prior's spread. A joint that did not
+move is informative too: arms that would have moved are shifted towards more friction.
 """
 
 from dataclasses import dataclass, replace
@@ -69,7 +69,7 @@ class Belief:
 
     @property
     def middle(self) -> dict[str, float]:
-        """The arm in the middle."""
+        """The median arm."""
         values = self._values(np.median(self.coordinates, axis=0)[None])[0]
         return within_range({**self.fixed, **dict(zip(self.names, values.tolist(), strict=True))})
 
@@ -87,7 +87,7 @@ class Belief:
         return Ensemble(physics, scale, "belief" if self.learned else "prior")
 
     def after(self, config: Config, seen: Seen) -> "Belief":
-        """What is thought after `seen`."""
+        """The belief updated by `seen`."""
         step = np.array([joint.joint.servo.position_unit for joint in config.joints])
         moved = seen.swing > MOVED_STEPS * step
         random = np.random.default_rng((self.seed, 8, self.learned))

@@ -1,4 +1,4 @@
-"""The whole way from link lengths to the result: the search, the full run, its estimate."""
+"""From link lengths to the result: the search, the full run, its estimate."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ _BACK_OFF = 0.85
 def identify_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
 ) -> tuple[str, SettledResult]:
-    """The whole way from link lengths to the result; the sentence about torque and the result.
+    """From link lengths to the result. Returns the sentence about torque and the result.
 
     Raises what a run raises, and ExperimentError when a joint does not move at its current limit.
     """

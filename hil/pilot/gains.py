@@ -20,7 +20,7 @@ _TORQUE_SHARE = 0.35  # of the torque limit at a radian, at most, beyond what gr
 
 
 def needs_stabiliser(config: Config, belief: Belief) -> bool:
-    """Whether gravity does not draw the middle arm back to its rest pose."""
+    """Whether gravity fails to return the median arm to its rest pose."""
     return float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min()) <= 0.0
 
 

@@ -46,7 +46,7 @@ comes fairly far on its way to a limit."""
 
 @dataclass
 class Search:
-    """What has been done and what is thought; `steps` and `belief` grow from run to run."""
+    """Runs so far and the current belief; both are updated from run to run."""
 
     config: Config
     run: RunFolder
@@ -78,7 +78,7 @@ class Search:
         return self._raise_to_limits()
 
     def learn(self, config: Config, played: Played) -> None:
-        """Take in what a run of `config` showed."""
+        """Update the belief with what a run of `config` showed."""
         self.steps.append(played.step)
         if played.passed_limit:
             self.cap = _AFTER_LIMIT * played.step.peak_torque
@@ -153,7 +153,7 @@ class Search:
         return Amplitude(plan, torque, predict(config, plan, self.belief.ensemble(self._farther), pose=self.pose))
 
     def _raise_to_limits(self) -> tuple[Config, Amplitude]:
-        """Runs on the way, until the arm is known well enough to go to its limits at once."""
+        """Intermediate runs, until the arm is known well enough to go straight to its limits."""
         config = self.held
         plan = self._waves(config)
         found = self.amplitude(config, 1.0, plan)
@@ -195,7 +195,7 @@ class Search:
 
     @staticmethod
     def _shares(found: Amplitude) -> Array:
-        """How far a typical arm comes on its way to a limit (joints,)."""
+        """How close a typical arm comes to a limit (joints,)."""
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
     def _give_up(self, config: Config, still: list[str]) -> None:
@@ -211,7 +211,7 @@ class Search:
 
 
 def pilot_config(config: Config) -> Config:
-    """Half the period where the band allows it, no held-out multisine, no waiting for a steady motion."""
+    """Half the period where the band allows it, no held-out multisine, no waiting for steady state."""
     experiment = config.experiment
     update: dict[str, Any] = {"held_out": False, "peak_torque": None, "periods": 1}
     update["max_settling_periods"] = min(experiment.max_settling_periods, _PILOT_SETTLING)

@@ -1,4 +1,4 @@
-"""One run on the way: played, compared with what was foreseen, and told."""
+"""One intermediate run: played, compared with its prediction, and reported."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Step:
-    """One run on the way: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
+    """One intermediate run: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
     (quantities, joints), in hil.dry_run.prediction.QUANTITIES. ended: why it ended early, empty where it did not.
     """
 
@@ -79,14 +79,14 @@ class Played:
 
 @dataclass(frozen=True)
 class Player:
-    """Plays runs: where the file is, who watches, who is told."""
+    """Plays runs: the configuration file, the watcher and the reporter."""
 
     shown_path: Path
     watch: Watch
     say: Say
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
-        """Run one step on an arm that could be any of `arms`, compare, tell.
+        """Run one step on an arm that could be any of `arms`, compare with the prediction, report.
 
         Raises what a run raises, but for what tells of the arm alone: a limit passed, no motion, no steady motion.
         """

@@ -1,4 +1,4 @@
-"""The first part of a stop, where it is possible: brake, that is, a current against each joint's velocity.
+"""The first part of a stop, where possible: braking, with a current opposing each joint's velocity.
 
 For a bounded time and within the current limits; over at once when a reply is missing, a servo alerts, a deadline is
 missed, a second signal comes, or a joint gets faster instead of slower, as one does whose motor turns the wrong way.

@@ -1,4 +1,4 @@
-"""What an arm in space will play: a path of its joints as the torque that its description needs for it.
+"""Excitation of a spatial arm: a joint path, played as the feed-forward torque that its description gives.
 
 The stabiliser pulls towards the rest pose all the time. So that its spring and damper hold the arm to the path instead,
 what they will add is taken off beforehand: goal = feed-forward + stiffness (path - rest) + damping path velocity. The
@@ -140,7 +140,7 @@ def _feed_forward(config: Config, known: KnownChain, path: Path) -> Array:
 
 
 def _check_torque(config: Config, known: KnownChain, path: Path) -> None:
-    """The path must leave the motors room for what the description has wrong."""
+    """Check that the path leaves the motors headroom for errors of the description."""
     peaks = np.abs(_feed_forward(config, known, path)).max(axis=1)
     for joint, peak in zip(config.joints, peaks.tolist(), strict=True):
         most = joint.goal_limit * joint.torque_per_goal

@@ -1,7 +1,7 @@
 """A spring and a damper in software, for arms that have no stable pose of their own: horizontal, inverted.
 
-The estimator is given the torque that was really commanded, spring and damper included; what they did can be computed
-from the recording at any time, since they act on the former sample's position and velocity alone.
+The estimator is given the torque that was really commanded, spring and damper included; their contribution can be
+recomputed from the recording, since it depends only on the previous sample's position and velocity.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from hil.results.parts import StabiliserShare
 
 
 class Stabiliser:
-    """Adds its currents to a goal. A joint whose reply was missing keeps the current that it had."""
+    """Adds its currents to a goal. A joint whose reply was missing keeps its previous current."""
 
     def __init__(self, config: Config) -> None:
         assert config.stabiliser is not None

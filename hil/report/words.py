@@ -1,4 +1,4 @@
-"""Numbers and lists as a person writes them."""
+"""Human-readable numbers and lists."""
 
 from collections.abc import Sequence
 
@@ -9,17 +9,17 @@ def listed(words: Sequence[str]) -> str:
 
 
 def percent(share: float) -> str:
-    """A share with two digits that count."""
+    """A percentage with two significant digits."""
     return f"{float(f'{100 * share:.2g}'):g} %"
 
 
 def steps(value: float) -> str:
-    """Encoder steps with three digits that count."""
+    """Encoder steps with three significant digits."""
     return f"{value:.3g}" if value < 100 else f"{value:.0f}"
 
 
 def number(value: float, digits: int = 5) -> str:
-    """A value with so many digits that count."""
+    """A value with this many significant digits."""
     return f"{value:.{digits}g}".replace("-", "\u2212")
 
 

@@ -1,4 +1,4 @@
-"""Values with error bars as a person reads them in an interpreter or a notebook."""
+"""Values with error bars, formatted for an interpreter or a notebook."""
 
 from collections.abc import Mapping, Sequence
 from html import escape

@@ -74,9 +74,9 @@ class Fit:
 
 @dataclass(frozen=True, kw_only=True)
 class SettledFit(Fit):
-    """Of settled periods. quantisation_floor_ticks: what the encoder's rounding alone leaves, in the same unit.
+    """Of settled periods. quantisation_floor_ticks: residual due to encoder rounding alone, in the same unit.
 
-    periods: how many were averaged. correlation_time: samples over which the residual repeats itself.
+    periods: how many were averaged. correlation_time: samples over which the residual is correlated.
     """
 
     quantisation_floor_ticks: float
@@ -99,7 +99,7 @@ class ShootingFit(Fit):
 
 @dataclass(frozen=True)
 class Confounded:
-    """The two parameters that the recording can hardly tell apart, and their correlation."""
+    """The two most strongly correlated parameters, and their correlation."""
 
     parameters: tuple[str, ...]
     correlation: float
@@ -137,7 +137,7 @@ class LineLevels:
 
     @property
     def groups(self) -> dict[str, LineGroup]:
-        """Those there are, by kind."""
+        """The available groups, by kind."""
         kinds = {"excited": self.excited, "odd": self.odd, "even": self.even, "other": self.other}
         return {kind: group for kind, group in kinds.items() if group is not None}
 
@@ -246,7 +246,7 @@ class RunTiming(Timing, StreamTiming):
 
 @dataclass(frozen=True)
 class ArmFacts:
-    """What it takes to use the model: gravity in the arm's plane [m/s^2], rest pose [rad], the joints."""
+    """What is needed to use the model: gravity in the arm's plane [m/s^2], rest pose [rad], the joints."""
 
     gravity: float
     rest_pose: PerJoint
@@ -259,8 +259,8 @@ class ChainFacts:
 
     urdf: the file's name, beside the configuration. rotation, translation [m], axis: of each joint's frame in that of
     the link before, and its axis in its own. gravity: in the base's frame [m/s^2]. groups: what each base parameter is
-    made of. from_prior: those of which the recording shows little, so that they are the URDF's. held: the URDF's joints
-    that are taken as fixed. doubts: what is odd about its inertias.
+    made of. from_prior: those that the recording hardly determines, taken from the URDF. held: the URDF's joints
+    that are taken as fixed. doubts: what is implausible about its inertias.
     """
 
     urdf: str
@@ -283,7 +283,7 @@ class PhysicalQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres and inertias under what [known] says. not_told_apart: groups that only another known parts."""
+    """Masses, centres and inertias, using [known]. not_told_apart: groups that need another known one."""
 
     quantities: Mapping[str, PhysicalQuantity]
     not_told_apart: tuple[tuple[str, ...], ...]

@@ -1,7 +1,7 @@
-"""How large a file may claim to be before anything of it is taken into memory.
+"""Limits on file size, checked before anything is loaded.
 
 A run folder may come from somebody else. A compressed archive of 12 MB can hold 1.7 GB, and a header of 128 bytes can
-promise any number of rows: both are asked first.
+promise any number of rows: both are checked first.
 """
 
 from pathlib import Path

@@ -182,7 +182,7 @@ def _reserve(path: Path) -> None:
 
 
 def missed(goal_current: Sequence[float], now: float) -> State:
-    """The sample of a deadline that passed unused: the former goal currents stayed in force, nothing was measured."""
+    """The sample of a deadline that passed unused: the previous goal currents stayed in force, nothing was measured."""
     nothing = (float("nan"),) * len(goal_current)
     return State(
         now, now, tuple(goal_current), nothing, nothing, nothing, (0,) * len(goal_current), (True,) * len(goal_current)

@@ -1,4 +1,4 @@
-"""The run folder: an exact copy of the configuration, what was run on what, events, samples, result.
+"""The run folder: an exact copy of the configuration, versions and machine, events, samples, result.
 
 config.toml     copied byte for byte
 experiment.json the [experiment] that was really played, where the tool chose it (pilot, torque found by dry runs)
@@ -159,7 +159,7 @@ class RunFolder:
         return self.path / "stabiliser.json"
 
     def load_config(self) -> Config:
-        """The configuration, with the experiment that was really played. Raises ConfigError, RunFolderError."""
+        """The configuration, with the experiment as it was actually played. Raises ConfigError, RunFolderError."""
         config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
         if not self.played_path.is_file():
             return config
@@ -175,7 +175,7 @@ class RunFolder:
         return config.model_copy(update=played)
 
     def below(self, name: str, played: Config) -> "RunFolder":
-        """A run of its own in a folder of this one, on the way to it; raises RunFolderError."""
+        """A separate run in a subfolder of this one; raises RunFolderError."""
         folder = RunFolder.create(self.path / name, played)
         folder.write_played(played)
         return folder

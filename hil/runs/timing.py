@@ -1,4 +1,4 @@
-"""How the stream kept time, from what every sample says of itself."""
+"""Timing of the stream, computed from the samples' timestamps."""
 
 import numpy as np
 from numpy.typing import NDArray

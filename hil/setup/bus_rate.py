@@ -1,4 +1,4 @@
-"""What rate a bus can hold, measured with torque off, in every way in which an exchange can be sent."""
+"""The rate that a bus can sustain, measured with torque off for every way of sending an exchange."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Way:
 
     @property
     def rate(self) -> float:
-        """Exchanges per second that it can hold."""
+        """Exchanges per second that it can sustain."""
         return SHARE / self.longest_s
 
     def __str__(self) -> str:
@@ -72,8 +72,8 @@ def goal_register(joint: Joint) -> str:
 
 
 def goals_taken(bus: ServoBus) -> list[Joint]:
-    """The joints, one for each servo, that take goals from a Sync Write: each is told another goal than it has, asked
-    for it, and given back the one that it had. Only with torque off. Raises DriverError.
+    """The joints, one for each servo, that take goals from a Sync Write: each is sent a goal different from its
+    present one, read back, and restored. Only with torque off. Raises DriverError.
     """
     before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     other = [goal - 1 if goal > 0 else goal + 1 for goal in before]

@@ -1,4 +1,4 @@
-"""The commented TOML file of an arm, from the few things that must be known of it."""
+"""The commented TOML file of an arm, from the few facts that it needs."""
 
 import json
 import math
@@ -123,7 +123,7 @@ def _spread(published: Published) -> float:
 
 
 def _goal_limit(answers: JointAnswers) -> float:
-    """A or V: part of what the servo stalls at, at its middle supply."""
+    """A or V: a fraction of the stall value at the nominal supply voltage."""
     servo = servo_model(answers.model)
     stall = servo.stalls[len(servo.stalls) // 2]
     most = _OF_STALL * (stall.voltage if servo.default_mode is Mode.PWM else stall.current)

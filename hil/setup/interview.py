@@ -1,4 +1,4 @@
-"""`hil init`: what the bus can tell of an arm is read, what it cannot is asked. Nothing is written to a servo."""
+"""`hil init`: reads from the bus what it can and asks for the rest. Nothing is written to a servo."""
 
 import math
 from collections.abc import Callable, Sequence

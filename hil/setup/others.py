@@ -1,4 +1,4 @@
-"""Servos on the bus that are not the arm's: found, told, and left alone."""
+"""Servos on the bus that are not the arm's: found, reported, and left alone."""
 
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import WallClock

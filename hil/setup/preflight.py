@@ -1,4 +1,4 @@
-"""Everything that would stop an experiment, looked at before one, with how to fix it. Torque stays off."""
+"""Everything that would stop an experiment, checked beforehand, with how to fix it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at: what, on what, what was found, and where it is not well how to fix it."""
+    """One check: what was checked, where, what was found, and how to fix it if it is not as it should be."""
 
     level: Level
     where: str
@@ -44,7 +44,7 @@ class Finding:
 
 
 def check_arm(config: Config) -> Iterator[Finding]:
-    """Look at port, servos, pose and rate, in this order; what cannot be looked at is a STOP, never an exception."""
+    """Check port, servos, pose and rate, in this order; a check that cannot be made is a STOP, never an exception."""
     fakes.register_for(config.url)
     try:
         bus = ServoBus.connect(config.bus)
@@ -85,7 +85,7 @@ def _latency_timer(bus: ServoBus) -> Finding:
 
 
 def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
-    """Servos beside the arm's: nothing is ever sent to them, but whoever drives them should know."""
+    """Servos beside the arm's: nothing is ever sent to them, but the user should know of them."""
     try:
         check_quiet(bus.port)
     except BusShared as error:
@@ -142,7 +142,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
 
 
 def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding]:
-    """What a run that was killed could not put back."""
+    """Settings that a killed run could not restore."""
     what = "settings from an earlier run"
     try:
         written = recover(servo, config.url)
@@ -335,7 +335,7 @@ _LOOKS: tuple[_Look, ...] = (
 
 
 def _goals(bus: ServoBus) -> Iterator[Finding]:
-    """Whether goals arrive: a Sync Write has no answer, so each servo is asked what it holds, with torque off."""
+    """Whether goals arrive: a Sync Write has no answer, so each servo's goal is read back, with torque off."""
     try:
         taken = goals_taken(bus)
     except DriverError as error:

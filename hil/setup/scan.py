@@ -47,7 +47,7 @@ class Heard(NamedTuple):
 
 
 class Asking(NamedTuple):
-    """A scan that goes on: the baud it is at, the time left [s], and the servo that has just answered, if it was one.
+    """A scan in progress: the baud it is at, the time left [s], and the servo that has just answered, if it was one.
 
     servo: ID, and model or model number.
     """
@@ -66,7 +66,7 @@ def serial_ports() -> list[tuple[str, str]]:
 
 
 def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _: None) -> Iterator[Heard]:
-    """Ask at each baud rate in turn; raises PortLost. watch: called while it waits, and with each servo that answers.
+    """Scan at each baud rate in turn; raises PortLost. watch: called while it waits, and with each servo that answers.
 
     Rates that the adapter cannot do are given with their trouble said. Over TCP, where the other end sets the baud,
     the first alone is tried.

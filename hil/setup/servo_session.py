@@ -1,4 +1,4 @@
-"""The arm's servos from the first write to the last: what they were set to is kept before it and put back after it.
+"""A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
 A session holds the port. One inside another of the same arm shares it, so that the steps of a pilot write each EEPROM
 register once, and put it back once, when the outermost block is left, however that is. What a killed program left
@@ -96,7 +96,7 @@ class ServoSession:
             self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
     def end(self) -> None:
-        """Put back what every servo was set to; each that cannot be is named. Never raises DriverError."""
+        """Restore every servo's settings; name those that cannot be restored. Never raises DriverError."""
         failed = self._put_back(self._kept)
         if failed:
             clock = self.bus.port.clock
@@ -128,7 +128,7 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
     """The open bus with every servo in its mode and torque off, prepared for exchanges; settings put back at the end.
 
-    folder: run folder that gets a copy of the settings. say: told what a person has to know of them.
+    folder: run folder that gets a copy of the settings. say: receives messages for the user.
     Raises as `ServoBus.open`, and RunFolderError.
     """
     outer = _outermost.get()
@@ -159,13 +159,13 @@ def has_moved() -> bool:
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:
-    """What a program that is gone left to be put back on this joint's servo."""
+    """Settings of this joint's servo that a terminated program left unrestored."""
     kept = settings_file.load(port, joint.id, joint.servo.name)
     return kept if kept is not None and kept.is_ours_to_mend else None
 
 
 def recover(servo: Servo, port: str) -> list[str]:
-    """Put back what a program that is gone left behind on a servo; what was done, in words. Raises as `Servo.write`."""
+    """Restore settings that a terminated program left changed. Raises as `Servo.write`."""
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.is_ours_to_mend:
         return []

@@ -1,4 +1,4 @@
-"""Set up one servo: ID, baud rate, return delay. Every write to EEPROM is asked for first and read back after."""
+"""Set up one servo: ID, baud rate, return delay. Every EEPROM write is confirmed first and read back afterwards."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -55,8 +55,8 @@ def set_up(
     """Make the changes that are asked for and differ from what is there, each after `confirm` said yes to its question.
 
     Raises ServoRefused where a register does not read back as written, WrongSetting where the new ID is taken, and
-    what `Servo.read` raises. The port is left at the baud at which the servo was last heard. A status that gets lost
-    when ID or baud changes is no failure: the servo is looked for at both.
+    what `Servo.read` raises. The port is left at the baud at which the servo was last heard. A status packet lost while
+    ID or baud rate changes is not a failure: the servo is searched for at both.
     """
     changes = []
     if return_delay_us is not None:

@@ -120,7 +120,7 @@ def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, 
         with pytest.raises(ResultError, match=rf"result\.json: .*{said}"):
             load_model(identified)
     path.unlink()
-    with pytest.raises(ResultError, match=r"holds no result\.json.* hil estimate"):
+    with pytest.raises(ResultError, match=r"has no result\.json.* hil estimate"):
         load_model(identified)
     with pytest.raises(ResultError, match=r"nowhere: cannot be read: No such file"):
         load_model(tmp_path / "nowhere")

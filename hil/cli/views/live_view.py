@@ -1,4 +1,4 @@
-"""The live picture of a running experiment: each joint between its limits, the stream's lateness, heat and supply."""
+"""The live display of a running experiment: each joint between its limits, the stream's lateness, heat and supply."""
 
 import math
 
@@ -14,7 +14,7 @@ _NEAR = 0.85  # of a limit from which a value is shown in yellow
 
 
 class LiveView:
-    """Keeps what the latest sample does not carry: the earliest write so far, the last temperatures and voltages."""
+    """Keeps values that the latest sample does not include: earliest write, last temperatures and voltages."""
 
     def __init__(self, config: Config, columns: int) -> None:
         self._joints = config.joints
@@ -26,7 +26,7 @@ class LiveView:
         self._supply = [math.nan] * len(config.joints)
 
     def draw(self, progress: Progress) -> Group:
-        """The picture for one progress."""
+        """The display for one progress report."""
         self._keep(progress)
         table = Table.grid(padding=(0, 1))
         state = progress.state
@@ -65,7 +65,7 @@ class LiveView:
         return f"{heat:.0f} °C {supply:.1f} V" if math.isfinite(heat) and math.isfinite(supply) else ""
 
     def _gauge(self, value: float, low: float, high: float) -> tuple[Text, Text]:
-        """The value, and a line with a mark where it stands between its limits; yellow when near one of them."""
+        """The value and a gauge of its place between its limits; yellow near a limit."""
         if not low <= value <= high:
             return Text(f"{value:+7.2f}", style="red"), Text("─" * self._gauge_width, style="red")
         share = (value - low) / (high - low)

@@ -17,7 +17,7 @@ _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.STOP: "red"}
 
 
 def print_ports(ports: Sequence[tuple[str, str]], json_only: bool) -> None:
-    """The machine's serial ports, and what to type next."""
+    """The machine's serial ports, and the next command to type."""
     if json_only:
         print(json.dumps({"ports": [{"device": device, "description": text} for device, text in ports]}))
         return

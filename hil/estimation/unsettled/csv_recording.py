@@ -15,8 +15,8 @@ Values = NDArray[np.float64]
 
 
 def read_csv(path: Path, columns: Columns) -> Recording:
-    """The recording in `path`; raises CsvError for columns that are missing and fields that are no numbers, and
-    RecordingError for what cannot be a recording in these units. An empty field or `nan` is a missing value.
+    """The recording in `path`; raises CsvError for columns that are missing and fields that are not numbers, and
+    RecordingError for data that cannot be a recording in these units. An empty field or `nan` is a missing value.
     """
     read = _read(path)
     time = _column(path, read, columns.time) * TIME_UNITS[columns.time_unit]

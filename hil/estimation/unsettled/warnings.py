@@ -1,4 +1,4 @@
-"""What looks wrong in an estimate from any data: said, with the joint and what to change."""
+"""Warnings about an estimate from unsettled data, each with the joint and the remedy."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ WEAK, UNSEEN = 0.5, 10.0  # standard error over value
 
 
 def any_warnings(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[str]:
-    """One sentence for each thing."""
+    """One sentence per warning."""
     found = []
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"

@@ -1,4 +1,4 @@
-"""Which parameters the data can hardly tell apart."""
+"""Which parameters the data hardly separate."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ STRONG = 0.9
 
 
 def correlation(data: RunData) -> Section | None:
-    """Where the result has parameters."""
+    """Present if the result has parameters."""
     names = data.result.covariance.names
     if not names:
         return None

@@ -15,7 +15,7 @@ _DRAWS = 200  # of the parameters, for the interval
 
 
 def friction(data: RunData) -> Section | None:
-    """Where the run has its settled period."""
+    """Present if the run has its settled period."""
     if data.fitted is None:
         return None
     speed, torque = _left_to_friction(data.model, data.fitted)

@@ -9,7 +9,7 @@ from hil.report.words import number, percent
 
 
 def limits(data: RunData) -> Section:
-    """Always there."""
+    """Always present."""
     rows: list[tuple[str, ...]] = []
     for index, joint in enumerate(data.config.joints):
         position, velocity = data.samples["position"][:, index], data.samples["velocity"][:, index]

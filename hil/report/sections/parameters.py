@@ -13,7 +13,7 @@ TWO_SIDED_95 = 1.96
 
 
 def parameters(data: RunData) -> Section:
-    """Always there."""
+    """Always present."""
     result = data.result
     groups = {} if result.chain is None else result.chain.groups
     tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]

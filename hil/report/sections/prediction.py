@@ -1,4 +1,4 @@
-"""Measured against predicted position, and what is left in encoder steps."""
+"""Measured and predicted position, and the residual in encoder steps."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from hil.runs.period_file import PlayedPeriod
 
 
 def prediction(data: RunData) -> Section | None:
-    """Where the run has its settled periods."""
+    """Present if the run has its settled periods."""
     if data.fitted is None:
         return None
     pictures = []

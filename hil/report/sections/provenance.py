@@ -6,7 +6,7 @@ from hil.runs.run_folder import Excitation
 
 
 def provenance(data: RunData) -> Section:
-    """Always there."""
+    """Always present."""
     record, config = data.record, data.config
     servos = "; ".join(f"{joint.name}: {joint.model}, ID {joint.id}" for joint in config.joints)
     rows = [

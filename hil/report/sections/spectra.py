@@ -21,7 +21,7 @@ _BEYOND = 3.0  # times the highest excited line are shown
 
 
 def spectra(data: RunData) -> Section | None:
-    """Where the run has its settled period."""
+    """Present if the run has its settled period."""
     if data.fitted is None:
         return None
     excited = _excited(data)

@@ -1,4 +1,4 @@
-"""What the stabiliser gave of the torque that was commanded."""
+"""The stabiliser's share of the commanded torque."""
 
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
@@ -6,7 +6,7 @@ from hil.report.words import number
 
 
 def stabiliser(data: RunData) -> Section | None:
-    """Where a stabiliser held the arm."""
+    """Present if a stabiliser held the arm."""
     share = data.result.stabiliser
     if share is None:
         return None

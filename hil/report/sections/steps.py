@@ -1,4 +1,4 @@
-"""What the dry runs had predicted of each step, pilot to full size, and what was then seen."""
+"""Predicted and measured peaks of each step, from pilot to full size."""
 
 from hil.config.schema import Config
 from hil.dry_run.prediction import quantities_of
@@ -9,7 +9,7 @@ from hil.results.parts import PlayedStep
 
 
 def steps(data: RunData) -> Section | None:
-    """Where the run was played in steps."""
+    """Present if the run was played in steps."""
     played = data.result.steps
     if not played:
         return None

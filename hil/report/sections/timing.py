@@ -1,4 +1,4 @@
-"""How the stream kept its ticks."""
+"""Timing of the stream."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ _BINS = 60
 
 
 def timing(data: RunData) -> Section:
-    """Always there."""
+    """Always present."""
     samples = data.samples
     sent = samples[samples["time_after_read"] > samples["time_before_write"]]
     lateness = 1e6 * (sent["time_before_write"] - sent["deadline"])

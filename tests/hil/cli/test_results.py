@@ -20,7 +20,7 @@ def test_report_prints_where_it_is(identified: Path, tmp_path: Path, capsys: pyt
     assert hil("report", identified, "--out", tmp_path / "x.html", "--svg", tmp_path / "pictures") == 0
     printed = capsys.readouterr().out
     assert (tmp_path / "x.html").is_file()
-    assert f"{len(list((tmp_path / 'pictures').glob('*.svg')))} pictures in" in printed
+    assert f"{len(list((tmp_path / 'pictures').glob('*.svg')))} figures in" in printed
 
 
 def test_export_prints_files_and_what_they_lack(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:

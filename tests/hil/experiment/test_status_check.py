@@ -19,8 +19,8 @@ FINE = Status(watchdog=4, goal=0.1, tick=1.0, torque=True, hardware_error=0)
         ({"torque": False}, Cause.TORQUE_OFF, "Torque Enable reads 0"),
         ({"hardware_error": 32}, Cause.ALERT, "overload"),
         ({"watchdog": 255}, Cause.WATCHDOG, "received nothing for 80 ms"),
-        ({"watchdog": 0}, Cause.WATCHDOG, "no longer watched: its Bus Watchdog reads 0 but was set to 4"),
-        ({"watchdog": 5}, Cause.WATCHDOG, "no longer watched"),
+        ({"watchdog": 0}, Cause.WATCHDOG, "no longer protected: its Bus Watchdog reads 0 but was set to 4"),
+        ({"watchdog": 5}, Cause.WATCHDOG, "no longer protected"),
     ],
 )
 def test_what_one_status_shows(arm: Arm, change: dict[str, object], cause: Cause, said: str) -> None:
