@@ -21,11 +21,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.client_calls import CLIENTS
 
+ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "fake-bus.md"
 BEGIN, END = "<!-- clients: made by benchmarks/clients.py -->\n", "<!-- clients: end -->\n"
 PATIENCE_S = 180.0

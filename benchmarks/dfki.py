@@ -30,8 +30,8 @@ from scipy.optimize import minimize
 from scipy.signal import savgol_filter
 
 from hil.config.csv_columns import load_csv_config
-from hil.estimation.csv_recording import read_csv
 from hil.estimation.model_from_config import wanted_model
+from hil.estimation.unsettled.csv_recording import read_csv
 from hil.estimator.baselines.idim import fit_inverse_dynamics, uniform
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting

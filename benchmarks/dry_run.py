@@ -31,10 +31,10 @@ from hil.dry_run.prediction import GUARDED, peaks_of
 from hil.dry_run.prior import quantities
 from hil.dry_run.waves import design_problem
 from hil.errors import NotSettled, SafetyStop
+from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
-from hil.model_file import read_result
 from hil.pilot import identify_in_steps
-from hil.results.result import Result
+from hil.results.result import Result, SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
@@ -187,7 +187,7 @@ def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
             except SafetyStop:
                 touched += 1
                 continue
-            pilot = read_result(folder / "run" / "pilot-1")
+            pilot = first_estimate(folder / "run")
         seen, median = map(np.array, (result.steps[-1].seen, result.steps[-1].predicted_median))
         allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
         used.append(float(((seen[1] - seen[0]) / allowed).min()))
@@ -205,6 +205,12 @@ def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
         "std_ratio_least": min(least, default=0.0),
         "predicted_over_seen": max(distances, default=1.0),
     }
+
+
+def first_estimate(run: Path) -> SettledResult:
+    """Of the first pilot in which every joint moved: the last one below the run."""
+    last = sorted(run.glob("pilot-*"), key=lambda path: int(path.name.removeprefix("pilot-")))[-1]
+    return estimate_run(RunFolder.open(last))
 
 
 def worst_relative_std(result: Result) -> float:

@@ -27,29 +27,31 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.fault_campaign.arms import Setting, settings
+from benchmarks.fault_campaign.arms import PERIOD_S, Setting, settings
 from benchmarks.fault_campaign.campaign import DoesNotRun, Outcome, inject, prepare
 
 INJECTIONS = 5000
 
 
-def campaign(chosen: Sequence[Setting], injections: int, jobs: int, first: int = 0) -> tuple[list[Outcome], list[str]]:
+def campaign(
+    chosen: Sequence[Setting], injections: int, jobs: int, first: int = 0, period: float = PERIOD_S
+) -> tuple[list[Outcome], list[str]]:
     """That many injections shared out between the settings; their outcomes, and the settings that do not run at all."""
     shares = [injections // len(chosen) + (number < injections % len(chosen)) for number in range(len(chosen))]
     if jobs == 1:
-        done = list(map(_all_of, chosen, shares, [first] * len(chosen)))
+        done = list(map(_all_of, chosen, shares, [first] * len(chosen), [period] * len(chosen)))
     else:
         with ProcessPoolExecutor(jobs) as processes:
-            done = list(processes.map(_all_of, chosen, shares, [first] * len(chosen)))
+            done = list(processes.map(_all_of, chosen, shares, [first] * len(chosen), [period] * len(chosen)))
     return [outcome for part, _ in done for outcome in part], [why for _, why in done if why]
 
 
-def _all_of(setting: Setting, count: int, first: int) -> tuple[list[Outcome], str]:
+def _all_of(setting: Setting, count: int, first: int, period: float) -> tuple[list[Outcome], str]:
     try:
-        prepare(setting)
+        prepare(setting, period)
     except DoesNotRun as why:
         return [], str(why)
-    return [inject(setting, seed) for seed in range(first, first + count)], ""
+    return [inject(setting, seed, period) for seed in range(first, first + count)], ""
 
 
 def figures(outcomes: Iterable[Outcome]) -> dict[str, Any]:

@@ -3,14 +3,15 @@
     python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--jobs N] [--json] [--keep DIR]
 
 The distribution stands in benchmarks/population_arms.py. Each arm is identified by `hil identify` in a process of its
-own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto", for
-tests.
+own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto",
+for tests.
 
 finished              share that ended with a result, nobody helping
 beyond_limit          arms that went farther beyond a position limit than hil.dry_run.stopping_distance predicts
 yes, yes_current, yes_pwm   share of all, of those with current sensors, of voltage-driven ones, with the verdict "yes"
 yes_but_wrong         share of the "yes" with an inertia, gravity or friction parameter off by more than 2 % and by more
-                      than 3 standard errors; torque constants aside: all torques count in the first joint's
+                      than 3 standard errors; torque constants aside: all torques count in the first joint's; friction
+                      counts as it was in the middle of the fitted multisine, while grease warmed
 worst_percent_of_yes  largest such error of a "yes" [%]
 held_out_percent      largest error of the free prediction among the "yes", and its median [% of motion RMS]
 cpu_seconds_*         processor time of the whole process
@@ -35,8 +36,9 @@ from hil.config.schema import Config, parse_config
 from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.stopping_distance import beyond_when_passed
 from hil.estimation.truth import true_parameters
+from hil.fakes.plants.arm import base_parameters
 from hil.plan.plan import make_plan
-from hil.runs.recording import load_samples
+from hil.runs.recording import Phase, load_samples
 
 try:
     from benchmarks.population_arms import DrawnArm, draw
@@ -103,7 +105,7 @@ def run(seed: int, folder: Path, *, quick: bool = False) -> Outcome:
     outcome = Outcome(
         seed, arm.name, arm.has_current, result is not None, message, seconds, arm_seconds, steps, beyond, predicted
     )
-    return outcome if result is None else _judged(outcome, arm, config, result)
+    return outcome if result is None else _judged(outcome, arm, config, result, folder / "run")
 
 
 def _identify(path: Path, folder: Path) -> tuple[dict[str, Any] | None, str, float]:
@@ -156,9 +158,19 @@ def _predicted(config: Config, at: np.void) -> float:
     return float(max(far.max() for far in ways.values()))
 
 
-def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, Any]) -> Outcome:
+def _truth(config: Config, folder: Path) -> dict[str, float]:
+    """Of the arm as it was in the middle of the fitted multisine: friction falls while grease warms."""
     truth = true_parameters(config)
-    assert truth is not None
+    assert truth is not None and config.fake is not None
+    samples = load_samples(folder / "samples.npy", len(config.joints))
+    fitted = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == 0)
+    now = base_parameters(config.fake.arm, float(np.median(samples["time_before_write"][fitted])))
+    warm = base_parameters(config.fake.arm)
+    return {name: value + now[name] - warm[name] for name, value in truth.items()}
+
+
+def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, Any], folder: Path) -> Outcome:
+    truth = _truth(config, folder)
     friction = min(value for name, value in truth.items() if name.startswith("coulomb"))
     errors = {}
     for name, entry in result["parameters"].items():

@@ -13,11 +13,11 @@ from hil.drivers.errors import (
     WrongModel,
 )
 from hil.drivers.exchange import Exchange
-from hil.drivers.hold import let_sink, refuse_held
 from hil.drivers.joint import Joint
 from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
 from hil.drivers.port import Port, open_port
-from hil.drivers.preparation import check_quiet, fault_text, learn_latency, prepare_servo, shared
+from hil.drivers.preparation.hold import let_sink, refuse_held
+from hil.drivers.preparation.prepare import check_quiet, fault_text, learn_latency, prepare_servo, shared
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
 from hil.drivers.shield import signals_held_back
@@ -83,7 +83,8 @@ class TorqueOff:
 
     def __str__(self) -> str:
         if not self.unconfirmed:
-            return f"Torque is off on all {len(self.confirmed)} servos, read back."
+            servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
+            return f"Torque is off on {servos}, read back."
         names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
         alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
         if alone:

@@ -88,7 +88,7 @@ class Exchange:
         self.one_write = one_write
         self.strangers = 0
         """Instruction packets heard that are not this program's: another one is master of the same bus."""
-        self._writes = [
+        self._write, *self._more_writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
         ]
@@ -130,11 +130,9 @@ class Exchange:
         usual = self._until_slow > 0 and self._until_status > 0 and not self._late_possible
         span = 0 if usual else self._other_span()
         read = self._reads[span]
-        if len(goal_ticks) != len(self.ids):
-            raise ValueError(f"{len(goal_ticks)} goals for {len(self.ids)} servos")
         try:
-            goals = self._writes[0].pack(goal_ticks)
-            for write in self._writes[1:]:
+            goals = self._write.pack(goal_ticks)
+            for write in self._more_writes:
                 goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
@@ -219,7 +217,7 @@ class Exchange:
         return wire + return_delay * len(self.ids) + self._port.latency + HOST_S
 
     def _bytes(self, read: GroupRead) -> int:
-        return sum(write.size for write in self._writes) + len(read.request) + read.reply_size
+        return sum(write.size for write in (self._write, *self._more_writes)) + len(read.request) + read.reply_size
 
 
 class _GoalWrite:
@@ -227,18 +225,24 @@ class _GoalWrite:
 
     def __init__(self, goal: Register, ids: Sequence[int], places: Sequence[int]) -> None:
         # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
-        self._struct = struct.Struct("<12s" + "Bh" * len(places))
+        packet = struct.Struct("<12s" + "Bh" * len(places))
+        self._pack = packet.pack
+        self._count = len(ids)
         self._fields: list[bytes | int] = [_front(goal, len(places))]
         for place in places:
             self._fields += [ids[place], 0]
         self._places = None if len(places) == len(ids) else tuple(places)
-        self.size = self._struct.size + 2
+        self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
         """The packet with these goals, one for each of all servos; raises struct.error where one does not fit."""
         fields, places = self._fields, self._places
-        fields[2::2] = goal_ticks if places is None else [goal_ticks[place] for place in places]
-        packet = self._struct.pack(*fields)
+        if places is not None:
+            if len(goal_ticks) != self._count:
+                raise ValueError(f"{len(goal_ticks)} goals for {self._count} servos")
+            goal_ticks = [goal_ticks[place] for place in places]
+        fields[2::2] = goal_ticks
+        packet = self._pack(*fields)
         return packet + _pack_crc(_crc(packet))
 
 

@@ -26,11 +26,39 @@ _EXPECTED = {
 
 def describe(error: ValidationError, path: Path | str, root: type[BaseModel], table: str = "") -> str:
     """All faults of one file, a line each. table: where in the file the checked model stands, "" for all of it."""
-    faults = [_fault(detail, root, table) for detail in error.errors(include_url=False)]
+    details = _without_consequences(_joined_alternatives(error.errors(include_url=False)))
+    faults = [_fault(detail, root, table) for detail in details]
     if len(faults) == 1:
         return f"{path}: {faults[0]}" + ("" if faults[0].endswith("?") else ".")
     lines = "".join(f"\n  {fault}" for fault in faults)
     return f"{path}: {len(faults)} errors:{lines}"
+
+
+def _joined_alternatives(details: Sequence[Any]) -> list[Any]:
+    """A value that fits none of several alternatives is one fault with all of them, not one for each."""
+    joined: dict[tuple[Any, ...], Any] = {}
+    for detail in details:
+        if detail["type"] != "literal_error":
+            joined[(*detail["loc"], len(joined))] = detail
+            continue
+        place = tuple(part for part in detail["loc"] if not str(part).startswith("literal["))
+        if place in joined:
+            expected = f"{joined[place]['ctx']['expected']}, {detail['ctx']['expected']}".replace(" or ", ", ")
+            joined[place] = {**joined[place], "ctx": {"expected": expected}}
+        else:
+            joined[place] = {**detail, "loc": place}
+    return list(joined.values())
+
+
+def _without_consequences(details: Sequence[Any]) -> list[Any]:
+    """A list whose entries are wrong is not said to be too short as well."""
+    places = [tuple(detail["loc"]) for detail in details]
+    return [
+        detail
+        for detail, place in zip(details, places, strict=True)
+        if detail["type"] != "too_short"
+        or not any(len(each) > len(place) and each[: len(place)] == place for each in places)
+    ]
 
 
 def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
@@ -62,6 +90,10 @@ def _constraint(kind: str, context: dict[str, Any]) -> str | None:
             return f"must be a multiple of {context['multiple_of']}"
         case "literal_error":
             return f"must be one of {context['expected']}"
+        case "string_too_short":
+            return "must not be empty"
+        case "string_too_long":
+            return f"may have at most {context['max_length']} characters"
         case "too_short":
             return f"needs at least {context['min_length']} entries"
         case "too_long":

@@ -102,6 +102,7 @@ UNHEARD = _INSTRUCTIONS | {
     FaultKind.CABLE_PULLED,
     FaultKind.SILENT_SERVO,
     FaultKind.REBOOT,
+    FaultKind.STATUS_ERROR,
 }
 """Where the program cannot reach a servo, the watchdog's time counts."""
 

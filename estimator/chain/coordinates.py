@@ -34,6 +34,7 @@ SHAPES = {
 """Shape of friction near standstill: what is likely [its unit] and the standard deviation of its logarithm. A joint
 that is never slow says nothing of it, and without that would let it go anywhere."""
 RESHAPING = 1.0  # of their logarithms, in one step
+NARROWING, WIDENING = 0.8, 2.0  # of a width, in one step
 LONGEST = 2.0  # of any coordinate, in one step
 NEAREST = 1e-3  # of the floor: what a width always stays above it
 
@@ -65,18 +66,24 @@ class ChainCoordinates:
         slope: Array = np.where(self._positive, self.values(x) - self._floors, self._scales)
         return slope
 
-    def limit(self, least: Array, most: Array) -> None:
-        """Reduce in place the permitted step of each coordinate."""
+    def limit(self, x: Array, least: Array, most: Array) -> None:
+        """Lower in place what coordinates may change by in one step from `x`."""
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], RESHAPING, LONGEST)
         least[:count], most[:count] = -bound, bound
+        widths = np.flatnonzero(self._floors)
+        share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
+        least[widths], most[widths] = np.maximum(-1.0, -NARROWING * share), WIDENING * share
 
     def moved(self, x: Array, step: Array) -> Array:
-        """The point reached by `step` from `x`; both may have further coordinates at the end."""
+        """Where `step` leads from `x`, both with coordinates of something else at their end.
+
+        The motion follows a width and not its logarithm: by the exponential of the step it would never arrive at its
+        floor.
+        """
         y: Array = x + step
         widths = np.flatnonzero(self._floors)
-        # Far above its floor a width follows its logarithm, near it itself: else it would never arrive.
-        y[widths] = np.maximum(y[widths], np.log(NEAREST * self.width_floor))
+        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), NEAREST * self.width_floor))
         return y
 
     @cached_property

@@ -40,6 +40,8 @@ class ChainProblem:
     """Integration steps in a sample."""
     softness: float
     """Natural frequency of the observer [Hz]."""
+    finer: int = 1
+    """Integration steps in place of one where a joint may be near standstill."""
 
     @property
     def count(self) -> int:
@@ -67,6 +69,7 @@ class ChainProblem:
             np.ascontiguousarray(np.transpose(slopes, (2, 3, 0, 1))),
             np.ascontiguousarray(period.position.T),
             1.0 / (period.rate * self.steps),
+            self.finer,
         )
 
     def gain(self, period: SettledPeriod) -> Array:
@@ -103,7 +106,7 @@ class ChainProblem:
 
         def limits(point: Array) -> tuple[Array, Array]:
             least, most = np.full(point.size, -LONGEST), np.full(point.size, LONGEST)
-            self.coordinates.limit(least, most)
+            self.coordinates.limit(point[: self.count], least, most)
             return least, most
 
         return minimise(self.evaluate, x, ftol, damping, move=self.coordinates.moved, limits=limits)

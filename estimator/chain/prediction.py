@@ -13,6 +13,7 @@ from hil.estimator.simulation.arm import steps_per_sample
 from hil.estimator.simulation.closed_loop import Feedback
 
 PERIODS = 3  # simulated; the last is taken
+FINER = 4  # steps in place of one near standstill
 NEVER = 1e6  # N m
 
 
@@ -45,7 +46,7 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
         for s in range(steps):
             torque[0, s] = command + (motor - command) * share
             motor = motor + (command - motor) * fallen
-        position, _ = simulation.go_on(ChainRun(torque, slopes, missing, step), slice(0, 1))
+        position, _ = simulation.go_on(ChainRun(torque, slopes, missing, step, FINER), slice(0, 1))
         if position is None:
             raise PeriodicityError("with these parameters the simulated arm diverges from the measured motion")
         positions[:, k % samples] = position[0]

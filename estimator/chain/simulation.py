@@ -28,6 +28,8 @@ class ChainRun:
     """Angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
     """Length of a step [s]."""
+    finer: int = 1
+    """Steps in place of one where a joint may be near standstill."""
 
 
 PIECE = 256  # samples whose derivatives stay in the processor's cache
@@ -91,7 +93,7 @@ class Simulation:
         derivative = np.empty((*measured.shape, self._causes))
         stayed = run(
             *(*self._arm, torque, run_.slopes[piece], measured),
-            *(self._gain, run_.step, self._columns, self._room, position, derivative),
+            *(self._gain, run_.step, run_.finer, self._columns, self._room, position, derivative),
         )
         return (position if stayed and np.all(np.isfinite(position)) else None), derivative
 

@@ -43,9 +43,10 @@ class ChainOptions:
     coarse_step: float = 2.6e-3
     """Of integration [s]."""
     fine_step: float = 0.85e-3
-    width_floor: float = 3e-3
-    """What the width of every Coulomb step stays above [rad/s]: with three steps a sample at 400 Hz, friction that
-    sticks is not told from this."""
+    finer: int = 4
+    """Steps in place of one of those near standstill."""
+    width_floor: float = 1e-3
+    """What the width of every Coulomb step stays above [rad/s]: friction that sticks is not told from this."""
     initial_width: float = 0.03
     """[rad/s]"""
     min_initial_lag: float = 5e-4
@@ -117,7 +118,7 @@ def fit_periods(
             break
         found, softness = trial, frequency
     assert found is not None
-    fine = problem.softer(softness)
+    fine = replace(problem, softness=softness, finer=options.finer)
     near = fine.minimise(found.x, options.ftol_near)
     positions = fine.positions(near.x)
     assert positions is not None  # the minimum's motion is finite

@@ -32,6 +32,7 @@ JOINT_TERMS = (
     *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
     *("torque_scale", "zero"),
 )
+NEAR = 6.0  # widths of friction's step, from standstill
 WORST = 1e4  # rad or rad/s: a simulation that comes here has run away
 
 
@@ -180,6 +181,15 @@ def _follow(
             direct[i, column] = work[6][i, j]
 
 
+def _near_standstill(p: Any, v: Any, k: Any, step: float) -> bool:
+    """Whether a joint is in the steep part of its friction, or may get there in this step; k: last accelerations."""
+    for j in range(v.size):
+        ahead = v[j] + 2.0 * step * k[j]
+        if p[COULOMB, j] > 0.0 and (min(abs(v[j]), abs(ahead)) < NEAR * p[WIDTH, j] or v[j] * ahead < 0.0):
+            return True
+    return False
+
+
 def _run_loop(  # noqa: PLR0912
     chain: Any,
     links: Any,
@@ -190,19 +200,20 @@ def _run_loop(  # noqa: PLR0912
     measured: Any,
     gain: Any,
     step: float,
+    finer: int,
     columns: Any,
     room: Any,
     position: Any,
     derivative: Any,
 ) -> bool:
     """Simulate as many samples as `torque` (samples, steps, joints) has, from state (2, joints), into position
-    (samples, joints) and derivative (samples, joints, causes); without derivatives where there are no causes."""
+    (samples, joints) and derivative (samples, joints, causes); without derivatives where there are no causes. A step in
+    which a joint may come near standstill is cut into `finer` ones."""
     work, solve, motion, by, zq, zv, dk, dl, R, direct, twice = room
     q1, v1, k, m, nothing, ahead = motion
     q, v = state[0], state[1]
     n, causes = q.size, derivative.shape[2]
     width = (causes + 7) // 8 * 8
-    h, gh = step, GAMMA * step
     for sample in range(torque.shape[0]):
         for j in range(n):
             position[sample, j] = q[j]
@@ -221,39 +232,43 @@ def _run_loop(  # noqa: PLR0912
                         zq[j, c] *= 1.0 - gain[0, j]
         for s in range(torque.shape[1]):
             t = torque[sample, s]
-            if not _stage(chain, links, p, q, v, t, nothing, gh, k, work, solve):
-                return False
-            if causes > 0:
-                _follow(chain, links, p, v, t, slopes[sample, s], k, gh, columns, work, solve, by, direct)
-                for i in range(n):
-                    for c in range(width):
-                        R[i, c] = direct[i, c]
-                _combine(work[6], zq, work[7], zv, n, width, R)
-                _solved(solve[2], R, n, width, dk)
-            for j in range(n):
-                q1[j], v1[j], ahead[j] = q[j] + h * v[j], v[j] + h * k[j], 2.0 * k[j]
-            if not _stage(chain, links, p, q1, v1, t, ahead, gh, m, work, solve):
-                return False
-            if causes > 0:
-                _follow(chain, links, p, v1, t, slopes[sample, s], m, gh, columns, work, solve, by, direct)
-                for i in range(n):
-                    for j in range(n):
-                        # By v' = v + h k, and by k through the acceleration.
-                        twice[0, i, j] = h * work[7][i, j] + 2.0 * work[4][i, j]
-                        twice[1, i, j] = work[7][i, j] + h * work[6][i, j]
-                    for c in range(width):
-                        R[i, c] = direct[i, c]
-                _combine(work[6], zq, twice[1], zv, n, width, R)
-                _combine(twice[0], dk, twice[2], dk, n, width, R)
-                _solved(solve[2], R, n, width, dl)
+            pieces = finer if _near_standstill(p, v, k, step) else 1
+            h = step / pieces
+            gh = GAMMA * h
+            for _ in range(pieces):
+                if not _stage(chain, links, p, q, v, t, nothing, gh, k, work, solve):
+                    return False
+                if causes > 0:
+                    _follow(chain, links, p, v, t, slopes[sample, s], k, gh, columns, work, solve, by, direct)
+                    for i in range(n):
+                        for c in range(width):
+                            R[i, c] = direct[i, c]
+                    _combine(work[6], zq, work[7], zv, n, width, R)
+                    _solved(solve[2], R, n, width, dk)
                 for j in range(n):
-                    for c in range(width):
-                        zq[j, c] += h * zv[j, c] + 0.5 * h * h * dk[j, c]
-                    for c in range(width):
-                        zv[j, c] += h * (1.5 * dk[j, c] + 0.5 * dl[j, c])
-            for j in range(n):
-                q[j] += h * v[j] + 0.5 * h * h * k[j]
-                v[j] += h * (1.5 * k[j] + 0.5 * m[j])
+                    q1[j], v1[j], ahead[j] = q[j] + h * v[j], v[j] + h * k[j], 2.0 * k[j]
+                if not _stage(chain, links, p, q1, v1, t, ahead, gh, m, work, solve):
+                    return False
+                if causes > 0:
+                    _follow(chain, links, p, v1, t, slopes[sample, s], m, gh, columns, work, solve, by, direct)
+                    for i in range(n):
+                        for j in range(n):
+                            # By v' = v + h k, and by k through the acceleration.
+                            twice[0, i, j] = h * work[7][i, j] + 2.0 * work[4][i, j]
+                            twice[1, i, j] = work[7][i, j] + h * work[6][i, j]
+                        for c in range(width):
+                            R[i, c] = direct[i, c]
+                    _combine(work[6], zq, twice[1], zv, n, width, R)
+                    _combine(twice[0], dk, twice[2], dk, n, width, R)
+                    _solved(solve[2], R, n, width, dl)
+                    for j in range(n):
+                        for c in range(width):
+                            zq[j, c] += h * zv[j, c] + 0.5 * h * h * dk[j, c]
+                        for c in range(width):
+                            zv[j, c] += h * (1.5 * dk[j, c] + 0.5 * dl[j, c])
+                for j in range(n):
+                    q[j] += h * v[j] + 0.5 * h * h * k[j]
+                    v[j] += h * (1.5 * k[j] + 0.5 * m[j])
     return True
 
 
@@ -261,7 +276,7 @@ def _run_loop(  # noqa: PLR0912
 _inner: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True
 )
-_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow = map(
-    _inner, (_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow)
+_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _near_standstill = map(
+    _inner, (_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _near_standstill)
 )
 run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"})

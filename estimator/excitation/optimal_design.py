@@ -19,6 +19,7 @@ from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.models.parameters import ABSENT, CONSTANTS, Physics
 from hil.estimator.models.terms import extra_names
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
+from hil.estimator.threads import thread_count
 
 KNOTS = 4  # of each joint's amplitude spectrum, over the logarithm of the line
 SHAPE_TRIALS = 60
@@ -159,7 +160,7 @@ class Problem:
 
         joints = wave.joints
         places = [(row, joint) for row in (0, 1) for joint in range(joints)]
-        with ThreadPoolExecutor(THREADS) as threads:
+        with ThreadPoolExecutor(thread_count(THREADS)) as threads:
             columns = [*threads.map(by_parameter, (*self.names, *self._nuisances(joints)))]
             columns += threads.map(by_state, places)
         return np.stack(columns, axis=1)

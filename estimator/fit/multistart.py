@@ -19,6 +19,7 @@ from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.objective import Objective
 from hil.estimator.models.terms import TERMS, kind_of
 from hil.estimator.options import LikelihoodOptions
+from hil.estimator.threads import thread_count
 
 STANDSTILL_TERMS = tuple(name for name, term in TERMS.items() if term.standstill)
 STRIBECK_TERMS = tuple(name for name, term in TERMS.items() if term.part == "stribeck")
@@ -211,7 +212,7 @@ class Search:
         """
         found: list[Minimum] = []
         lost = ConvergenceError("there was nothing to fit")
-        with ThreadPoolExecutor(min(len(fits), self.options.threads)) as threads:
+        with ThreadPoolExecutor(min(len(fits), thread_count(self.options.threads))) as threads:
             for running in [threads.submit(fit) for fit in fits]:
                 try:
                     found.append(running.result())

@@ -5,7 +5,6 @@ segment's block is eliminated by itself (Schur complement), and its columns of t
 segments at once. Hundreds of initial states cost as much as four.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import numpy.typing as npt
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.options import SegmentedMinimiserOptions
+from hil.estimator.threads import thread_count
 
 Residual = Callable[[int, Array, Array], Array]
 """Residuals (rows,) of one segment at shared coordinates (shared,) and its own (own,)."""
@@ -133,7 +133,7 @@ def minimise_segmented(
     `residual` and `derivative` are called from several threads; the result does not depend on their number. Raises
     ConvergenceError.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(thread_count()) as threads:
         rows = _residuals(residual, shared, own, threads)
         cost = _cost(rows)
         if not np.isfinite(cost):

@@ -11,9 +11,10 @@ R. Mattone, "Sensorless robot collision detection and hybrid force/motion contro
 ensemble of arms; they are updated from sample to sample (recursive least squares, that is, a Kalman filter on constants
 that drift slowly). The admissible motion is thus wide for a poorly known arm and narrows as it moves.
 
-Alarm: for `HOLD_S` the torque lacking in a joint is more than `TIMES` standard deviations of what parameters and noise
-leave open, more than friction can hold while the joint stands, and more than a fraction of the largest planned
-torque. Noise is estimated too: model error (Stribeck friction, play, flexibility) widens the bounds.
+Alarm: for `HOLD_S` (less where it is much) the torque lacking in a joint is more than `TIMES` standard deviations of
+what parameters and noise leave open, more than friction can hold while the joint stands, and more than a share of the
+largest planned torque. Noise is learnt too: what the model lacks (Stribeck friction, play, flexibility) widens what is
+allowed.
 """
 
 import math
@@ -44,7 +45,8 @@ _VELOCITY_STD = 0.0135  # rad/s: a register's step, which is 0.024, and some noi
 _FIRST_NOISE_SHARE = 0.1  # of the largest planned torque
 _NOISE_S = 1.0  # in which the noise is learnt
 _CLIPPED = 9.0  # variances by which one sample may teach it
-_DRIFT = 0.03  # of its first deviation by which a parameter may drift in a second, as a standard deviation
+_DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # of its value, of its first deviation: a parameter's drift in a second
+_MOST_WEIGHT = 4.0  # of a sample in which so many times as much lacks as may
 _WARM_S = 3 * FILTER_S
 _LONGEST_GAP = 3.0  # intervals between two samples behind which the past is forgotten
 
@@ -74,9 +76,8 @@ class MomentumObserver:
         self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * largest) ** 2
         floor = np.zeros(2)
         floor[:joints] = FLOOR_SHARE * largest
-        self._constants = np.concatenate(
-            ([joints, interval, *floor], (_DRIFT**2 * np.diag(covariance)), (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2)
-        )
+        drift = _LEAST_DRIFT**2 * np.diag(covariance)
+        self._constants = np.concatenate(([joints, interval, *floor], drift, (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2))
         self.observe((0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf)  # compiled, and begun anew
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
@@ -179,12 +180,12 @@ def _of_rounding(m: Any, j: int, slope: float) -> float:
     return float(rounding * rounding)
 
 
-def _alarms(single: Any, j: int, is_beyond: bool, dt: float) -> bool:
-    """Whether the discrepancy has lasted long enough for an alarm."""
-    if not is_beyond:
+def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
+    """Whether what lacks, as a share of what may, is more and lasts long enough: the shorter the more it is."""
+    if share <= 1.0:
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
         return False
-    single[_HELD + j] += dt
+    single[_HELD + j] += dt * min(share, _MOST_WEIGHT)
     single[_SAMPLES + j] += 1.0
     return bool(single[_HELD + j] >= HOLD_S and single[_SAMPLES + j] >= 2.0)
 
@@ -205,7 +206,7 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
     lesson = is_warm and single[_LESSON] >= FILTER_S
     if lesson:
         for i in range(_COUNT):
-            m[_COVARIANCE + i, i] += k[4 + i] * single[_LESSON]
+            m[_COVARIANCE + i, i] += (k[4 + i] + (_DRIFT * m[_THETA, i]) ** 2) * single[_LESSON]
         single[_LESSON] = 0.0
     alarm = -1
     row, gain = np.empty(_COUNT), np.empty(_COUNT)
@@ -219,7 +220,7 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
         spread = left_open + rounding + single[_NOISE + j]
         beyond = max(abs(lacking) - holds, 0.0)
         is_beyond = beyond > TIMES * math.sqrt(spread)
-        if _alarms(single, j, is_beyond and beyond > k[2 + j], dt):
+        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), k[2 + j]), dt):
             alarm = j
         taught = min(beyond * beyond, _CLIPPED * spread) - left_open - rounding
         single[_NOISE + j] += min(dt / _NOISE_S, 1.0) * (max(taught, k[4 + _COUNT + j]) - single[_NOISE + j])

@@ -66,9 +66,14 @@ class Choice:
         return self.chosen.estimate
 
     @property
+    def plainest(self) -> Trial:
+        """The trial with the fewest parameters that could be fitted."""
+        return min((each for each in self.trials if each.estimate is not None), key=lambda each: len(each.model.names))
+
+    @property
     def gained(self) -> float:
         """The plainest model's error over the chosen one's."""
-        return self.trials[0].score / self.chosen.score
+        return self.plainest.score / self.chosen.score
 
     @property
     def cost(self) -> float:
@@ -76,13 +81,17 @@ class Choice:
         model lacks were known: what adding them cost (geometric mean)."""
         estimate = self.estimate
         std = estimate.std
-        seen = np.isfinite(std)
-        added = seen & [name not in self.trials[0].model.names for name in estimate.names]
+        seen = np.isfinite(std) & (std > 0.0)
+        added = seen & [name not in self.plainest.model.names for name in estimate.names]
         base = seen & [name in estimate.model.base_names for name in estimate.names]
-        correlation = np.where(np.outer(seen, seen), estimate.covariance, 0.0) / np.outer(std, std)
+        if not added.any():
+            return 1.0
+        correlation = np.where(np.outer(seen, seen), estimate.covariance, 0.0) / np.outer(
+            np.where(seen, std, 1.0), np.where(seen, std, 1.0)
+        )
         across = correlation[np.ix_(added, base)]
-        told = np.sum(across * np.linalg.solve(correlation[np.ix_(added, added)], across), axis=0)
-        return float(np.exp(-0.5 * np.mean(np.log1p(-told))))
+        told = np.sum(across * (np.linalg.pinv(correlation[np.ix_(added, added)]) @ across), axis=0)
+        return float(np.exp(-0.5 * np.mean(np.log1p(-np.clip(told, 0.0, 1.0 - 1e-9)))))
 
 
 def choose(

@@ -67,6 +67,7 @@ class FakeBus:
         """When the cable was pulled last."""
         self._servos = tuple(servos)
         self._joints = Joints(servos, plant, joints)
+        self._one_each = self._joints.one_each
         self._supply = supply
         self._wire = Wire(baud, adapter_latency_us * 1e-6)
         self._echoes = adapter_echoes
@@ -223,7 +224,7 @@ class FakeBus:
                 event = True
         if event:
             self._advance_by_events(until)
-        elif self._joints.one_each:
+        elif self._one_each:
             self.plant.advance(until - self._origin, commands)
             self._now = until
         else:
@@ -339,6 +340,9 @@ class FakeBus:
 
     def joints(self) -> States:
         """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
+        if self._one_each:
+            plant = self.plant
+            return plant.position, plant.velocity, plant.current
         return self._joints.states()
 
     def is_moving(self, servo: Servo) -> bool:

@@ -190,10 +190,16 @@ class Instructions:
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
         writers = self._writers
+        refuse = self._line.servos_refuse
         for at in range(4, len(body) - length, length + 1):
-            for servo in writers.get(body[at], ()):
-                if servo.heard_at == now:
-                    self._write(servo, body[at], address, body[at + 1 : at + 1 + length], now)
+            servo_id = body[at]
+            for servo in writers.get(servo_id, ()):
+                if servo.heard_at != now:
+                    continue
+                if servo.id == servo_id and not refuse:
+                    servo.write(address, body[at + 1 : at + 1 + length])
+                else:
+                    self._write(servo, servo_id, address, body[at + 1 : at + 1 + length], now)
 
     def _bulk_write(self, body: bytes, now: float) -> None:
         at = 0

@@ -9,7 +9,7 @@ from hil.api.progress import OnProgress, Progress, ignore
 from hil.api.run import Estimation, Identification, Run, estimation, identification
 from hil.errors import ConfigError, RecordingCutShort
 from hil.estimation.settled_estimate import estimate_run
-from hil.estimation.unsettled_estimate import estimate_csv, estimate_unsettled
+from hil.estimation.unsettled.estimate import estimate_csv, estimate_unsettled
 from hil.runs.run_folder import RunFolder
 
 __all__ = ["estimate"]

@@ -1,6 +1,8 @@
 """`hil.identify` and `hil.record`: an experiment on the bus, or on a fake one."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
@@ -65,15 +67,16 @@ def identify(
     def say(message: str) -> None:
         tell(Progress("experiment", message))
 
-    if checked.experiment.pilot:
-        from hil.pilot import identify_in_steps
+    with _discarding(run):
+        if checked.experiment.pilot:
+            from hil.pilot import identify_in_steps
 
-        torque, result = identify_in_steps(checked, run, shown, watch, say)
-        say(torque)
-    else:
-        say(run_experiment(checked, run, shown, watch))
-        tell(Progress("estimation", "Estimating"))
-        result = estimate_run(run)
+            torque, result = identify_in_steps(checked, run, shown, watch, say)
+            say(torque)
+        else:
+            say(run_experiment(checked, run, shown, watch))
+            tell(Progress("estimation", "Estimating"))
+            result = estimate_run(run)
     write_run_report(run)
     log.info("%s: trust this model: %s", run.path, result.verdict.trust)
     return identification(result, run.path)
@@ -100,9 +103,20 @@ def record(
         )
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
-    torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
+    with _discarding(run):
+        torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
     tell(Progress("experiment", torque))
     return load_run(run.path)
+
+
+@contextmanager
+def _discarding(run: RunFolder) -> Iterator[None]:
+    """A start that fails before the first sample leaves no folder in the way of the next try."""
+    try:
+        yield
+    except BaseException:
+        run.discard_if_unused()
+        raise
 
 
 def loaded(config: ConfigLike) -> tuple[Config, Path]:

@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from hil import __version__
-from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema
+from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
 from hil.cli.errors import exit_code, message
 from hil.cli.verbosity import with_verbosity
 
@@ -56,6 +56,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "runs": (runs.runs, "runs"),
     "note": (runs.note, 'runs/20261121-153000-fake_two_link --text "new gearbox"'),
     "diff": (runs.diff, "runs/before runs/after --png wear.png"),
+    "study": (study.study, "studies/seeds.toml --workers 2"),
     "compare": (data.compare, "runs/20261121-153000-fake_two_link"),
     "calibrate": (data.calibrate, "runs/bare runs/with_mass --mass 0.1 --distance 0.16 --length 0.147"),
     "fake": (fake_command.fake, "koch --pty --link /tmp/arm"),

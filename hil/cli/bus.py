@@ -27,8 +27,8 @@ def scan(
     json_only: Json = False,
 ) -> None:
     """Find servos: every baud, every ID, with model, firmware, voltage, temperature and errors."""
-    from hil.cli.setup_view import print_ports, print_scan, scanned
     from hil.cli.terminal import Terminal
+    from hil.cli.views.setup_view import print_ports, print_scan, scanned
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
@@ -53,8 +53,8 @@ def scan(
 def check(config: ConfigPath, json_only: Json = False) -> None:
     """Check for everything that would stop an experiment and say how to fix it. Torque stays off."""
     from hil.api.check import check as check_arm
-    from hil.cli.setup_view import print_findings
     from hil.cli.terminal import Terminal
+    from hil.cli.views.setup_view import print_findings
 
     with Terminal(quiet=json_only).following(config) as follow:
         report = check_arm(config, on_progress=follow)
@@ -79,7 +79,7 @@ def setup(
     json_only: Json = False,
 ) -> None:
     """Set a servo's ID, baud, return delay or Secondary ID: a question before each write, each write read back."""
-    from hil.cli.setup_view import changed, print_changes
+    from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES

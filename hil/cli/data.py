@@ -43,14 +43,16 @@ def calibrate(
     with_mass: Annotated[
         Path, typer.Argument(metavar="RUN_WITH_MASS", help="Run folder of the arm with the mass bolted on.")
     ],
-    mass: Annotated[float, typer.Option("--mass", metavar="KG", help="Mass bolted to the last link.")],
+    mass: Annotated[float, typer.Option("--mass", min=1e-6, metavar="KG", help="Mass bolted to the last link.")],
     distance: Annotated[
-        float, typer.Option("--distance", metavar="M", help="Distance of its centre from the last joint.")
+        float, typer.Option("--distance", min=1e-6, metavar="M", help="Distance of its centre from the last joint.")
     ],
     length: Annotated[
-        float | None, typer.Option("--length", metavar="M", help="Length of link 1; default known.length_1.")
+        float | None, typer.Option("--length", min=1e-6, metavar="M", help="Length of link 1; default known.length_1.")
     ] = None,
-    inertia: Annotated[float, typer.Option("--inertia", metavar="KG_M2", help="Inertia about its own centre.")] = 0.0,
+    inertia: Annotated[
+        float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia about its own centre.")
+    ] = 0.0,
     json_only: Json = False,
 ) -> None:
     """Each joint's torque constant, from a second run with a known mass bolted on."""
@@ -60,6 +62,8 @@ def calibrate(
     from hil.results.json_form import to_json
     from hil.runs.run_folder import RunFolder
 
+    if without.resolve() == with_mass.resolve():
+        raise typer.BadParameter(f"{without} is given twice: one run without the mass, one with it.")
     runs = RunFolder.open(without), RunFolder.open(with_mass)
     known = runs[0].load_config().known
     if length is None and known is not None and known.length_1 is not None:

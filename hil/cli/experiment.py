@@ -79,7 +79,7 @@ def _show(result: "Identification | Estimation", json_only: bool) -> None:
     from rich.console import Console
 
     from hil.api.run import Identification
-    from hil.cli.result_table import print_result, print_shooting_result
+    from hil.cli.views.result_table import print_result, print_shooting_result
     from hil.runs.run_folder import RunFolder
 
     if isinstance(result, Identification):

@@ -10,8 +10,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hil.api.progress import OnProgress
 from hil.api.progress import Progress as Report
-from hil.cli.live_view import LiveView
 from hil.cli.verbosity import is_quiet
+from hil.cli.views.live_view import LiveView
 from hil.config.schema import Config, load_config
 from hil.experiment.stream import Progress as StreamProgress
 from hil.experiment.stream import Watch

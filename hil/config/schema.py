@@ -38,6 +38,9 @@ from hil.toml_errors import UNSAID, describe
 
 FAKE_URL = "fake://"
 
+DRIFT = 5.0
+"""Times experiment.settle_within."""
+
 SLOW_INTERVAL_S = 0.25
 """From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
 
@@ -241,9 +244,6 @@ class ExperimentConfig(_Table):
     settle_within: PositiveFloat = Field(
         0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
     )
-    drift_within: float = Field(
-        0.05, ge=0, lt=1, description="the same, for a motion that still drifts after max_settling_periods"
-    )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="number of settled periods recorded")
     held_out: bool = Field(True, description="play a second multisine with other phases to validate the model")
@@ -266,6 +266,11 @@ class ExperimentConfig(_Table):
             if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
                 raise ValueError(f"lines: each list needs different harmonics from 1 to {samples // 4:g}")
         return self
+
+    @property
+    def drift_within(self) -> float:
+        """As settle_within, of a motion that after max_settling_periods only drifts, as while grease warms."""
+        return DRIFT * self.settle_within
 
     @property
     def samples(self) -> int:
@@ -550,7 +555,7 @@ def _url_of(port: str) -> str:
     if "://" in port:
         return port
     config = find_config(Path(port))
-    if config.suffix == ".toml":
+    if config.suffix == ".toml" or config.is_file():
         return load_config(config).url
     arm = find_arm(port)
     return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port

@@ -26,6 +26,7 @@ from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import scaled_feedback
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
+from hil.estimator.threads import thread_count
 from hil.plan.brake import GETS_FASTER, NOTICED_AFTER, braking_gains
 from hil.plan.plan import Plan
 from hil.plan.silence import missing_limit
@@ -134,7 +135,7 @@ def _farthest(
         from_here = starts(physics, scale)
         return [stops.farthest(physics, scale, from_here, commands) for commands in ways.values()]
 
-    with ThreadPoolExecutor(_THREADS) as threads:  # the compiled simulation lets go of the interpreter
+    with ThreadPoolExecutor(thread_count(_THREADS)) as threads:  # the compiled simulation lets go of the interpreter
         worst = np.max(list(threads.map(one, range(few.size))), axis=0)
     return dict(zip(ways, worst, strict=True))
 

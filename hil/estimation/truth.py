@@ -20,8 +20,8 @@ def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] 
     truth = base_parameters(fake.arm, time)
     if fake.arm is None:
         return truth
-    parts = zip(config.joints, fake.servos, fake.arm.drives, strict=True)
-    for number, (joint, servo, drive) in enumerate(parts, start=1):
+    for servo, moved in zip(fake.servos, fake.joints, strict=True):
+        joint, drive, number = config.joints[moved], fake.arm.drives[moved], moved + 1
         if joint.drive_mode is Mode.PWM:
             motor = load_model(servo.model)
             truth[f"viscous_{number}"] += drive.torque_constant * motor.back_emf_v_s / motor.resistance_ohm

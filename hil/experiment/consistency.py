@@ -44,8 +44,8 @@ class Consistency:
         moved, felt = position - former, 0.5 * (before + velocity) * seconds
         change = velocity - before
         self._apart = kept * self._apart + moved - felt
-        self._open = kept * self._open + SCALE * (moved if moved > 0 else -moved)
-        self._open += CURVED * seconds * (change if change > 0 else -change)
+        self._open = kept * self._open + SCALE * abs(moved)
+        self._open += CURVED * seconds * abs(change)
         highest, lowest = kept * self._highest + (1 - kept) * velocity, kept * self._lowest + (1 - kept) * velocity
         self._highest = highest = velocity if velocity > highest else highest
         self._lowest = lowest = velocity if velocity < lowest else lowest

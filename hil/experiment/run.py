@@ -38,6 +38,9 @@ _PATIENCE_S = 0.2
 
 _MOVED = 2.0
 
+_LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
+"""How long the next run waits for an arm to come to rest, how often it looks, and how little may change in between."""
+
 
 def run_experiment(
     config: Config,
@@ -63,6 +66,8 @@ def run_experiment(
 
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
+        if has_moved():
+            _wait_for_rest(bus)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
@@ -171,10 +176,21 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if bus.port.latency_measured:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: this adapter was measured to hold replies back for "
-            f"{bus.port.latency * 1e3:.0f} ms, which "
-            f"allows at most {1 / slowest:.0f} Hz. Lower the rate, or use a wired adapter with a short latency, such "
-            "as a U2D2."
+            f"{bus.port.latency * 1e3:.0f} ms, which allows at most {1 / slowest:.0f} Hz. Lower the rate, or use a "
+            "wired adapter with a short latency, such as a U2D2."
         )
+
+
+def _wait_for_rest(bus: ServoBus) -> None:
+    """A run that ended early leaves the arm swinging: wait for it, at most _LONGEST_REST_S."""
+    clock = bus.port.clock
+    former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S
+    while clock.now() < end:
+        clock.wait_until(clock.now() + _REST_EVERY_S)
+        latest = bus.read_positions()
+        if all(abs(now - before) < _REST_WITHIN_RAD for now, before in zip(latest, former, strict=True)):
+            return
+        former = latest
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:

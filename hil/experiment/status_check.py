@@ -55,7 +55,8 @@ class StatusCheck:
         if status.watchdog == _TRIPPED:
             return Cause.WATCHDOG, (
                 "has lost its torque: its watchdog tripped (Bus Watchdog reads 255), so it received nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Check its plug and cable."
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Check its plug and cable, unless the computer kept this "
+                "program waiting."
             )
         if status.watchdog == 0 and self._may_be_unwatched:
             return None

@@ -72,7 +72,8 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._guard = Guard(config, planned)
-        self._model = ModelWatch(config, planned, arms)
+        # Of a chain there is no such model yet: position, velocity, current and status are what is looked at.
+        self._model = None if config.is_chain else ModelWatch(config, planned, arms)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -141,10 +142,9 @@ class Stream:
             return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
-            f"drifts slowly: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and experiment.drift_within {self._plan.drift_within:.1%} for slow "
-            "drift. "
-            "Check for play, a dragging cable or a slipping joint; or raise "
+            f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. Check for play, a "
+            "dragging cable or a slipping joint; or raise "
             "max_settling_periods."
         )
 
@@ -212,7 +212,8 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
-        self._model.look(state)
+        if self._model is not None:
+            self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 

@@ -171,7 +171,9 @@ class Search:
 
     def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
         played_config = with_torque(config, found.peak_torque)
-        played = self.play(played_config, self.run.below(folder, played_config), name, found)
+        # Settled or not, its first period teaches; an arm that is ramped out comes to rest, one that is cut off swings.
+        calm = Amplitude(replace(found.plan, settle_within=np.inf), found.peak_torque, found.prediction)
+        played = self.play(played_config, self.run.below(folder, played_config), name, calm)
         self.learn(played_config, played)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:

@@ -6,6 +6,7 @@ way from the rest pose to the path and back is part of what is played.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from hil.estimator.chain.excitation import Path, design_path
 from hil.estimator.chain.geometry import Chain
 from hil.estimator.chain.prior import Prior
 from hil.estimator.excitation.multisine import Multisine
-from hil.plan.plan import IDENTIFY, ROLES, Plan, Segment, end_samples, make_plan
+from hil.plan.plan import Plan, Segment, make_plan, plan_with
 
 Array = NDArray[np.float64]
 
@@ -83,21 +84,10 @@ def make_chain_plan(config: Config) -> Plan:
     if config.joint_path is None or experiment.band is None:
         raise ConfigError(f"{config.path}: joint_path is missing: [joint_path] with centre, swing and speed per joint.")
     known = known_chain(config)
-    roles = ROLES if experiment.held_out else (IDENTIFY,)
-    return Plan(
-        rate=experiment.rate,
-        segments=tuple(_segment(config, known, role, experiment.seed + offset) for offset, role in enumerate(roles)),
-        rest_samples=max(1, round(experiment.rest * experiment.rate)),
-        end_samples=end_samples(config),
-        brake_samples=round(config.safety.damp_time * experiment.rate),
-        max_settling_periods=experiment.max_settling_periods,
-        periods=experiment.periods,
-        settle_within=experiment.settle_within,
-        drift_within=experiment.drift_within,
-    )
+    return plan_with(config, partial(_segment, known))
 
 
-def _segment(config: Config, known: KnownChain, role: str, seed: int) -> PathSegment:
+def _segment(known: KnownChain, config: Config, role: str, seed: int) -> PathSegment:
     experiment, wanted = config.experiment, config.joint_path
     assert wanted is not None
     assert experiment.band is not None  # checked above

@@ -1,7 +1,7 @@
 """The excitation plan: the multisines of an experiment as goal currents, sample by sample, ramps included."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,13 +105,18 @@ def period_current(config: Config, multisine: Multisine) -> NDArray[np.float64]:
 
 def make_plan(config: Config) -> Plan:
     """Design the multisines of a planar arm; the same seed gives the same plan."""
+    return plan_with(config, _segment)
+
+
+def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) -> Plan:
+    """What is played, each segment designed by `segment` for its role with a seed of its own."""
     experiment = config.experiment
     roles = ROLES if experiment.held_out else (IDENTIFY,)
     return Plan(
         rate=experiment.rate,
-        segments=tuple(_segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
+        segments=tuple(segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
         rest_samples=max(1, round(experiment.rest * experiment.rate)),
-        end_samples=end_samples(config),
+        end_samples=_end_samples(config),
         brake_samples=round(config.safety.damp_time * experiment.rate),
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
@@ -125,7 +130,7 @@ def rest_window(rate: float) -> int:
     return max(1, round(0.2 * rate))
 
 
-def end_samples(config: Config) -> int:
+def _end_samples(config: Config) -> int:
     """Samples that coming to rest may take: whole windows."""
     rate = config.experiment.rate
     window = rest_window(rate)

@@ -15,6 +15,7 @@ period.npz      the settled periods as measured and as the model has them (hil.r
 import json
 import logging
 import platform
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime
@@ -22,6 +23,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import ValidationError
 
 from hil import __version__, strict_json
@@ -74,6 +76,21 @@ class RunRecord(RunFacts):
 Facts = TypeVar("Facts", bound=RunFacts)
 
 
+_OF_A_START = frozenset(
+    {
+        "config.toml",
+        "experiment.json",
+        "stabiliser.json",
+        "starts.json",
+        "run.json",
+        "events.jsonl",
+        "samples.npy",
+        "servo_settings.json",
+    }
+)
+_DESCRIPTIONS = (".urdf", ".xml")
+
+
 class RunFolder:
     """A folder of one run. `create` makes a new one, `open` reads one that exists."""
 
@@ -94,6 +111,19 @@ class RunFolder:
         except OSError as error:
             raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
         return run
+
+    def discard_if_unused(self) -> bool:
+        """Remove the folder of a start that failed before the first sample; whether it was removed.
+
+        The same --out can then be used again. A folder with a sample, a result or a file of somebody else's is kept.
+        """
+        files = [path for path in self.path.rglob("*") if path.is_file()]
+        if any(path.name not in _OF_A_START and path.suffix not in _DESCRIPTIONS for path in files):
+            return False
+        if any(path.name == "samples.npy" and _has_samples(path) for path in files):
+            return False
+        shutil.rmtree(self.path, ignore_errors=True)
+        return not self.path.exists()
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
@@ -262,6 +292,17 @@ def _urdfs(config: Config) -> set[Path]:
     chain = None if config.fake is None else config.fake.chain
     named = [config.arm.urdf, None if chain is None else chain.urdf]
     return {Path(each) for each in named if each is not None}
+
+
+def _has_samples(path: Path) -> bool:
+    """Whether anything was recorded in it; what cannot be read may have been."""
+    from hil.runs.recording import Phase
+
+    try:
+        phases = np.load(path, allow_pickle=False, mmap_mode="r")["phase"]
+    except (OSError, ValueError, IndexError, EOFError):
+        return True
+    return bool((phases != Phase.NOT_RECORDED).any())
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ _AT_ONCE_S = 0.005
 
 def others_on_the_bus(bus: ServoBus) -> list[str]:
     """Each servo at this baud that is not one of the arm's, in words; raises PortLost."""
-    ours = {joint.id for joint in bus.joints}
+    ours = {drive.id for drive in bus.drives}
     heard = listen(bus.port) if isinstance(bus.port.clock, WallClock) else listen(bus.port, _AT_ONCE_S)
     return [_describe(bus, found) for found in heard.servos if found.id not in ours]
 

@@ -12,10 +12,10 @@ from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNo
 from hil.drivers.joint import Joint
 from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.packet import MAX_ID, HardwareError
-from hil.drivers.preparation import TIME_BASED_PROFILE, check_quiet
+from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
-from hil.drivers.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.setup.bus_rate import check_rate, goals_taken
 from hil.setup.others import others_on_the_bus
 from hil.setup.servo_session import recover

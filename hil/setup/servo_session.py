@@ -17,9 +17,9 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
-from hil.drivers.settings import put_back, read_settings
 from hil.drivers.shield import signals_held_back
 from hil.errors import RunFolderError
 from hil.setup import settings_file
@@ -177,9 +177,12 @@ def recover(servo: Servo, port: str) -> list[str]:
 
 
 def _before(kept: Kept, present: dict[str, int]) -> dict[str, int]:
-    """What the servo was set to before the program that was killed; what somebody has changed since then stays."""
-    ours = {name for name, value in kept.changed.items() if present.get(name) == value}
-    if "Operating Mode" not in ours and "Operating Mode" in kept.changed:
-        return {**present, **{name: kept.settings[name] for name in ours if name in kept.settings}}
-    since = {name: value for name, value in present.items() if name in kept.changed and name not in ours}
-    return {**kept.settings, **since}
+    """What the servo was set to before the program that was killed; what somebody has changed since then stays.
+
+    A register that holds neither what that program set nor what it found was changed by somebody else. With another
+    Operating Mode the goals and gains belong to that mode.
+    """
+    theirs = {name for name, value in kept.changed.items() if present.get(name) not in (value, kept.settings.get(name))}
+    wanted = present if "Operating Mode" in theirs else kept.settings
+    untouched = {name: kept.settings[name] for name in kept.changed if name in kept.settings and name not in theirs}
+    return {**wanted, **untouched, **{name: present[name] for name in theirs if name in present}}

@@ -12,6 +12,7 @@ from hil.drivers.bus import BusConfig, ServoBus
 from hil.drivers.errors import BusShared, NoReply, ServoFault, WrongSetting
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.packet import HardwareError
+from hil.drivers.rate import FixedRate
 from hil.drivers.servo_model import Mode, servo_model
 from hil.fakes.bus.faults import Fault
 from hil.fakes.description import FakeArm
@@ -244,3 +245,28 @@ def test_fakes_register_knows_the_url_that_the_driver_is_given() -> None:
     fakes.register()
     with ServoBus.open(BusConfig("fake://fake_two_link", 1_000_000, (Joint("a", 1, XM430, zero_ticks=3072),))) as bus:
         assert bus.read_positions() == pytest.approx((-math.pi / 2,), abs=2e-3)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_six_servos_with_shadows_hold_400_hz_at_1_mbaud(opened: Open, fast: bool) -> None:
+    servos = ({"joint": 1}, {"joint": 1, "direction": -1}, {"joint": 2}, {"joint": 2, "direction": -1}, {}, {})
+    described = {
+        "servos": [{"id": n, "model": "XM540-W270", "zero_ticks": 2048} | s for n, s in enumerate(servos, 1)],
+        "plant": "hil.fakes.plants.independent:make_plant",
+        "plant_options": {"joints": [ONE] * 4},
+        "adapter_latency_us": 60.0,
+    }
+    xm540 = servo_model("XM540-W270")
+    joints = (
+        Joint("a", 1, xm540, zero_ticks=2048, seconds=(SecondServo(2, -1),)),
+        Joint("b", 3, xm540, zero_ticks=2048, seconds=(SecondServo(4, -1),)),
+        Joint("c", 5, xm540, zero_ticks=2048),
+        Joint("d", 6, xm540, zero_ticks=2048),
+    )
+    bus, port = opened(FakeArm.model_validate(described), *joints, fast_sync_read=fast, interval=1 / 400)
+    rate = FixedRate(port.clock, 400.0)
+    with bus, bus.torque(watchdog=0.1):
+        for _ in range(400):
+            assert not rate.wait().missed
+            assert not any(bus.exchange([0.02] * 4).missing)
+    assert rate.missed == 0

@@ -16,6 +16,7 @@ from typing import Any
 import dynamixel_sdk as sdk
 import pytest
 
+from benchmarks import clients
 from tests.support.paths import ROOT
 
 CONFIG = ROOT / "configs" / "fake_two_link.toml"
@@ -235,3 +236,14 @@ def test_dynamixel_python(device: str) -> None:
         assert bus.factory_reset_except_id_baudrate(2).ok
     finally:
         bus.disconnect()
+
+
+# All of them, by the same calls as the benchmark's
+
+
+@pytest.mark.parametrize("name", ["dynamixel_sdk", "dynamixel_easy_sdk", "rustypot", "dxl2"])
+def test_every_call_of_the_benchmark_is_right(name: str) -> None:
+    outcome = clients.run(name, [sys.executable])
+    if "missing" in outcome:
+        pytest.skip(WHY)
+    assert [each for each in outcome["results"] if each["wrong"]] == []

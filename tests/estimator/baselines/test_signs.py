@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hil.config.csv_columns import load_csv_config
-from hil.estimation.csv_recording import read_csv
+from hil.estimation.unsettled.csv_recording import read_csv
 from hil.estimator.baselines.signs import Signs, suspect_signs
 from hil.estimator.data.recording import Recording
 from tests.support.paths import CONFIGS, DATA

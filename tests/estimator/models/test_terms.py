@@ -56,7 +56,7 @@ def test_every_term_says_what_it_is() -> None:
 def test_every_option_is_a_key_of_the_configuration() -> None:
     for option, words in OPTIONS.items():
         assert ModelConfig.model_fields[option].description == words
-        assert option in wanted_model(ModelConfig(**{option: True}), 2).options
+        assert option in wanted_model(ModelConfig(friction="stribeck", **{option: True}), 2).options
 
 
 def test_names_with_and_without_joints() -> None:

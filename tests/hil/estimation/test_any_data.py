@@ -172,9 +172,10 @@ def test_compare_and_known_quantities_on_one_run(
     assert "centre_2" in capsys.readouterr().out
     physical = json.loads(Path("run/result.json").read_text(encoding="utf-8"))["physical"]
     assert physical["quantities"]["centre_2"]["value"] == pytest.approx(0.112, rel=0.005)
-    # A small difference of large numbers: what is promised is its error bar.
+    # A small difference of large numbers: what is promised is its error bar, which holds that zeros, the ratio of the
+    # torque constants and the like may be off although this model does without them.
     inertia = physical["quantities"]["link_inertia_2"]
-    assert abs(inertia["value"] - 2.9e-4) < 3.0 * inertia["std"] < 1.0e-4
+    assert abs(inertia["value"] - 2.9e-4) < 3.0 * inertia["std"] < 1.5e-4
     assert physical["not_told_apart"] == []
     assert hil("compare", "run", "--json") == 0
     methods = json.loads(capsys.readouterr().out)["methods"]

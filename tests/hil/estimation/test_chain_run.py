@@ -15,7 +15,7 @@ from hil.description.urdf import read_urdf
 from hil.errors import ConfigError
 from hil.estimation.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
-from hil.estimation.unsettled_estimate import estimate_unsettled
+from hil.estimation.unsettled.estimate import estimate_unsettled
 from hil.estimator.chain.dynamics import inverse_dynamics
 from hil.estimator.chain.geometry import Chain, parameter_names
 from hil.experiment.run import run_experiment

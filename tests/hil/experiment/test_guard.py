@@ -111,6 +111,23 @@ def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> No
     assert look(guard, alone[11]._replace(goal_current=(0.45, 0.0), current=(0.45, 0.0))) is Cause.WRONG_SIGN
 
 
+def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:
+    given = "[stabiliser]\nstiffness = [1.0, 1.0]\ndamping = [0.1, 0.1]\n\n[experiment]\n"
+    guard = Guard(arm(("[experiment]\n", given)))
+    for n in range(60):
+        guard.look(
+            STILL._replace(
+                goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0), position=(-1.57 - 0.0075 * n, 0.0)
+            )
+        )
+
+
+def test_lost_torque_is_measured_against_what_the_configuration_plans(arm: Arm) -> None:
+    """0.8 N m at 1.8 N m/A: a third of that is worth speaking of."""
+    off = STILL._replace(goal_current=(0.15, 0.0))
+    assert look(Guard(arm()), *[off] * 14) is Cause.NOT_FOLLOWING
+
+
 def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
     guard = Guard(arm())
     for _ in range(20):

@@ -13,6 +13,7 @@ import pytest
 import serial
 
 from hil.config.schema import Config
+from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, NoReply, PortLost, ServoFault, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import ExperimentError, NotSettled, RunFolderError, SafetyStop, StopRequested
 from hil.experiment.run import run_experiment
@@ -77,6 +78,16 @@ def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: P
     first = load_samples(run(config, tmp_path / "a").samples_path, 2)
     second = load_samples(run(config, tmp_path / "b").samples_path, 2)
     assert first.tobytes() == second.tobytes()
+
+
+def test_a_rest_pose_at_the_encoders_wrap_is_found_on_either_side(arm: Arm) -> None:
+    zeros = (("zero_ticks = 3072  ", "zero_ticks = 1024  "), (SERVO_1, SERVO_1.replace("3072", "1024")))
+    for off in (-0.003, 0.003):
+        start = ("start = [-1.5707963, 0.0]", f"start = [{-1.5707963 + off}, 0.0]")
+        config = arm(*zeros, start)
+        with ServoBus.open(config.bus) as bus:
+            for position in (bus.read_positions(), bus.exchange([0.0, 0.0]).position):
+                assert position == pytest.approx([-1.5707963 + off, 0.0], abs=2e-3)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -182,7 +193,7 @@ def test_a_motion_that_never_settles_is_said(arm: Arm, tmp_path: Path, ports: li
         (("id = 2", "id = 7"), NoReply, r"'elbow' \(ID 7, XM430-W350\) does not answer at 1000000 baud"),
         (("baud = 1_000_000", "baud = 57600"), NoReply, r"'shoulder' \(ID 1.*at 57600 baud"),
         (('model = "XM430-W350"', 'model = "XM540-W270"'), WrongModel, r"a XM430-W350 answers at ID 1"),
-        (("rest_pose = [-1.5707963, 0.0]", "rest_pose = [-1.5707963, 0.5]"), ExperimentError, r"set zero_ticks = 1722"),
+        (("rest_pose = [-1.5707963, 0.0]", "rest_pose = [-1.5707963, 0.7]"), ExperimentError, r"set zero_ticks = 1592"),
         ((SERVO_1, SERVO_1 + 'registers = { "Drive Mode" = 8 }\n'), WrongSetting, r"'shoulder'.*Drive Mode is 8"),
         ((SERVO_1, SERVO_1 + "input_voltage_v = 5.0\n"), ServoFault, r"'shoulder' \(ID 1.*input voltage"),
     ],

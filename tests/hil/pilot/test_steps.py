@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from benchmarks.dry_run import worst_relative_std
-from hil.cli.result_table import print_result
+from hil.cli.views.result_table import print_result
 from hil.config.schema import load_config
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment

@@ -174,14 +174,25 @@ def _raise(_: bytes) -> int:
 
 def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     config = arm(SHORT)
-    with pytest.raises(PortLost), servo_session(config) as bus:
-        monkeypatch.setattr(bench.port, "write", _raise)
+    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
+        gone.setattr(bench.port, "write", _raise)
         bus.exchange([0.0, 0.0])
-    monkeypatch.undo()
     for servo in bench.servos.values():
         servo.write(11, bytes((4,)))
     list(check_arm(config))
     assert [servo.operating_mode for servo in bench.servos.values()] == [4, 4]
+
+
+def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = arm(SHORT)
+    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
+        gone.setattr(bench.port, "write", _raise)
+        bus.exchange([0.0, 0.0])
+    for servo in bench.servos.values():
+        servo.write(11, bytes((3,)))
+        servo.write(102, (7).to_bytes(2, "little"))
+    list(check_arm(config))
+    assert bench.changed() == []
 
 
 def test_a_pilot_writes_each_eeprom_register_twice(tmp_path: Path, bench: Bench) -> None:

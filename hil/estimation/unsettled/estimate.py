@@ -12,12 +12,12 @@ from hil.config.chain import only_planar
 from hil.config.csv_columns import load_csv_config
 from hil.config.schema import ModelConfig
 from hil.errors import ConfigError
-from hil.estimation.csv_recording import read_csv
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.result_checks import describe_segment_choice
 from hil.estimation.settled_warnings import clipping_warnings
-from hil.estimation.unsettled_warnings import any_warnings
+from hil.estimation.unsettled.csv_recording import read_csv
+from hil.estimation.unsettled.warnings import any_warnings
 from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting

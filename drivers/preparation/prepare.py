@@ -6,9 +6,9 @@ from hil.drivers.errors import BusShared, NoReply, ServoFault, WrongReply, Wrong
 from hil.drivers.joint import Joint
 from hil.drivers.packet import Framer, HardwareError
 from hil.drivers.port import Port
+from hil.drivers.preparation.settings import arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import Mode
-from hil.drivers.settings import arms_itself
 
 LISTEN_S = 0.05
 """How long the bus must be quiet before this program speaks on it for good [s]."""
@@ -67,9 +67,8 @@ def check_quiet(port: Port) -> None:
 def shared(what: str) -> BusShared:
     """The error for a bus with another active master."""
     return BusShared(
-        f"Another master {what} on this bus. Two masters corrupt each other's packets, and the other's goals would "
-        "move "
-        "the arm too: end that program, or unplug that controller."
+        f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
+        "other's packets, and the other's goals would move the arm too: end that program, or unplug that controller."
     )
 
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from hil.drivers.clock import Clock
 from hil.drivers.errors import TorqueHeld
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
-from hil.drivers.settings import WATCHDOG_TRIPPED
 
 FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""

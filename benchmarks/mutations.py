@@ -1,0 +1,187 @@
+"""Which small changes of the code that keeps the arm safe pass its tests unnoticed.
+
+    python benchmarks/mutations.py [MODULE ...] [--json] [--every N]
+
+Each mutation changes one operator, comparison, number or boolean of a module (its texts, annotations and zip's `strict`
+aside) and runs that module's tests in a child process. Those that no test notices survive.
+A mutation that makes a test hang counts as noticed after `PATIENCE_S`.
+"""
+
+import argparse
+import ast
+import copy
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PATIENCE_S = 300
+
+_EXPERIMENT = "tests/hil/experiment"
+TESTS = {
+    "hil/experiment/guard.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/following.py": [f"{_EXPERIMENT}/test_following.py"],
+    "hil/experiment/consistency.py": [f"{_EXPERIMENT}/test_consistency.py"],
+    "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
+    "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
+    "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
+    "hil/plan/silence.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
+    "hil/experiment/stream.py": [f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"],
+    "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
+}
+"""Modules, and the tests that have to notice."""
+
+Change = Callable[[], None]
+
+_COMPARE = {
+    ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+}  # fmt: skip
+_OPERATE = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.BitAnd: ast.BitOr}
+
+
+def mutants(source: str) -> Iterator[tuple[int, str, str]]:
+    """Line, what was changed, and the changed source of each mutation."""
+    tree = ast.parse(source)
+    count = sum(1 for _ in _spots(tree))
+    for number in range(count):
+        changed = copy.deepcopy(tree)
+        node, change = list(_spots(changed))[number]
+        line = node.lineno
+        before = ast.unparse(node)
+        change()
+        yield line, f"{before}  ->  {ast.unparse(node)}", ast.unparse(ast.fix_missing_locations(changed))
+
+
+def _spots(tree: ast.AST) -> Iterator[tuple[ast.expr, Change]]:
+    """Every node that can be changed, with the change."""
+    silent = set(_of_messages(tree))
+    for node in ast.walk(tree):
+        if node in silent:
+            continue
+        if isinstance(node, ast.Compare):
+            for index, operator in enumerate(node.ops):
+                if type(operator) in _COMPARE:
+                    yield node, _set(node.ops, index, _COMPARE[type(operator)]())
+        elif isinstance(node, ast.BinOp) and type(node.op) in _OPERATE:
+            yield node, lambda node=node: setattr(node, "op", _OPERATE[type(node.op)]())
+        elif isinstance(node, ast.BoolOp):
+            other = ast.Or if isinstance(node.op, ast.And) else ast.And
+            yield node, lambda node=node, other=other: setattr(node, "op", other())
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+            yield node, lambda node=node: setattr(node, "op", ast.UAdd())
+        elif isinstance(node, ast.Constant) and type(node.value) in (int, float, bool):
+            yield node, lambda node=node: setattr(node, "value", _other(node.value))
+
+
+def _set(ops: list[ast.cmpop], index: int, operator: ast.cmpop) -> Change:
+    return lambda: ops.__setitem__(index, operator)
+
+
+def _other(value: float | bool) -> float | bool:
+    if isinstance(value, bool):
+        return not value
+    return value + 1 if value == 0 else 2 * value
+
+
+def _of_messages(tree: ast.AST) -> Iterator[ast.AST]:
+    """What stands in formatted texts and annotations: words are judged elsewhere."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr | ast.AnnAssign):
+            parts = [node] if isinstance(node, ast.JoinedStr) else [node.annotation]
+            for part in parts:
+                yield from ast.walk(part)
+        elif isinstance(node, ast.keyword) and node.arg == "strict":
+            yield node.value
+        elif isinstance(node, ast.FunctionDef):
+            for part in (node.returns, *(argument.annotation for argument in node.args.args)):
+                if part is not None:
+                    yield from ast.walk(part)
+
+
+def survivors(module: str, every: int) -> tuple[int, list[str]]:
+    """How many mutations were tried, and those that survived."""
+    source = (ROOT / module).read_text(encoding="utf-8")
+    if not _passes(module, source):
+        raise SystemExit(f"The tests of {module} fail without any mutation.")
+    tried, left = 0, []
+    for number, (line, what, changed) in enumerate(mutants(source)):
+        if number % every:
+            continue
+        tried += 1
+        if _passes(module, changed):
+            left.append(f"{module}:{line}: {what}")
+    return tried, left
+
+
+def _passes(module: str, source: str) -> bool:
+    """Whether the module's tests pass with this source in its place: in a child that has all its libraries already."""
+    sys.stdout.flush()
+    child = os.fork()
+    if not child:
+        _test_in_child(module, source)
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status) == 0
+        if time.monotonic() > until:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            return False
+        time.sleep(0.02)
+
+
+def _test_in_child(module: str, source: str) -> None:
+    code = 1
+    try:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        name = module.removesuffix(".py").replace("/", ".")
+        mutated = types.ModuleType(name)
+        mutated.__file__ = str(ROOT / module)
+        sys.modules[name] = mutated
+        exec(compile(source, module, "exec"), mutated.__dict__)
+        code = int(pytest.main(["-q", "-x", "-n", "0", "-p", "no:cacheprovider", *TESTS[module]]))
+    except BaseException:
+        code = 1
+    finally:
+        os._exit(code)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("modules", nargs="*", default=list(TESTS))
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--every", type=int, default=1, help="try only every N-th mutation")
+    options = parser.parse_args()
+    os.chdir(ROOT)
+    sys.path.insert(0, str(ROOT))
+    # What takes long to import, and holds none of the modules under test.
+    for library in ("numpy", "scipy", "numba", "pydantic", "serial", "hil.config.schema", "hil.estimator.identify"):
+        importlib.import_module(library)
+    hypothesis.settings.register_profile("mutations", database=None, derandomize=True)
+    hypothesis.settings.load_profile("mutations")
+    told = {}
+    for module in options.modules:
+        tried, left = survivors(module, options.every)
+        told[module] = {"tried": tried, "survived": len(left), "which": left}
+        if not options.json:
+            print(f"{module:36s} {tried:4d} tried, {len(left):3d} survived", *left, sep="\n    ", flush=True)
+    if options.json:
+        print(json.dumps(told))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Recordings that hold no settled period: CSV files, and runs that were cut short."""

@@ -1,0 +1,81 @@
+"""What would go wrong with a study, said before anything runs."""
+
+import shutil
+from pathlib import Path
+
+import tomli_w
+
+from hil.config.schema import Config, parse_config
+from hil.errors import ConfigError
+from hil.study.draw import arm_path, arm_values, drawn, put, run_count
+from hil.study.schema import Study
+
+BYTES_A_ROW = 4_000
+"""Of Parquet, generously: some hundred columns."""
+
+_SAMPLE_BYTES = 256
+_REPORT_BYTES = 1_500_000
+_LOOKED_AT = 32
+"""Runs whose values are put into the arm's file and checked, spread over the study."""
+
+
+def check_study(study: Study, out: Path) -> int:
+    """How many runs it has; raises ConfigError for a field that does not exist, a bad value, or too little disk."""
+    runs = run_count(study)
+    if study.study.task in ("identify", "dry_run"):
+        step = max(1, runs // _LOOKED_AT)
+        for run in range(0, runs, step):
+            config = checked_arm(study, run)
+        needed = runs * (BYTES_A_ROW + (_folder_bytes(config) if study.keep.run_folders else 0))
+    else:
+        if study.vary and study.study.task == "empty" and study.study.config is not None:
+            arm_toml(study, 0)
+        needed = runs * BYTES_A_ROW
+    free = shutil.disk_usage(_existing(out)).free
+    if needed > free:
+        raise ConfigError(
+            f"{study.path}: {runs} runs would write about {needed / 1e9:.3g} GB, and {out} has {free / 1e9:.3g} GB "
+            "free: set keep.run_folders = false, or name another folder with --out."
+        )
+    return runs
+
+
+def arm_toml(study: Study, run: int) -> str:
+    """The arm's file with the values of this run; raises ConfigError for a key that leads nowhere."""
+    if study.study.config is None:
+        return ""
+    values = arm_values(study)
+    for key, value in drawn(study, run).items():
+        try:
+            put(values, key, value)
+        except KeyError as error:
+            raise ConfigError(
+                f'{study.path}: vary."{key}": {arm_path(study).name} has no {error.args[0]!r} there. Keys are those of '
+                'the arm\'s TOML, list entries by number from 0, as in "fake.arm.drives.0.coulomb".'
+            ) from None
+    return tomli_w.dumps(values)
+
+
+def checked_arm(study: Study, run: int) -> Config:
+    """The arm's configuration of this run; raises ConfigError, which names the run and its values."""
+    try:
+        return parse_config(arm_toml(study, run), arm_path(study))
+    except ConfigError as error:
+        said = ", ".join(f"{key} = {value!r}" for key, value in drawn(study, run).items())
+        raise ConfigError(f"{study.path}: run {run} ({said}) is not a valid arm: {error}") from error
+
+
+def _folder_bytes(config: Config) -> int:
+    experiment = config.experiment
+    played = (
+        experiment.period * (experiment.periods + experiment.max_settling_periods) * (2 if experiment.held_out else 1)
+    )
+    return int(played * experiment.rate) * _SAMPLE_BYTES * (3 if experiment.pilot else 1) + _REPORT_BYTES
+
+
+def _existing(path: Path) -> Path:
+    """The nearest folder above that is there."""
+    for place in (path.absolute(), *path.absolute().parents):
+        if place.exists():
+            return place
+    return Path("/")

@@ -1,0 +1,132 @@
+"""What each run of a study is given: values drawn from its own random stream, put into the arm's TOML.
+
+Run number i draws from the stream (seed, i) alone, so that its values depend neither on the other runs nor on who
+works on it when.
+"""
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from itertools import product
+from math import exp, log
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.config.bundled import find_config
+from hil.errors import ConfigError
+from hil.study.schema import Draw, Scalar, Study
+
+
+def run_count(study: Study) -> int:
+    """How many rows the study has; raises ConfigError for a folder without recordings."""
+    if study.study.task == "estimate":
+        return len(recordings(study))
+    if study.study.runs is not None:
+        return study.study.runs
+    return int(np.prod([len(values) for values in study.vary.values() if isinstance(values, list)], dtype=np.int64))
+
+
+def drawn(study: Study, run: int) -> dict[str, Scalar]:
+    """The varied values of run number `run`, by key."""
+    if study.study.runs is None and study.study.task != "estimate":
+        return _combination(study.vary, run)
+    rng = np.random.default_rng([study.study.seed, run])
+    return {key: _value(values, run, rng) for key, values in study.vary.items()}
+
+
+def _combination(vary: Mapping[str, list[Scalar] | Draw], run: int) -> dict[str, Scalar]:
+    lists = [values for values in vary.values() if isinstance(values, list)]
+    for number, values in enumerate(product(*lists)):
+        if number == run:
+            return dict(zip(vary, values, strict=True))
+    raise IndexError(run)
+
+
+def _value(values: list[Scalar] | Draw, run: int, rng: np.random.Generator) -> Scalar:
+    if isinstance(values, list):
+        return values[run % len(values)]
+    if values.count is not None:
+        return values.count + run
+    if values.uniform is not None:
+        low, high = values.uniform
+        return float(rng.uniform(low, high))
+    if values.log_uniform is not None:
+        low, high = values.log_uniform
+        return exp(float(rng.uniform(log(low), log(high))))
+    if values.normal is not None:
+        mean, std = values.normal
+        return float(rng.normal(mean, std))
+    if values.integer is not None:
+        return int(rng.integers(values.integer[0], values.integer[1] + 1))
+    assert values.choice is not None  # one of them is given, as Draw checks
+    return values.choice[int(rng.integers(len(values.choice)))]
+
+
+def arm_values(study: Study) -> dict[str, Any]:
+    """The arm's TOML as a dictionary; raises ConfigError."""
+    path = arm_path(study)
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise ConfigError(f"{study.path}: study.config = {study.study.config!r}: {path}: {reason}.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{study.path}: study.config: {path}: not valid TOML: {error}.") from error
+
+
+def arm_path(study: Study) -> Path:
+    """The arm's TOML: relative to the study's own folder, or a bundled one."""
+    assert study.study.config is not None  # checked by the schema
+    given = Path(study.study.config)
+    beside = study.path.parent / given
+    return beside if beside.exists() else find_config(given)
+
+
+def put(values: dict[str, Any], key: str, value: Scalar) -> None:
+    """Set `key`, such as "fake.arm.drives.0.coulomb", within `values`; raises KeyError with the part that is not there.
+
+    Tables may be new (settings that the file leaves at their defaults; the arm's own check knows their names), entries
+    of lists may not.
+    """
+    *parents, last = key.split(".")
+    place: Any = values
+    for part in parents:
+        place = _inside(place, part)
+    if isinstance(place, list):
+        _inside(place, last)
+        place[int(last)] = value
+    elif isinstance(place, dict):
+        place[last] = value
+    else:
+        raise KeyError(last)
+
+
+def _inside(place: Any, part: str) -> Any:
+    if isinstance(place, dict):
+        return place.setdefault(part, {})
+    if isinstance(place, list) and part.isdigit() and int(part) < len(place):
+        return place[int(part)]
+    raise KeyError(part)
+
+
+def recordings(study: Study) -> list[Path]:
+    """The run folders that hold a recording, sorted; raises ConfigError when there is none."""
+    assert study.study.recordings is not None  # checked by the schema
+    given = Path(study.study.recordings)
+    beside = study.path.parent / given
+    folder = beside if beside.exists() else given
+    found = sorted(_recorded(folder)) if folder.is_dir() else []
+    if not found:
+        raise ConfigError(f"{study.path}: study.recordings = {study.study.recordings!r}: no run folder is in {folder}.")
+    return found
+
+
+def _recorded(folder: Path) -> Iterator[Path]:
+    """Run folders; the steps of a pilot within one are not arms of their own."""
+    if (folder / "samples.npy").is_file() and (folder / "config.toml").is_file():
+        yield folder
+        return
+    for below in folder.iterdir():
+        if below.is_dir() and not below.is_symlink():
+            yield from _recorded(below)

@@ -1,0 +1,50 @@
+"""A study as one HTML page that needs no network: rates, messages, quantiles with a small histogram each."""
+
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from jinja2 import Environment, StrictUndefined
+
+from hil import __version__
+from hil.errors import RunFolderError
+from hil.study.figures import QUANTILES, Figures, figures
+from hil.study.fleet import fleet
+
+FILE_NAME = "study.html"
+_BINS = 24
+
+
+def write_page(table: pa.Table, title: str, path: Path) -> Figures:
+    """Write the page; the figures on it. Raises RunFolderError when it cannot be written."""
+    found = figures(table)
+    template = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).from_string((files("hil.study") / "page.html.j2").read_text(encoding="utf-8"))
+    histograms = {spread.name: _histogram(table, spread.name) for spread in found.spreads}
+    text = template.render(
+        title=title,
+        figures=found,
+        fleet=fleet(table) if "recording" in table.column_names else None,
+        histograms=histograms,
+        quantiles=[f"{100 * share:g} %" for share in QUANTILES],
+        version=__version__,
+        bar=100 / _BINS,
+    )
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+    return found
+
+
+def _histogram(table: pa.Table, name: str) -> list[float]:
+    """Heights from 0 to 1 of equally wide bins between the 1 % and the 99 % quantile."""
+    values = np.array([float(each) for each in table.column(name).to_pylist() if each is not None])
+    values = values[np.isfinite(values)]
+    low, high = np.quantile(values, [0.01, 0.99])
+    if high <= low:
+        return [1.0 if index == _BINS // 2 else 0.0 for index in range(_BINS)]
+    counted, _ = np.histogram(values, _BINS, (low, high))
+    return [float(each) for each in counted / max(1, counted.max())]

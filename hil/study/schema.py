@@ -1,0 +1,136 @@
+"""STUDY.toml: what to vary, what to run, what to keep, on which workers.
+
+[study]
+task = "identify"                    # identify, dry_run, estimate, empty
+config = "fake_two_link"             # an arm's TOML, or a bundled one
+runs = 200                           # rows; left out: every combination of the lists in [vary]
+seed = 1
+
+[vary]                               # keys of the arm's TOML, list entries by number
+"fake.seed" = { count = 1000 }       # the run's number, from 1000 on
+"experiment.seed" = [1, 2, 3]
+"fake.arm.drives.0.coulomb" = { log_uniform = [0.02, 0.1] }
+"fake.arm.links.1.mass" = { normal = [0.2, 0.02] }
+
+[keep]
+columns = ["verdict.trust", "parameters.*.value"]
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+
+from hil.errors import ConfigError
+from hil.toml_errors import describe
+
+Task = Literal["identify", "dry_run", "estimate", "empty"]
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+Scalar = bool | int | float | str
+
+MOST_RUNS = 10_000_000
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Draw(_Table):
+    """A distribution to draw from, of which just one is given."""
+
+    uniform: Pair | None = Field(None, description="[low, high]")
+    log_uniform: Pair | None = Field(None, description="[low, high], both positive")
+    normal: Pair | None = Field(None, description="[mean, standard deviation]")
+    integer: list[int] | None = Field(None, min_length=2, max_length=2, description="[low, high], both included")
+    choice: list[Scalar] | None = Field(None, min_length=1, description="one of these, drawn")
+    count: int | None = Field(None, description="this number plus the number of the run")
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of {', '.join(type(self).model_fields)}; here are {len(given)}")
+        for name in ("uniform", "log_uniform", "integer"):
+            bounds = getattr(self, name)
+            if bounds is not None and not bounds[0] <= bounds[1]:
+                raise ValueError(f"{name} = {bounds}: the first must not be larger than the second")
+        if self.log_uniform is not None and self.log_uniform[0] <= 0:
+            raise ValueError(f"log_uniform = {self.log_uniform}: both must be positive")
+        if self.normal is not None and self.normal[1] < 0:
+            raise ValueError(f"normal = {self.normal}: the standard deviation must not be negative")
+        return self
+
+
+class StudyTable(_Table):
+    """`[study]`: the work and how often."""
+
+    task: Task = Field(description="what one run does")
+    config: str | None = Field(None, min_length=1, description="the arm's TOML or a bundled arm's name")
+    recordings: str | None = Field(None, min_length=1, description="for estimate: the folder of run folders")
+    runs: int | None = Field(None, ge=1, le=MOST_RUNS, description="rows; every combination of the lists if left out")
+    seed: int = Field(1, ge=0, description="of all draws")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.task in ("identify", "dry_run") and self.config is None:
+            raise ValueError(f'task = "{self.task}" needs config = "ARM.toml"')
+        if (self.task == "estimate") != (self.recordings is not None):
+            raise ValueError('task = "estimate" needs recordings = "FOLDER"; no other task has recordings')
+        if self.task == "estimate" and (self.config is not None or self.runs is not None):
+            raise ValueError('task = "estimate" takes the recordings as they are: leave config and runs out')
+        return self
+
+
+class KeepTable(_Table):
+    """`[keep]`: what of each run."""
+
+    columns: list[str] | None = Field(None, min_length=1, description="names with *; what the task gives if left out")
+    run_folders: bool = Field(False, description="keep the run folders too, recordings and reports included")
+
+
+class EngineTable(_Table):
+    """`[engine]`: the workers, where the command line does not say."""
+
+    workers: int | None = Field(None, ge=1, le=4096, description="processes; one per core if left out")
+    worker_memory_gib: PositiveFloat = Field(2.0, le=1024, description="a worker that needs more is started afresh")
+    run_seconds: PositiveFloat = Field(3600.0, description="processor time after which a run has failed")
+
+
+class Study(_Table):
+    """The whole file. `path` is where it was read from."""
+
+    path: Path = Field(exclude=True)
+    study: StudyTable
+    vary: dict[str, list[Scalar] | Draw] = {}
+    keep: KeepTable = KeepTable()
+    engine: EngineTable = EngineTable()
+
+    @model_validator(mode="after")
+    def _varied(self) -> Self:
+        for key, values in self.vary.items():
+            if isinstance(values, list) and not values:
+                raise ValueError(f'vary."{key}" is an empty list')
+        if self.vary and self.study.task == "estimate":
+            raise ValueError("[vary] means nothing to recordings that are made already: leave it out")
+        if self.study.runs is None and self.study.task != "estimate":
+            drawn = [key for key, values in self.vary.items() if isinstance(values, Draw)]
+            if drawn:
+                raise ValueError(f'study.runs is missing: vary."{drawn[0]}" is drawn, so it must say how often')
+        return self
+
+
+def load_study(path: Path) -> Study:
+    """Read and check; raises ConfigError, which names file, key, value and what is allowed."""
+    try:
+        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}.") from error
+    if "path" in values:
+        raise ConfigError(f"{path}: path is not a known key.")
+    try:
+        return Study(path=path, **values)
+    except ValidationError as error:
+        raise ConfigError(describe(error, path, Study)) from error

@@ -1,0 +1,123 @@
+"""What a model leaves out: seen by the score test, said in the verdict, counted in error bars; drifting friction."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.excitation.multisine import Multisine
+from hil.estimator.identify import identify
+from hil.estimator.models.model import Model
+from hil.estimator.selection.candidates import candidates, colour, considered, ripple_cycles
+from hil.estimator.selection.drift import friction_change
+from hil.estimator.selection.settled import choose
+from hil.estimator.selection.validation import validate
+from hil.estimator.selection.verdict import Evidence, judge
+from hil.fakes.plants.arm import Arm, base_parameters
+
+Recorder = Callable[[Arm, Multisine], SettledPeriod]
+Wave = Callable[..., Multisine]
+PLAIN = Model(2, "coulomb", "delay")
+PEAKS = (0.8, 0.42)
+
+
+def changed(arm: Arm, **changes: float) -> Arm:
+    return arm.model_copy(update={"drives": tuple(drive.model_copy(update=changes) for drive in arm.drives)})
+
+
+def wrong_encoders(period: SettledPeriod, once: float, twice: float) -> SettledPeriod:
+    """As encoders would read it that err by so many steps once and twice a turn."""
+    step = period.position_step[:, None]
+    error = once * np.sin(period.position + 0.7) + twice * np.sin(2.0 * period.position - 0.4)
+    return replace(period, position=np.round(period.position / step + error) * step)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes"),
+    [
+        ("saturation", {"saturation": 0.05, "saturation_current": 0.44}),
+        ("cable", {"cable_stiffness": 0.02, "cable_angle": 0.3}),
+    ],
+)
+def test_what_is_missing_is_named_with_its_evidence(
+    ideal_arm: Arm, recorded: Recorder, wave: Wave, part: str, changes: dict[str, float]
+) -> None:
+    period = recorded(changed(ideal_arm, **changes), wave(1, PEAKS))
+    estimate = identify(period, PLAIN)
+    found = candidates(period, estimate, {})
+    seen = {each.part: each for each in found}
+    assert seen[part].evidence > 1.0
+    verdict = judge(estimate, validate(period, estimate), Evidence(candidates=found))
+    assert verdict.trust != "yes"
+    assert "It looks most like" in verdict.sentences[0] and 'friction = "auto"' in verdict.sentences[0]
+    tried = judge(estimate, validate(period, estimate), Evidence(candidates=found, tried_all=True))
+    assert '"auto"' not in " ".join(tried.sentences)
+
+
+def test_of_nothing_nothing_is_seen(ideal_period: SettledPeriod) -> None:
+    estimate = identify(ideal_period, PLAIN)
+    assert max(each.evidence for each in candidates(ideal_period, estimate, {})) < 1.0
+    assert colour(estimate.residual) < 1.5
+
+
+def test_error_bars_hold_what_is_left_out_and_cannot_be_ruled_out(
+    ideal_arm: Arm, recorded: Recorder, wave: Wave
+) -> None:
+    """Half a percent less torque at the peak leaves a clean residual and gravity many standard errors off."""
+    period = recorded(changed(ideal_arm, saturation=0.005, saturation_current=0.44), wave(1, PEAKS))
+    estimate = identify(period, PLAIN)
+    truth = np.array(list(base_parameters(ideal_arm).values()))
+    wider = np.sqrt(np.diag(considered(period, estimate)))[:12]
+    assert np.all(wider >= estimate.std[:12])
+    error = np.abs(estimate.value[:12] - truth)
+    assert (error / estimate.std[:12]).max() > 4.0
+    assert (error / wider).max() < 3.0
+
+
+def test_encoders_that_are_not_linear_are_found_out(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
+    choice = choose([wrong_encoders(ideal_period, 5.7, 2.0)], None, "delay")
+    found = choice.estimate
+    assert "encoder" in found.model.options
+    truth = base_parameters(ideal_arm)
+    for name, true in truth.items():
+        std = found.std[found.names.index(name)]
+        assert abs(found.parameters[name] - true) < max(0.01 * abs(true), 4.0 * std), name
+
+
+def test_the_noise_of_an_encoder_is_measured(ideal_period: SettledPeriod) -> None:
+    step = ideal_period.position_step[:, None]
+    noise = 0.5 * step * np.random.default_rng(3).standard_normal(ideal_period.position.shape)
+    noisy = replace(ideal_period, position=np.round((ideal_period.position + noise) / step) * step)
+    assert noisy.noise / step[:, 0] == pytest.approx(np.full(2, np.hypot(0.5, 6**-0.5)), rel=0.08)  # rounded twice
+    estimate = identify(noisy, PLAIN)
+    verdict = judge(estimate, validate(noisy, estimate), Evidence(held_out=np.array([0.001, 0.001])))
+    assert verdict.trust == "yes"
+    assert "encoders' noise" in verdict.sentences[0]
+    assert "does not have" not in " ".join(verdict.sentences)
+
+
+def test_where_ripple_repeats_is_seen_in_what_a_fit_leaves(ideal_arm: Arm, recorded: Recorder, wave: Wave) -> None:
+    period = recorded(changed(ideal_arm, ripple=0.01, ripple_cycles=9.0), wave(1, PEAKS))
+    estimate = identify(period, PLAIN, coarse=True)
+    found = ripple_cycles(period, estimate, (3.0, 5.0, 7.0, 9.0, 11.0, 13.0))
+    assert found == {"ripple_cycles_1": 9.0, "ripple_cycles_2": 9.0}
+
+
+def test_friction_that_fell_is_told(
+    ideal_arm: Arm, ideal_period: SettledPeriod, recorded: Recorder, wave: Wave
+) -> None:
+    estimate = identify(ideal_period, PLAIN)
+    drives = tuple(
+        drive.model_copy(update={"coulomb": 0.92 * drive.coulomb, "viscous": 0.92 * drive.viscous})
+        for drive in ideal_arm.drives
+    )
+    later = recorded(ideal_arm.model_copy(update={"drives": drives}), wave(2, PEAKS))
+    drift = friction_change(later, estimate, 30.0)
+    assert drift.is_seen
+    assert drift.change == pytest.approx([-0.08, -0.08], abs=0.004)
+    said = judge(estimate, validate(ideal_period, estimate), Evidence(drift=drift)).sentences
+    assert any("Friction of joint 1 fell by 8" in sentence or "fell by 7.9" in sentence for sentence in said)
+    same = friction_change(recorded(ideal_arm, wave(2, PEAKS)), estimate, 30.0)
+    assert not same.is_seen

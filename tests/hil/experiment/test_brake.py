@@ -1,0 +1,86 @@
+"""The brake: against each velocity, within the limits, and over when it cannot or should not go on."""
+
+from collections.abc import Callable
+from math import nan
+
+import pytest
+
+from hil.config.schema import Config
+from hil.drivers.errors import PortLost
+from hil.drivers.state import State
+from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop, StopRequested
+from hil.plan.brake import Brake, braking_gains, may_brake
+
+Arm = Callable[..., Config]
+MOVING = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (3.0, -4.0), (-1.57, 0.0), (0, 0), (False, False))
+
+
+def test_full_current_at_half_of_the_velocity_limit(arm: Arm) -> None:
+    """1.2 A and 15 rad/s, 0.8 A and 20 rad/s."""
+    assert braking_gains(arm()) == pytest.approx([1.2 / 7.5, 0.8 / 10.0])
+    assert Brake(arm()).goals(MOVING) == pytest.approx([-1.2 * 3.0 / 7.5, 0.8 * 4.0 / 10.0])
+
+
+def test_never_more_than_the_current_limit(arm: Arm) -> None:
+    assert Brake(arm()).goals(MOVING._replace(velocity=(-14.0, 19.0))) == pytest.approx([1.2, -0.8])
+    assert Brake(arm()).goals(MOVING._replace(velocity=(14.0, -19.0))) == pytest.approx([-1.2, 0.8])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"velocity": (0.09, -0.09)},
+        {"velocity": (nan, -4.0), "missing": (True, False)},
+        {"missing": (False, True)},
+        {"error": (0, 0x80)},
+        {"error": (1, 0)},
+    ],
+)
+def test_over_at_rest_unseen_or_alarmed(arm: Arm, change: dict[str, object]) -> None:
+    assert Brake(arm()).goals(MOVING._replace(**change)) is None  # type: ignore[arg-type]
+
+
+def test_one_joint_that_still_moves_is_braked_alone(arm: Arm) -> None:
+    goals = Brake(arm()).goals(MOVING._replace(velocity=(0.0, 0.11)))
+    assert goals is not None and goals[0] == 0.0 and goals[1] == pytest.approx(-0.8 * 0.11 / 10.0)
+
+
+@pytest.mark.parametrize(("more", "goes_on"), [(3.9, True), (4.1, False)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_joint_that_gets_faster_ends_it(arm: Arm, more: float, goes_on: bool, sign: float) -> None:
+    """By more than a fifth of the velocity limit, 20 rad/s, than when the braking began, in whatever direction."""
+    brake = Brake(arm())
+    assert brake.goals(MOVING) is not None
+    faster = MOVING._replace(velocity=(0.0, sign * (4.0 + more)))
+    assert (brake.goals(faster) is not None) is goes_on
+    slow = Brake(arm())
+    assert slow.goals(MOVING._replace(velocity=(0.0, 0.2))) is not None
+    assert (slow.goals(MOVING._replace(velocity=(0.0, sign * (0.2 + more)))) is not None) is goes_on
+
+
+ALLOWED = {Cause.POSITION, Cause.VELOCITY, Cause.TEMPERATURE, Cause.VOLTAGE}
+
+
+@pytest.mark.parametrize("cause", Cause)
+def test_brakes_only_where_motion_and_command_can_be_trusted(arm: Arm, cause: Cause) -> None:
+    assert may_brake(arm(), SafetyStop("", cause)) is (cause in ALLOWED)
+
+
+@pytest.mark.parametrize(
+    ("error", "brakes"),
+    [
+        (StopRequested(), True),
+        (NotSettled(), True),
+        (ExperimentError(), True),
+        (PortLost(), False),
+        (KeyboardInterrupt(), False),
+        (ZeroDivisionError(), False),
+    ],
+)
+def test_brakes_for_the_errors_of_an_experiment_alone(arm: Arm, error: BaseException, brakes: bool) -> None:
+    assert may_brake(arm(), error) is brakes
+
+
+def test_never_where_the_configuration_says_cut(arm: Arm) -> None:
+    config = arm(("[experiment]\n", '[safety]\nstop = "cut"\n\n[experiment]\n'))
+    assert not may_brake(config, StopRequested())

@@ -1,0 +1,132 @@
+"""The model beside the experiment: healthy arms pass, others do not, and what it allows follows from what is known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil.config.schema import Config, load_config
+from hil.drivers.state import State
+from hil.dry_run.ensemble import prior_ensemble
+from hil.errors import Cause, SafetyStop
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation.closed_loop import Feedback, respond, resting
+from hil.experiment.model_watch import ModelWatch
+from tests.support.paths import CONFIGS
+
+RATE = 400.0
+TICK, STEP = 0.229 * math.tau / 60, math.tau / 4096
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(CONFIGS / "first_time.toml")
+
+
+def waves(seconds: float, peaks: tuple[float, float], seed: int) -> np.ndarray:
+    """Torques (2, samples) [N m]."""
+    random = np.random.default_rng(seed)
+    when = np.arange(round(seconds * RATE)) / RATE
+    frequency, phase = random.uniform(0.3, 4.0, (2, 6, 1)), random.uniform(0, math.tau, (2, 6, 1))
+    torque = np.sin(math.tau * frequency * when + phase).sum(axis=1)
+    return torque / np.abs(torque).max(axis=1, keepdims=True) * np.array(peaks)[:, None]
+
+
+def motion(config: Config, physics: Physics, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As the servos tell it, in whole ticks (2, samples)."""
+    moved = respond(physics, resting(np.array(config.arm.rest_pose)), torque, RATE, Feedback.none(2))
+    return np.round(moved.position / STEP) * STEP, np.round(moved.velocity / TICK) * TICK
+
+
+def seen_after(
+    watch: ModelWatch, config: Config, torque: np.ndarray, position: np.ndarray, velocity: np.ndarray
+) -> float:
+    """When it stops [s], infinite where it does not."""
+    constants = [joint.torque_per_goal for joint in config.joints]
+    for index in range(torque.shape[1]):
+        goal = tuple(torque[:, index] / constants)
+        now = index / RATE
+        told = tuple(position[:, index].tolist()), (0, 0), (False, False)
+        state = State(now, now + 1e-3, goal, goal, tuple(velocity[:, index].tolist()), *told)
+        try:
+            watch.look(state)
+        except SafetyStop as stop:
+            assert stop.cause is Cause.UNEXPECTED and "any arm" in str(stop)
+            return now
+    return math.inf
+
+
+def fastest(velocity: np.ndarray, since: float) -> int:
+    """The sample within a second of `since` [s] at which the first joint is fastest."""
+    first = round(since * RATE)
+    return first + int(np.argmax(np.abs(velocity[0, first : first + round(RATE)])))
+
+
+def planned(config: Config, torque: np.ndarray) -> list[float]:
+    return [float(np.abs(t).max()) / j.torque_per_goal for t, j in zip(torque, config.joints, strict=True)]
+
+
+@pytest.mark.parametrize("arm", range(6))
+def test_arms_of_the_prior_pass_and_what_is_not_their_motion_does_not(config: Config, arm: int) -> None:
+    physics = prior_ensemble(config, 8, seed=7).physics[arm]
+    torque = waves(6.0, (0.5, 0.25), arm)
+    position, velocity = motion(config, physics, torque)
+    assert seen_after(ModelWatch(config, planned(config, torque)), config, torque, position, velocity) == math.inf
+    # From a moment on both readings of both joints stand still, as if everything were held.
+    at = fastest(velocity, 3.0)
+    held, still = position.copy(), velocity.copy()
+    held[:, at:] = held[:, at - 1 : at]
+    still[:, at:] = 0.0
+    when = seen_after(ModelWatch(config, planned(config, torque)), config, torque, held, still)
+    assert 0.0 < when - at / RATE < 0.1
+
+
+def test_torque_that_reaches_the_arm_no_more(config: Config) -> None:
+    """Though nothing in the replies says so; an arm that these torques hardly move cannot tell."""
+    seen = 0
+    for arm in range(6):
+        physics = prior_ensemble(config, 8, seed=7).physics[arm]
+        torque = waves(6.0, (0.5, 0.25), arm)
+        cut = torque.copy()
+        cut[:, round(3.0 * RATE) :] = 0.0
+        position, velocity = motion(config, physics, cut)
+        when = seen_after(ModelWatch(config, planned(config, torque)), config, torque, position, velocity)
+        assert when > 3.0
+        seen += when < 3.6
+    assert seen >= 3
+
+
+@pytest.mark.parametrize("arm", range(3))
+def test_an_arm_of_which_nothing_is_known_is_learnt_before_it_is_judged(config: Config, arm: int) -> None:
+    unknown = config.model_copy(update={"arm": config.arm.model_copy(update={"link_lengths": None})})
+    physics = prior_ensemble(config, 8, seed=9).physics[arm]
+    torque = waves(6.0, (0.5, 0.25), arm)
+    position, velocity = motion(config, physics, torque)
+    assert seen_after(ModelWatch(unknown, planned(config, torque)), config, torque, position, velocity) == math.inf
+    at = fastest(velocity, 4.0)
+    velocity[:, at:] = 0.0
+    position[:, at:] = position[:, at - 1 : at]
+    when = seen_after(ModelWatch(unknown, planned(config, torque)), config, torque, position, velocity)
+    assert 0.0 < when - at / RATE < 0.1
+
+
+def test_a_lost_reply_and_a_stall_begin_anew(config: Config) -> None:
+    physics = prior_ensemble(config, 8, seed=7).physics[0]
+    torque = waves(4.0, (0.5, 0.25), 0)
+    position, velocity = motion(config, physics, torque)
+    # Two seconds are missing, and some replies before: the arm is somewhere else, at another speed.
+    constants = [joint.torque_per_goal for joint in config.joints]
+    watch = ModelWatch(config, planned(config, torque))
+    for index in (*range(400), *range(1200, 1600)):
+        now, goal = index / RATE, tuple(torque[:, index] / constants)
+        told = tuple(velocity[:, index].tolist()), tuple(position[:, index].tolist())
+        watch.look(State(now, now + 1e-3, goal, goal, *told, (0, 0), (False, 390 < index < 400)))
+
+
+def test_a_pendulum() -> None:
+    pendulum = load_config(CONFIGS / "fake_pendulum.toml")
+    watch = ModelWatch(pendulum, [0.19])
+    rest = pendulum.arm.rest_pose[0]
+    for index in range(400):
+        now = index / RATE
+        watch.look(State(now, now + 1e-3, (0.0,), (0.0,), (0.0,), (rest,), (0,), (False,)))

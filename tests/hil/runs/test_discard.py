@@ -1,0 +1,33 @@
+"""A start that fails before the first sample leaves nothing in the way of the next; what was recorded stays."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hil.config.schema import Config
+from hil.runs.run_folder import RunFolder
+from tests.support.command_line import hil
+
+
+def test_a_failed_start_can_be_tried_again(arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+    path = arm_file()
+    text = path.read_text(encoding="utf-8").replace('url = "fake://"', 'url = "/dev/no_such_port"')
+    path.write_text(text, encoding="utf-8")
+    out = path.parent / "run"
+    for _ in range(2):
+        assert hil("identify", path, "--out", out) == 2
+        assert "not empty" not in capsys.readouterr().err
+        assert not out.exists()
+
+
+def test_what_was_recorded_stays(identified: Path) -> None:
+    assert not RunFolder(identified).discard_if_unused()
+    assert (identified / "samples.npy").is_file()
+
+
+def test_somebody_elses_file_stays(arm: Callable[..., Config], tmp_path: Path) -> None:
+    run = RunFolder.create(tmp_path / "run", arm())
+    (run.path / "thesis.pdf").write_bytes(b"x")
+    assert not run.discard_if_unused()
+    assert (run.path / "thesis.pdf").is_file()
