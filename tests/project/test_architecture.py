@@ -257,6 +257,8 @@ def test_a_plant_as_described(copy: Path) -> None:
         """
 from pathlib import Path
 from hil.config.schema import load_config
+from hil.fakes import allow_code
+allow_code()
 plant = load_config(Path("arm.toml")).fake.make_plant()
 plant.advance(0.1, (1.0, 0.0))
 assert abs(plant.velocity[0] - 9.0) < 1e-9 and plant.position[1] == 0.0

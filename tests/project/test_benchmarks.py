@@ -8,7 +8,16 @@ import pytest
 from tests.support.paths import ROOT
 
 BENCHMARKS = ROOT / "benchmarks"
-SHARED = ("__init__", "elastic_slip", "machine", "pty", "recorded_arm", "short_experiment")
+SHARED = (
+    "__init__",
+    "elastic_slip",
+    "machine",
+    "pty",
+    "population_arms",
+    "client_calls",
+    "recorded_arm",
+    "short_experiment",
+)
 SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if path.stem not in SHARED)
 
 

@@ -54,6 +54,8 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         (here / "configs" / path.name).write_text(text, encoding="utf-8")
     new = text_of_new_servos((here / "configs" / "fake_two_link.toml").read_text(encoding="utf-8"))
     (here / "configs" / "new.toml").write_text(new, encoding="utf-8")
+    for urdf in (ROOT / "configs").glob("*.urdf"):
+        (here / "configs" / urdf.name).symlink_to(urdf)
     (here / "examples").symlink_to(ROOT / "examples")
     (here / "runs").mkdir()
     identified.rename(here / "runs" / "finished")

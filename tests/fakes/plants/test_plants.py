@@ -138,7 +138,7 @@ def test_tilt_is_less_gravity() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"stops": [1.0, 0.5]}, "the first value must be the smaller one"),
+        ({"stops": [1.0, 0.5]}, "the first must be the smaller"),
         ({"stops": [0.0, 0.5]}, "beyond its stops"),
         ({"backlash": 0.01, "rotor_inertia": 0.0}, "backlash needs a rotor_inertia"),
     ],
@@ -253,7 +253,7 @@ def test_joints_of_plant_and_servos_must_agree() -> None:
 def test_arm_or_plant(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     path.write_text('[fake]\n[[fake.servos]]\nid = 1\nmodel = "XM430-W350"\nzero_ticks = 0\n', encoding="utf-8")
-    with pytest.raises(DescriptionError, match="give either the table arm or plant"):
+    with pytest.raises(DescriptionError, match="give one of the table arm, the table chain and plant"):
         load_fake(path)
 
 

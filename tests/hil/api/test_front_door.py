@@ -145,7 +145,7 @@ def test_results_show_themselves(identified_once: Path) -> None:
     result = run.result
     assert isinstance(result, hil.Identification)
     for shown in (repr(result), result._repr_html_(), repr(run), run._repr_html_()):
-        assert "inertia_1" in shown and "trust it" in shown
+        assert "inertia_1" in shown and "trust this model" in shown
     assert len(repr(result).splitlines()) < 40
     assert "<script>" not in run._repr_html_()
 

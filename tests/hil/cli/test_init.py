@@ -39,7 +39,7 @@ def test_defaults_make_a_file_that_runs(arm_file: ArmFile, capsys: pytest.Captur
     assert "NOT yet run on this arm" in Path("mine.toml").read_text(encoding="utf-8")
     assert hil("check", "mine.toml") == 0
     assert hil("init", arm_file(), "--yes", "--out", "mine.toml") == 2
-    assert "mine.toml is there already" in capsys.readouterr().err
+    assert "mine.toml already exists" in capsys.readouterr().err
 
 
 def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> None:
@@ -107,7 +107,7 @@ def test_a_bus_that_makes_no_arm_is_said(arm_file: ArmFile) -> None:
     one = Found(57_600, 1, 1020, "XM430-W350", 48, 12.0, 30.0, "")
     try:
         for heard, text in (
-            ([Heard(57_600, (), "")], "No servo that hil can drive answers"),
+            ([Heard(57_600, (), "")], "No servo that hil can drive answered"),
             ([Heard(57_600, (one,), ""), Heard(1_000_000, (one._replace(id=2),), "")], "more than one baud"),
         ):
             with pytest.raises(ExperimentError, match=text):

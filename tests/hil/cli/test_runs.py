@@ -39,7 +39,7 @@ def test_no_such_folder(what: str, tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_a_run_differs_from_itself_in_nothing(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("diff", identified, identified) == 0
-    assert "Nothing changed" in capsys.readouterr().out
+    assert "No significant changes" in capsys.readouterr().out
 
 
 def test_a_changed_parameter_is_named_and_drawn(

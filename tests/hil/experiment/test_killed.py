@@ -29,5 +29,5 @@ def test_the_campaign_says_why_an_experiment_would_not_start(tmp_path: Path, mon
 
     pty_config = kills.pty_config
     monkeypatch.setattr(kills, "pty_config", wrong_pose)
-    with pytest.raises(RuntimeError, match=r"0 of 3 kills count(.|\n)*'shoulder'.*arm\.rest_pose says 0\.000"):
+    with pytest.raises(RuntimeError, match=r"0 of 3 kills count(.|\n)*'shoulder'.*arm\.rest_pose is 0\.000"):
         kill_campaign(1, tmp_path)

@@ -96,7 +96,7 @@ def test_an_events_file_that_blocks_holds_up_nobody_and_the_last_line_is_on_file
             log.note(0.0, f"event {number}")
         assert time.process_time() - started < 2.0
     late = lines(run.path / LATE_NAME)
-    assert late[0] == "event 0" and late[-1].endswith("events were dropped: the disk did not keep up")
+    assert late[0] == "event 0" and late[-1].endswith("events were dropped: the disk could not keep up")
 
 
 def test_a_full_disk_is_no_reason_to_stop(tmp_path: Path, monkeypatch: object) -> None:

@@ -102,5 +102,5 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
         with pytest.raises(RunFolderError, match="cannot be read as a recording"):
             load_samples(path, 2)
     np.save(path, np.zeros(3))
-    with pytest.raises(RunFolderError, match="another type than a recording of 2 joints"):
+    with pytest.raises(RunFolderError, match="does not have the row type of a recording of 2 joints"):
         load_samples(path, 2)
