@@ -21,8 +21,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+from hil.config.experiment import ModelConfig
 from hil.config.known_quantities import KnownConfig
-from hil.config.schema import ModelConfig
 from hil.errors import ConfigError
 from hil.toml_errors import describe
 

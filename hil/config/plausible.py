@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from hil.drivers.servo_model import Mode, servo_model
 
 if TYPE_CHECKING:
-    from hil.config.schema import Config, JointConfig
+    from hil.config.joint import JointConfig
+    from hil.config.schema import Config
 
 _MOST_TURN_RAD = 4 * math.pi
 _LONGEST_M = 3.0

@@ -8,15 +8,11 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Discriminator,
     Field,
     PositiveFloat,
-    Tag,
     ValidationError,
     field_validator,
     model_validator,
@@ -25,41 +21,25 @@ from pydantic import (
 from hil import fakes
 from hil.config.bundled import find_config
 from hil.config.chain import MOST_JOINTS, chain_slips
+from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
+from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
+from hil.config.table import Table
 from hil.drivers.bus import BusConfig
-from hil.drivers.joint import Joint, SecondServo
-from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode, servo_model
+from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode
 from hil.errors import ConfigError
-from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import find_arm
-from hil.toml_errors import UNSAID, describe
+from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
-
-DRIFT = 5.0
-"""Times experiment.settle_within."""
 
 SLOW_INTERVAL_S = 0.25
 """From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-BusId = Annotated[int, Field(ge=0, le=252)]
-_One = TypeVar("_One")
-OneOrList = Annotated[
-    Annotated[_One, Tag(f"{UNSAID}one")] | Annotated[list[_One], Tag(f"{UNSAID}list")],
-    Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
-]
-"""A value, or a list of such; a wrong one is named as what it looks like."""
-Range = Annotated[list[float], Field(min_length=2, max_length=2)]
-
-
-class PortConfig(_Table):
+class PortConfig(Table):
     """`[port]`: where the servos are."""
 
     url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
@@ -68,126 +48,7 @@ class PortConfig(_Table):
     fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")
 
 
-class JointConfig(_Table):
-    """`[[joints]]`: one joint, from the base outwards."""
-
-    name: str = Field(min_length=1, max_length=20)
-    servos: OneOrList[BusId] = Field(alias="id", description="bus ID, or the IDs of the joint's two servos")
-    model: Literal[tuple(SERVO_MODELS)]  # type: ignore[valid-type]
-    turns: OneOrList[Literal[-1, 1]] = Field(
-        1, alias="direction", description="-1 where the servo turns opposite to the joint; one entry per servo"
-    )
-    zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
-    mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
-    torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
-    torque_constant_std: float = Field(0.0, ge=0, description="N m/A")
-    torque_per_volt: PositiveFloat | None = Field(None, le=100, description="N m/V at the output shaft, pwm mode only")
-    torque_per_volt_std: float = Field(0.0, ge=0, description="N m/V")
-    position_limit: Range = Field(description="rad")
-    velocity_limit: PositiveFloat = Field(description="rad/s")
-    current_limit: PositiveFloat | None = Field(None, le=30, description="A")
-    voltage_limit: PositiveFloat | None = Field(None, le=30, description="V, pwm mode only")
-
-    @field_validator("name")
-    @classmethod
-    def _printable(cls, name: str) -> str:
-        """A name goes into terminals, XML, HTML and CSV: no control character, line break or half of a surrogate."""
-        if bad := [each for each in name if not each.isprintable()]:
-            raise ValueError(f"{name!a}: {bad[0]!a} is not a printable character")
-        return name
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        low, high = self.position_limit
-        if low >= high:
-            raise ValueError(f"position_limit = [{low}, {high}]: the first value must be the smaller one")
-        return self
-
-    @model_validator(mode="after")
-    def _a_direction_for_each_servo(self) -> Self:
-        if isinstance(self.servos, list) and not 1 <= len(self.servos) <= 2:
-            raise ValueError(f"id has {len(self.servos)} entries: a joint has one or two servos")
-        if len(set(self.ids)) < len(self.ids):
-            raise ValueError(f"id = {list(self.ids)}: each servo needs its own ID")
-        if isinstance(self.turns, list) and len(self.turns) != len(self.ids):
-            raise ValueError(f"direction has {len(self.turns)} entries for {len(self.ids)} servos: give one per servo")
-        return self
-
-    @property
-    def ids(self) -> tuple[int, ...]:
-        """The IDs of its servos, the first one's first."""
-        return tuple(self.servos) if isinstance(self.servos, list) else (self.servos,)
-
-    @property
-    def id(self) -> int:
-        """The ID of its servo, the first where it has two."""
-        return self.ids[0]
-
-    @property
-    def directions(self) -> tuple[int, ...]:
-        """+1 or -1 for each of its servos."""
-        return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
-
-    @property
-    def direction(self) -> int:
-        """+1 or -1, of the first servo."""
-        return self.directions[0]
-
-    @model_validator(mode="after")
-    def _driven(self) -> Self:
-        pwm = self.drive_mode is Mode.PWM
-        if not pwm and servo_model(self.model).current_unit is None:
-            raise ValueError(f'mode = "current": a {self.model} has no current mode; use "pwm"')
-        values = (self.torque_constant, self.current_limit), (self.torque_per_volt, self.voltage_limit)
-        names = ("torque_constant", "current_limit"), ("torque_per_volt", "voltage_limit")
-        mode = self.drive_mode.name.lower()
-        for name, value in zip(names[pwm], values[pwm], strict=True):
-            if value is None:
-                raise ValueError(f"{name} is missing; {mode} mode needs it")
-        for name, value in zip(names[not pwm], values[not pwm], strict=True):
-            if value is not None:
-                raise ValueError(f"{name} = {value:g}: it has no meaning in {mode} mode; {' and '.join(names[pwm])} do")
-        return self
-
-    @property
-    def drive_mode(self) -> Mode:
-        if self.mode is None:
-            return servo_model(self.model).default_mode
-        return Mode[self.mode.upper()]
-
-    @property
-    def torque_per_goal(self) -> float:
-        """N m per A, or per V in pwm mode."""
-        value = self.torque_per_volt if self.drive_mode is Mode.PWM else self.torque_constant
-        assert value is not None  # checked above
-        return value
-
-    @property
-    def torque_per_goal_std(self) -> float:
-        return self.torque_per_volt_std if self.drive_mode is Mode.PWM else self.torque_constant_std
-
-    @property
-    def goal_limit(self) -> float:
-        """A, or V in pwm mode."""
-        value = self.voltage_limit if self.drive_mode is Mode.PWM else self.current_limit
-        assert value is not None  # checked above
-        return value
-
-    @property
-    def joint(self) -> Joint:
-        seconds = tuple(SecondServo(*each) for each in zip(self.ids[1:], self.directions[1:], strict=True))
-        return Joint(
-            self.name,
-            self.id,
-            servo_model(self.model),
-            self.direction,
-            self.zero_ticks,
-            self.drive_mode,
-            seconds=seconds,
-        )
-
-
-class PriorConfig(_Table):
+class PriorConfig(Table):
     """`[arm.prior]`: best guesses before any identification; one value per joint. Missing values are guessed roughly
     from link lengths and servo models (hil.dry_run.prior), with `rough_spread` in place of `spread`.
     """
@@ -205,7 +66,7 @@ class PriorConfig(_Table):
     coulomb: list[PositiveFloat] | None = Field(None, description="N m")
 
 
-class ArmConfig(_Table):
+class ArmConfig(Table):
     """`[arm]`: what is known about the mechanism."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
@@ -224,101 +85,7 @@ class ArmConfig(_Table):
     prior: PriorConfig | None = Field(None, description="prior knowledge of masses and friction, for a dry run")
 
 
-class ExperimentConfig(_Table):
-    """`[experiment]`: the excitation and how it is streamed."""
-
-    rate: float = Field(ge=20, le=4000, description="samples per second")
-    period: float = Field(gt=0, le=1000, description="s")
-    band: Range | None = Field(None, description="Hz: its lines are assigned to the joints in turn")
-    lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
-    detection: bool = Field(
-        False, description="drive only some of the odd lines: the others reveal nonlinear distortion"
-    )
-    peak_torque: list[PositiveFloat] | None = Field(
-        None, description="N m per joint; with pilot = true, found by dry runs"
-    )
-    pilot: bool = Field(False, description="find peak_torque with a small pilot run first, then raise it to the limits")
-    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
-    ramp: float = Field(1.0, ge=0, le=60, description="s, at start and end")
-    rest: float = Field(0.5, ge=0, le=60, description="s without torque beforehand")
-    settle_within: PositiveFloat = Field(
-        0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
-    )
-    max_settling_periods: int = Field(5, ge=1, le=100)
-    periods: int = Field(1, ge=1, le=1000, description="number of settled periods recorded")
-    held_out: bool = Field(True, description="play a second multisine with other phases to validate the model")
-    seed: int = Field(1, ge=0)
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        samples = self.rate * self.period
-        if abs(samples - round(samples)) > 1e-9 * samples:
-            raise ValueError(f"rate * period = {samples:g}: must be a whole number of samples")
-        if (self.band is None) == (self.lines is None):
-            raise ValueError("give either band or lines")
-        if self.detection and self.band is None:
-            raise ValueError("detection chooses lines from a band; with lines, omit the detection lines yourself")
-        if self.band is not None:
-            low, high = self.band
-            if not 0 < low < high < self.rate / 4:
-                raise ValueError(f"band = [{low}, {high}]: must be 0 < low < high < rate / 4 = {self.rate / 4:g} Hz")
-        for lines in self.lines or []:
-            if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
-                raise ValueError(f"lines: each list needs different harmonics from 1 to {samples // 4:g}")
-        return self
-
-    @property
-    def drift_within(self) -> float:
-        """As settle_within, of a motion that after max_settling_periods only drifts, as while grease warms."""
-        return DRIFT * self.settle_within
-
-    @property
-    def samples(self) -> int:
-        """Samples in a period."""
-        return round(self.rate * self.period)
-
-
-class PathConfig(_Table):
-    """`[joint_path]`: the path that excites a spatial arm; band's upper end is its highest frequency."""
-
-    centre: list[float] = Field(description="rad per joint: centre of the path")
-    swing: list[PositiveFloat] = Field(description="rad per joint: amplitude around the centre")
-    speed: list[PositiveFloat] = Field(description="rad/s per joint: maximum speed")
-
-
-class ModelConfig(_Table):
-    """`[model]`: the model terms that the estimator may use."""
-
-    friction: Literal["auto"] | Friction = Field(
-        "auto", description='"auto" also tries every term below and keeps those that the data support'
-    )
-    drive: Drive = "lag"
-    presliding: bool = Field(False, description=OPTIONS["presliding"])
-    asymmetry: bool = Field(False, description=OPTIONS["asymmetry"])
-    ripple: bool = Field(False, description=OPTIONS["ripple"])
-    zeros: bool = Field(False, description=OPTIONS["zeros"])
-    torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
-    saturation: bool = Field(False, description=OPTIONS["saturation"])
-    cable: bool = Field(False, description=OPTIONS["cable"])
-    encoder: bool = Field(False, description=OPTIONS["encoder"])
-    lags: bool = Field(False, description=OPTIONS["lags"])
-
-    @property
-    def fixed_friction(self) -> Friction:
-        """The model for fits without model selection: "stribeck" where the file says "auto"."""
-        return "stribeck" if self.friction == "auto" else self.friction
-
-    @model_validator(mode="after")
-    def _auto_has_no_terms(self) -> Self:
-        given = [option for option in OPTIONS if option != "torque_scale" and getattr(self, option)]
-        if self.friction == "auto" and given:
-            raise ValueError(
-                f'friction = "auto" chooses {", ".join(given)} itself: remove them, or choose a friction model'
-            )
-        return self
-
-
-class SafetyConfig(_Table):
+class SafetyConfig(Table):
     """`[safety]`: what stops the arm besides the joint limits, and how."""
 
     watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s without packets after which a servo stops by itself")
@@ -358,7 +125,7 @@ class SafetyConfig(_Table):
         return seconds
 
 
-class StabiliserConfig(_Table):
+class StabiliserConfig(Table):
     """`[stabiliser]`: a spring and a damper in software around arm.rest_pose, for arms that have no stable rest."""
 
     stiffness: list[float] = Field(description="N m/rad per joint")
@@ -373,7 +140,7 @@ class StabiliserConfig(_Table):
         return self
 
 
-class Config(_Table):
+class Config(Table):
     """The whole file. `path` is the file it was read from."""
 
     path: Path = Field(exclude=True)

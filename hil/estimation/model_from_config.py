@@ -1,6 +1,6 @@
 """From `[model]` to the model that the estimator fits."""
 
-from hil.config.schema import ModelConfig
+from hil.config.experiment import ModelConfig
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import OPTIONS
 

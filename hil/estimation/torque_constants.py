@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from hil.config.schema import JointConfig
+from hil.config.joint import JointConfig
 from hil.drivers.servo_model import Mode
 from hil.results.parts import Quantity
 

@@ -17,7 +17,7 @@ since a reply may be measured before or after the motor has followed the latest 
 
 from typing import NamedTuple
 
-from hil.config.schema import JointConfig
+from hil.config.joint import JointConfig
 
 SIGMA_SHARE = 0.1
 """Of the planned peak: errors of sensor and current loop that are nothing out of the ordinary."""

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from math import isnan
 from typing import NamedTuple, NoReturn
 
-from hil.config.schema import Config, JointConfig
+from hil.config.joint import JointConfig
+from hil.config.schema import Config
 from hil.drivers.packet import ALERT
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status

@@ -27,7 +27,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from hil import __version__, strict_json
-from hil.config.schema import Config, ExperimentConfig, StabiliserConfig, parse_config
+from hil.config.experiment import ExperimentConfig
+from hil.config.schema import Config, StabiliserConfig, parse_config
 from hil.errors import RunFolderError
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json

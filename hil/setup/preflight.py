@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from hil import fakes
-from hil.config.schema import Config, JointConfig
+from hil.config.joint import JointConfig
+from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.control_table import model_names
 from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNotOpened

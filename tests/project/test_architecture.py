@@ -148,7 +148,7 @@ def test_a_friction_term_as_described(copy: Path) -> None:
 FRICTION = """
 from dataclasses import replace
 import numpy as np
-from hil.config.schema import ModelConfig
+from hil.config.experiment import ModelConfig
 from hil.estimation.model_from_config import wanted_model
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import design_multisine

@@ -10,7 +10,7 @@ import numpy as np
 
 from hil.config.chain import only_planar
 from hil.config.csv_columns import load_csv_config
-from hil.config.schema import ModelConfig
+from hil.config.experiment import ModelConfig
 from hil.errors import ConfigError
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.physical import physical_of

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.config.schema import ModelConfig
+from hil.config.experiment import ModelConfig
 from hil.estimation.model_from_config import wanted_model
 from hil.estimator.errors import ModelError
 from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.config.schema import Config, JointConfig, load_config
+from hil.config.joint import JointConfig
+from hil.config.schema import Config, load_config
 from hil.experiment.following import Following
 from tests.support.paths import CONFIGS
 

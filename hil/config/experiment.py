@@ -1,0 +1,105 @@
+"""`[experiment]`, `[joint_path]` and `[model]`: the excitation, how it is streamed, what may explain the motion."""
+
+from typing import Literal, Self
+
+from pydantic import Field, PositiveFloat, model_validator
+
+from hil.config.table import Range, Table
+from hil.estimator.models.terms import OPTIONS, Drive, Friction
+
+DRIFT = 5.0
+"""Times experiment.settle_within."""
+
+
+class ExperimentConfig(Table):
+    """`[experiment]`: the excitation and how it is streamed."""
+
+    rate: float = Field(ge=20, le=4000, description="samples per second")
+    period: float = Field(gt=0, le=1000, description="s")
+    band: Range | None = Field(None, description="Hz: its lines are assigned to the joints in turn")
+    lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
+    detection: bool = Field(
+        False, description="drive only some of the odd lines: the others reveal nonlinear distortion"
+    )
+    peak_torque: list[PositiveFloat] | None = Field(
+        None, description="N m per joint; with pilot = true, found by dry runs"
+    )
+    pilot: bool = Field(False, description="find peak_torque with a small pilot run first, then raise it to the limits")
+    design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
+    ramp: float = Field(1.0, ge=0, le=60, description="s, at start and end")
+    rest: float = Field(0.5, ge=0, le=60, description="s without torque beforehand")
+    settle_within: PositiveFloat = Field(
+        0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
+    )
+    max_settling_periods: int = Field(5, ge=1, le=100)
+    periods: int = Field(1, ge=1, le=1000, description="number of settled periods recorded")
+    held_out: bool = Field(True, description="play a second multisine with other phases to validate the model")
+    seed: int = Field(1, ge=0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        samples = self.rate * self.period
+        if abs(samples - round(samples)) > 1e-9 * samples:
+            raise ValueError(f"rate * period = {samples:g}: must be a whole number of samples")
+        if (self.band is None) == (self.lines is None):
+            raise ValueError("give either band or lines")
+        if self.detection and self.band is None:
+            raise ValueError("detection chooses lines from a band; with lines, omit the detection lines yourself")
+        if self.band is not None:
+            low, high = self.band
+            if not 0 < low < high < self.rate / 4:
+                raise ValueError(f"band = [{low}, {high}]: must be 0 < low < high < rate / 4 = {self.rate / 4:g} Hz")
+        for lines in self.lines or []:
+            if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
+                raise ValueError(f"lines: each list needs different harmonics from 1 to {samples // 4:g}")
+        return self
+
+    @property
+    def drift_within(self) -> float:
+        """As settle_within, of a motion that after max_settling_periods only drifts, as while grease warms."""
+        return DRIFT * self.settle_within
+
+    @property
+    def samples(self) -> int:
+        """Samples in a period."""
+        return round(self.rate * self.period)
+
+
+class PathConfig(Table):
+    """`[joint_path]`: the path that excites a spatial arm; band's upper end is its highest frequency."""
+
+    centre: list[float] = Field(description="rad per joint: centre of the path")
+    swing: list[PositiveFloat] = Field(description="rad per joint: amplitude around the centre")
+    speed: list[PositiveFloat] = Field(description="rad/s per joint: maximum speed")
+
+
+class ModelConfig(Table):
+    """`[model]`: the model terms that the estimator may use."""
+
+    friction: Literal["auto"] | Friction = Field(
+        "auto", description='"auto" also tries every term below and keeps those that the data support'
+    )
+    drive: Drive = "lag"
+    presliding: bool = Field(False, description=OPTIONS["presliding"])
+    asymmetry: bool = Field(False, description=OPTIONS["asymmetry"])
+    ripple: bool = Field(False, description=OPTIONS["ripple"])
+    zeros: bool = Field(False, description=OPTIONS["zeros"])
+    torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
+    saturation: bool = Field(False, description=OPTIONS["saturation"])
+    cable: bool = Field(False, description=OPTIONS["cable"])
+    encoder: bool = Field(False, description=OPTIONS["encoder"])
+    lags: bool = Field(False, description=OPTIONS["lags"])
+
+    @property
+    def fixed_friction(self) -> Friction:
+        """The model for fits without model selection: "stribeck" where the file says "auto"."""
+        return "stribeck" if self.friction == "auto" else self.friction
+
+    @model_validator(mode="after")
+    def _auto_has_no_terms(self) -> Self:
+        given = [option for option in OPTIONS if option != "torque_scale" and getattr(self, option)]
+        if self.friction == "auto" and given:
+            raise ValueError(
+                f'friction = "auto" chooses {", ".join(given)} itself: remove them, or choose a friction model'
+            )
+        return self

@@ -1,0 +1,23 @@
+"""What all tables of the TOML have in common."""
+
+from typing import Annotated, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+
+from hil.toml_errors import UNSAID
+
+
+class Table(BaseModel):
+    """Frozen; unknown keys, wrong types, infinity and NaN are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+BusId = Annotated[int, Field(ge=0, le=252)]
+_One = TypeVar("_One")
+OneOrList = Annotated[
+    Annotated[_One, Tag(f"{UNSAID}one")] | Annotated[list[_One], Tag(f"{UNSAID}list")],
+    Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
+]
+"""A value, or a list of such; a wrong one is named as what it looks like."""
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
