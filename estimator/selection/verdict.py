@@ -200,6 +200,8 @@ def _weak(validation: Validation) -> tuple[str, ...]:
     if part <= WELL_KNOWN:
         return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
     improvement = IMPROVEMENT[kind_of(name)]
+    if not np.isfinite(part):
+        return (f"This motion reveals nothing of {name}. To identify it: {improvement}.",)
     return (f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}.",)
 
 

@@ -114,8 +114,9 @@ def _discarding(run: RunFolder) -> Iterator[None]:
     """A start that fails before the first sample leaves no folder in the way of the next try."""
     try:
         yield
-    except BaseException:
-        run.discard_if_unused()
+    except BaseException as stopped:
+        if not run.discard_if_unused() and isinstance(stopped, KeyboardInterrupt):
+            stopped.add_note(f"The recording is kept. To estimate from it: hil estimate {run.path}")
         raise
 
 

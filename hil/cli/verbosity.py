@@ -6,11 +6,15 @@ result on standard output and errors on standard error, nothing else.
 
 import inspect
 import logging
+import sys
 from collections.abc import Callable
 from functools import wraps
 from typing import Annotated, Any
 
 import typer
+
+STOPPED = 130
+"""Exit code of a command that Ctrl-C ended while no arm moved, as shells have it."""
 
 _Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Show log messages; -vv for details.")
@@ -26,7 +30,11 @@ def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:
         if verbose and quiet:
             raise typer.BadParameter("give either --verbose or --quiet, not both.")
         _set_up(verbose, quiet)
-        command(*args, **options)
+        try:
+            command(*args, **options)
+        except KeyboardInterrupt as stopped:  # before or after the arm moved; while it moves the stream answers
+            print("\n".join(["hil: Stopped by Ctrl-C.", *getattr(stopped, "__notes__", [])]), file=sys.stderr)
+            raise typer.Exit(STOPPED) from None
 
     own = inspect.signature(command)
     more = [

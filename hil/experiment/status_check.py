@@ -74,9 +74,8 @@ class StatusCheck:
             return None
         unit = self._unit[joint]
         return Cause.GOALS_LOST, (
-            f"does not take its goals: it holds {status.goal:.3f} {unit} where {sent:.3f} {unit} was sent, and an "
-            "earlier "
-            "one before that. Packets to it get lost, or it refuses them: check cable and limits."
+            f"does not take its goals: it holds {status.goal:.3f} {unit} where {sent:.3f} {unit} was sent, and missed "
+            "an earlier one too. Goals are lost on the way, or the servo refuses them: check its cable and limits."
         )
 
     def look_at_clock(self, joint: int, tick: float, now: float) -> tuple[Cause, str] | None:

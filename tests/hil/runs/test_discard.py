@@ -31,3 +31,19 @@ def test_somebody_elses_file_stays(arm: Callable[..., Config], tmp_path: Path) -
     (run.path / "thesis.pdf").write_bytes(b"x")
     assert not run.discard_if_unused()
     assert (run.path / "thesis.pdf").is_file()
+
+
+def test_ctrl_c_during_the_estimate_keeps_the_recording_and_says_how_to_go_on(
+    arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(_: RunFolder) -> None:
+        raise KeyboardInterrupt
+
+    path = arm_file()
+    out = path.parent / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr("hil.api.experiment.estimate_run", interrupted)
+        assert hil("identify", path, "--out", out) == 130
+    said = capsys.readouterr().err
+    assert "Stopped by Ctrl-C" in said and f"hil estimate {out}" in said
+    assert hil("estimate", out) == 0
