@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hil.estimator.baselines.signs import suspect_signs
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 
@@ -17,7 +18,7 @@ WEAK, UNSEEN = 0.5, 10.0  # standard error over value
 
 def any_warnings(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[str]:
     """One sentence per warning."""
-    found = []
+    found = _signs(recordings)
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
         found += _motion(recordings, joint, name)
@@ -31,6 +32,19 @@ def any_warnings(recordings: Sequence[Recording], estimate: ShootingEstimate) ->
                 "units, signs and zero of position and torque; then try shorter segments."
             )
     return [*found, *_weak(estimate)]
+
+
+def _signs(recordings: Sequence[Recording]) -> list[str]:
+    suspicion = suspect_signs(recordings)
+    if suspicion is None:
+        return []
+    columns = " and ".join(suspicion.signs.reversed_columns)
+    negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
+    return [
+        f"The sign of {columns} seems to be reversed: with it reversed, inverse dynamics leaves "
+        f"{100 * suspicion.residual:.2g} % of the torque unexplained, as given {100 * suspicion.residual_given:.2g} %"
+        f"{negative}. Correct the sign in the file, or exchange the columns."
+    ]
 
 
 def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
