@@ -141,7 +141,7 @@ def test_a_friction_term_as_described(copy: Path) -> None:
     """Derivatives as differences say, a simulated arm's term found again, and known to all who use a model."""
     touched = follow(copy, "A friction term")
     equations = {"estimator/simulation/arm.py", "estimator/simulation/sensitivity.py", "hil/arm_model.py"}
-    assert touched == {"estimator/models/terms.py", *equations, "hil/config/schema.py"}
+    assert touched == {"estimator/models/terms.py", *equations, "hil/config/experiment.py"}
     run(copy, FRICTION)
 
 
