@@ -1,6 +1,5 @@
 """A study from its file to its rows: specifications out to the workers, rows back into the dataset."""
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -144,15 +143,3 @@ def _failed(dataset: Dataset) -> int:
     return (
         sum(status != "done" for status in table.column("status").to_pylist()) if "status" in table.schema.names else 0
     )
-
-
-def read_about(out: Path) -> dict[str, object]:
-    """about.json of a study's folder; raises RunFolderError."""
-    path = out / "about.json"
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{path} cannot be read: {error}.") from error
-    if not isinstance(value, dict):
-        raise RunFolderError(f"{path} is damaged: it holds no JSON object.")
-    return value
