@@ -18,8 +18,9 @@ from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import DidNotMove, ExperimentError, NotSettled
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.experiment.guard import Guard
+from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
@@ -74,6 +75,7 @@ class Stream:
         self._guard = Guard(config, planned)
         # Of a chain there is no such model yet: position, velocity, current and status are what is looked at.
         self._model = None if config.is_chain else ModelWatch(config, planned, arms)
+        self._lowering = Lowering(config, plan) if config.is_chain else None
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -101,7 +103,9 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
-            if may_brake(self._config, error):
+            if self._lowering is not None and may_lower(self._config, error):
+                self._lower(self._lowering, error)
+            elif may_brake(self._config, error):
                 self._brake()
             raise
 
@@ -231,6 +235,37 @@ class Stream:
                     return
                 state = self._bus.exchange(goals)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
+
+    def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
+        """Brake and lower the arm until it lies, anything is wrong, or a second signal comes. Never raises."""
+        state, asked = self._state, max(1, self._stop.count)
+        if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
+            return
+        self._note(f"lowering the arm after: {error}")
+        try:
+            for index in range(lowering.begin(state, self._goal)):
+                deadline, now, late = self._ticks.wait()
+                if self._stop.count > asked:
+                    raise SafetyStop("A second signal came.", Cause.UNEXPECTED)
+                if late:
+                    self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
+                    lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
+                    continue
+                self._goal = lowering.goals(index, state)
+                former, state = state.time_before_write, self._bus.exchange(self._goal)
+                self._sent_at = state.time_before_write
+                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
+                lowering.look(index, state, state.time_before_write - former)
+        except (SafetyStop, DriverError) as ended:
+            self._told(error, f"Torque was cut while the arm was being lowered, so it fell the rest of the way: {ended}")
+            return
+        lies = lowering.lies(state)
+        self._told(error, "The arm was lowered to its rest pose." if lies else "The arm was lowered, but does not lie in "
+                   "its rest pose.")
+
+    def _told(self, error: ExperimentError, what: str) -> None:
+        error.add_note(what)
+        self._note(what)
 
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))

@@ -63,6 +63,8 @@ class Plan:
     periods: int
     settle_within: float
     drift_within: float
+    lower_samples: int = 0
+    """The most that lowering an arm in space takes after a stop."""
 
     def first_segment(self) -> "Plan":
         """The plan with its first multisine alone."""
@@ -73,7 +75,7 @@ class Plan:
         """The largest number of samples that playing can take."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played + self.end_samples + self.brake_samples
+        return self.rest_samples + played + self.end_samples + self.brake_samples + self.lower_samples
 
     @property
     def expected(self) -> int:
