@@ -158,7 +158,7 @@ def _split(arms: ChainArms, arm: int) -> tuple[Array, Array]:
     return np.ascontiguousarray(table[:, :-1]), np.ascontiguousarray(table[:, -1])
 
 
-def _roll_loop(  # noqa: PLR0912
+def _roll_loop(
     chain: Any,
     link: Any,
     armature: Any,

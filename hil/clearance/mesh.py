@@ -41,7 +41,9 @@ def mesh_corners(path: Path) -> Array | None:
 def _stl(data: bytes) -> Array | None:
     count = int.from_bytes(data[80:_HEADER], "little") if len(data) >= _HEADER else -1
     if len(data) == _HEADER + _TRIANGLE * count:
-        rows = np.frombuffer(data, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")]), offset=84)
+        rows = np.frombuffer(
+            data, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")]), offset=84
+        )
         return np.asarray(rows["corners"].reshape(-1, 3), dtype=np.float64)
     lines = (line.split() for line in data.decode("ascii", "replace").splitlines())
     return _points([words[1:4] for words in lines if words[:1] == ["vertex"]])

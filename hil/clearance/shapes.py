@@ -59,8 +59,9 @@ def shapes_of(arm: ArmDescription) -> Shapes:
         capsules += found
     for each in capsules:
         if not (np.isfinite(each.ends).all() and 0.0 <= each.radius < np.inf):
-            raise ArmFileError(f'{arm.path}: link "{names[each.link]}": its collision geometry has a size or origin that is '
-                               "no number")
+            raise ArmFileError(
+                f'{arm.path}: link "{names[each.link]}": its collision geometry has a size or origin that is no number'
+            )
     return Shapes(names, tuple(capsules), tuple(guessed))
 
 

@@ -194,7 +194,9 @@ def _ignored(config: Config, names: tuple[str, ...]) -> set[frozenset[str]]:
     for pair in config.clearance.ignore:
         for name in pair:
             if name not in names:
-                raise ConfigError(f"{config.path}: clearance.ignore: there is no {name!r}; there are {', '.join(names)}.")
+                raise ConfigError(
+                    f"{config.path}: clearance.ignore: there is no {name!r}; there are {', '.join(names)}."
+                )
     return {frozenset(pair) for pair in config.clearance.ignore}
 
 

@@ -113,7 +113,9 @@ class SafetyConfig(Table):
     )
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes, where possible, before torque is cut')
     damp_time: float = Field(0.06, ge=0, le=2, description="s: maximum braking time")
-    lower_speed: PositiveFloat = Field(0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose")
+    lower_speed: PositiveFloat = Field(
+        0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose"
+    )
     lower_time: PositiveFloat = Field(10.0, le=60, description="s: longest time for that; a longer way is taken faster")
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"

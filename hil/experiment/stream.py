@@ -19,6 +19,8 @@ from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.estimator.chain.rollout import ChainArms
+from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
@@ -64,7 +66,7 @@ class Stream:
         stop: StopRequest,
         watch: Watch,
         note: Note,
-        arms: Ensemble | None = None,
+        arms: Ensemble | ChainArms | None = None,
     ) -> None:
         self._bus = bus
         self._clock = bus.port.clock
@@ -73,8 +75,11 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._guard = Guard(config, planned)
-        # Of a chain there is no such model yet: position, velocity, current and status are what is looked at.
-        self._model = None if config.is_chain else ModelWatch(config, planned, arms)
+        self._model: ModelWatch | ChainWatch = (
+            ModelWatch(config, planned, arms)
+            if isinstance(arms, Ensemble) or not config.is_chain
+            else ChainWatch(config, planned, arms)
+        )
         self._lowering = Lowering(config, plan) if config.is_chain else None
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
@@ -216,8 +221,7 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
-        if self._model is not None:
-            self._model.look(state)
+        self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 
@@ -257,11 +261,17 @@ class Stream:
                 self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
                 lowering.look(index, state, state.time_before_write - former)
         except (SafetyStop, DriverError) as ended:
-            self._told(error, f"Torque was cut while the arm was being lowered, so it fell the rest of the way: {ended}")
+            self._told(
+                error, f"Torque was cut while the arm was being lowered, so it fell the rest of the way: {ended}"
+            )
             return
         lies = lowering.lies(state)
-        self._told(error, "The arm was lowered to its rest pose." if lies else "The arm was lowered, but does not lie in "
-                   "its rest pose.")
+        self._told(
+            error,
+            "The arm was lowered to its rest pose."
+            if lies
+            else "The arm was lowered, but does not lie in its rest pose.",
+        )
 
     def _told(self, error: ExperimentError, what: str) -> None:
         error.add_note(what)
@@ -281,5 +291,4 @@ class Stream:
 
 def _largest_goals(plan: Plan) -> list[float]:
     """Of each joint [A, or V under PWM]; the guard rejects values that are not numbers."""
-    peaks = [np.nan_to_num(np.abs(segment.period_current)).max(axis=0) for segment in plan.segments]
-    return [float(peak) for peak in np.max(peaks, axis=0)]
+    return [float(peak) for peak in np.max([segment.peak_goal for segment in plan.segments], axis=0)]

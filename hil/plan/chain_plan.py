@@ -30,12 +30,18 @@ class PathSegment(Segment):
     """A path, its multisine being the torque that is played for it; `way` (samples, joints) [A] leads there.
 
     paths: the motions that are wanted: from the rest pose, the period, back. thought: what the torque was made with.
+    peaks: largest goal for the path alone (joints,) [A].
     """
 
     way: Array
     back: Array
     paths: tuple[Path, Path, Path]
     thought: ChainTorque
+    peaks: Array
+
+    @property
+    def peak_goal(self) -> Array:
+        return self.peaks
 
     @property
     def ramp_in(self) -> Array:
@@ -63,8 +69,7 @@ def make_chain_plan(config: Config) -> Plan:
 
 
 def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str, int], Path]) -> Plan:
-    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where they take too much torque.
-    """
+    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where they take too much torque."""
 
     def segment(config: Config, role: str, seed: int) -> PathSegment:
         return path_segment(config, thought, role, path(config, role, seed))
@@ -103,7 +108,8 @@ def path_segment(config: Config, thought: ChainTorque, role: str, path: Path) ->
     )
     goals = torque.T / constants
     ways = there.T / constants, home.T / constants
-    return PathSegment(role, multisine, goals, len(there.T), *ways, (way, path, back), thought)
+    peaks = np.abs(thought.of(path)).max(axis=1) / constants
+    return PathSegment(role, multisine, goals, len(there.T), *ways, (way, path, back), thought, peaks)
 
 
 def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array | float = 1.0) -> Array:

@@ -45,6 +45,12 @@ class Segment:
         peaks: NDArray[np.float64] = np.abs(self.multisine.torque).max(axis=1)
         return peaks
 
+    @property
+    def peak_goal(self) -> NDArray[np.float64]:
+        """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as nothing."""
+        peaks: NDArray[np.float64] = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
+        return peaks
+
     def _before(self, count: int) -> NDArray[np.float64]:
         index = np.arange(-count, 0) % len(self.period_current)
         return self.period_current[index]
