@@ -20,8 +20,11 @@ ALWAYS_SHARE = 0.9
 """Of all poses: capsules that are nearer than the margin in as many are parts of one joint, which touch as built."""
 
 RANDOM_POSES = 400
-AT_REST_SLACK = 0.004
-"""m by which an arm on its way may come nearer than it lies at rest, where it lies nearer than the margin."""
+AT_REST_SLACK = 0.008
+"""m by which an arm on its way may come nearer than it lies at rest, where it lies hardly farther than the margin."""
+
+LYING_RAD = 0.12
+"""An arm that is so near its rest pose in every joint lies, which its owner says is safe."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +56,10 @@ class Space:
     obstacles: tuple[str, ...]
     margin: float
     as_built: tuple[tuple[str, str], ...]
+    rest: Array
+    """The rest pose (joints,) [rad]."""
     at_rest: Array
-    """Distance of each pair in the rest pose (pairs,) [m]."""
+    """Distance of each pair in it (pairs,) [m]."""
     _pairs: NDArray[np.int64]
     _chain: tuple[Array, Array, Array]
     _arrays: tuple[NDArray[np.int64], Array, Array, Array, Array]
@@ -121,6 +126,9 @@ class Space:
         q = np.ascontiguousarray(position.T, dtype=np.float64)
         room, worst = np.empty(len(q)), np.empty(len(q), dtype=np.int64)
         least_room(self._chain, self._arrays, self._pairs, self._needed(on_the_way), q, room, worst)
+        if on_the_way:
+            lies = np.abs(q - self.rest).max(axis=1) < LYING_RAD
+            room[lies] = np.maximum(room[lies], 0.0)
         return room, worst
 
 
@@ -161,15 +169,15 @@ def _space(key: _Key) -> Space:
     obstacles = tuple(box.name for box in wanted.boxes)
     ignored = _ignored(config, (*shapes.names, "floor", *obstacles))
     pairs = np.array(_pairs(shapes, link, len(obstacles), np.isfinite(floor[3])), dtype=np.int64).reshape(-1, 2)
-    space = Space(shapes, obstacles, wanted.margin, (), np.zeros(len(pairs)), pairs, chain, arrays)  # type: ignore[arg-type]
+    rest = np.array(config.arm.rest_pose)
+    space = Space(shapes, obstacles, wanted.margin, (), rest, np.zeros(len(pairs)), pairs, chain, arrays)  # type: ignore[arg-type]
     kept = np.array([frozenset(space.names_of(pair)) not in ignored for pair in range(len(pairs))], dtype=bool)
     touching = _touch_as_built(config, chain, arrays, pairs, wanted.margin)
     as_built = sorted({space.names_of(pair) for pair in np.flatnonzero(touching & kept)})
     pairs = pairs[kept & ~touching]
-    rest = np.array([config.arm.rest_pose])
     at_rest = np.empty((1, len(pairs)))
-    all_distances(chain, arrays, pairs, rest, at_rest)
-    return Space(shapes, obstacles, wanted.margin, tuple(as_built), at_rest[0], pairs, chain, arrays)  # type: ignore[arg-type]
+    all_distances(chain, arrays, pairs, rest[None], at_rest)
+    return Space(shapes, obstacles, wanted.margin, tuple(as_built), rest, at_rest[0], pairs, chain, arrays)  # type: ignore[arg-type]
 
 
 def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:

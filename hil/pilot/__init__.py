@@ -5,6 +5,8 @@ gains    a stabiliser for arms that have no stable rest
 steps    one run on the way: what was foreseen, what was seen
 search   from the first careful run to one at the limits
 full     the run at the limits and its estimate
+
+Of an arm in space: chain_belief, chain_paths and chain_search.
 """
 
 from hil.pilot.full import identify_in_steps
