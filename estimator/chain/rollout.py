@@ -20,6 +20,9 @@ from hil.estimator.compiled import compiled
 
 LONGEST_STEP = 1.3e-3  # s
 RAN_AWAY = 1e3  # rad/s
+NEAR_REST = 0.3  # rad: where what the arm lies on may carry it
+YIELDS = 0.03  # rad, under a joint's largest torque: how far that gives way
+PRESSED_SHARE = 0.01  # of a joint's largest torque: less weight presses a joint on nothing
 VISCOUS, COULOMB, OFFSET, WIDTH, SCALE, LAG = range(6)
 DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", "lag")
 
@@ -55,8 +58,7 @@ class ChainArms:
 @dataclass(frozen=True)
 class Loop:
     """The software's part. goal: torques (samples, joints) [N m]; spring [N m/rad] and damper [N m s/rad] to `pose`
-    (joints,) [rad]; limit [N m]; support: share of the starting pose's own weight that what the arm lies on carries
-    (samples,)."""
+    (joints,) [rad], in which the arm lies: near it no joint that gravity presses down goes farther; limit [N m]."""
 
     rate: float
     goal: Array
@@ -64,41 +66,37 @@ class Loop:
     damping: Array
     pose: Array
     limit: Array
-    support: Array
 
 
 @dataclass(frozen=True)
 class Motions:
     """Of each arm at each sample: angles and velocities (arms, samples, joints) [rad, rad/s], commanded torques
-    [N m]; all NaN after an arm has run away. support (joints,): torque that carries each arm at its start."""
+    [N m]; all NaN after an arm has run away."""
 
     position: Array
     velocity: Array
     torque: Array
 
 
-def roll_out(
-    arms: ChainArms, loop: Loop, start: Array, speed: Array | None = None, weight: Array | None = None
-) -> Motions:
-    """Motions of all arms from angles `start` (joints,) or (arms, joints) [rad], at rest unless `speed` is given.
-
-    weight: torque (arms, joints) [N m] that `loop.support` is a share of; that of the pose `start` unless given."""
+def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = None) -> Motions:
+    """Motions of all arms from angles `start` (joints,) or (arms, joints) [rad], at rest unless `speed` is given."""
     n, samples = arms.base.chain.joints, len(loop.goal)
     at = np.broadcast_to(start, (arms.size, n))
     moving = np.zeros((arms.size, n)) if speed is None else np.broadcast_to(speed, (arms.size, n))
     shape = arms.size, samples, n
     position, velocity, torque = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     steps = max(1, math.ceil(1.0 / (loop.rate * LONGEST_STEP)))
-    held = weights(arms, at) if weight is None else weight
+    pressed = weights(arms, loop.pose)
+    pressed = np.where(np.abs(pressed) > PRESSED_SHARE * loop.limit, -np.sign(pressed), 0.0)
     software = tuple(
         np.ascontiguousarray(each, dtype=np.float64)
-        for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit, loop.support)
+        for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit)
     )
     for arm in range(arms.size):
         link, armature = _split(arms, arm)
         _roll(
             *(arms.base.chain.arrays, link, armature, np.ascontiguousarray(arms.drive[arm]), software),
-            *(held[arm], np.array(at[arm]), np.array(moving[arm]), 1.0 / (loop.rate * steps), steps),
+            *(pressed[arm], np.array(at[arm]), np.array(moving[arm]), 1.0 / (loop.rate * steps), steps),
             *(room(n), position[arm], velocity[arm], torque[arm]),
         )
     return Motions(position, velocity, torque)
@@ -164,7 +162,7 @@ def _roll_loop(
     armature: Any,
     drive: Any,
     software: Any,
-    weight: Any,
+    pressed: Any,
     q: Any,
     v: Any,
     h: float,
@@ -175,7 +173,7 @@ def _roll_loop(
     torque: Any,
 ) -> None:
     rotation, translation, axis, gravity = chain
-    goal, stiffness, damping, pose, limit, support = software
+    goal, stiffness, damping, pose, limit = software
     n = q.size
     still, real = np.zeros(n), np.zeros(n)
     seen_q, seen_v = q.copy(), v.copy()
@@ -191,17 +189,25 @@ def _roll_loop(
             place(rotation, translation, axis, q, work[0], work[1])
             move(link, armature, v, work)
             accelerate(armature, gravity, v, still, work)
+            near = True
+            for j in range(n):
+                near = near and abs(q[j] - pose[j]) < NEAR_REST
             for j in range(n):
                 lag = drive[5, j]
                 kept = math.exp(-h / lag) if lag > 0.0 else 0.0
                 real[j] = kept * real[j] + (1.0 - kept) * u[j] * drive[4, j]
                 bend = math.tanh(v[j] / drive[3, j])
                 slope = drive[0, j] + drive[1, j] * (1.0 - bend * bend) / drive[3, j]
-                b[j] = real[j] + support[k] * weight[j] - work[5][j]
+                b[j] = real[j] - work[5][j]
                 b[j] -= drive[2, j] + drive[0, j] * v[j] + drive[1, j] * bend
                 for i in range(n):
                     A[j, i] = work[4][j, i]
                 A[j, j] += h * slope
+                if near and pressed[j] * (q[j] - pose[j]) > 0.0:
+                    stiff = limit[j] / YIELDS
+                    firm = 2.0 * math.sqrt(stiff * work[4][j, j])
+                    b[j] -= stiff * (q[j] - pose[j] + h * v[j]) + firm * v[j]
+                    A[j, j] += h * (firm + h * stiff)
             if not invert(A, inverse, factor):
                 return
             for j in range(n):
@@ -213,7 +219,7 @@ def _roll_loop(
                 v[j] += still[j]
                 still[j] = 0.0
                 q[j] += h * v[j]
-                if not abs(v[j]) < 1e3:
+                if not abs(v[j]) < RAN_AWAY:
                     for i in range(n):
                         position[k, i] = velocity[k, i] = np.nan
                     return

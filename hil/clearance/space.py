@@ -77,6 +77,11 @@ class Space:
         """
         return self._least(position, on_the_way)[0]
 
+    def lies(self, position: Array) -> NDArray[np.bool_]:
+        """At which poses of a motion (joints, samples) [rad] the arm lies in its rest pose (samples,)."""
+        near: NDArray[np.bool_] = np.abs(position.T - self.rest).max(axis=1) < LYING_RAD
+        return near
+
     def nearest(self, position: Array, on_the_way: bool = False) -> Nearest:
         """The tightest moment of a motion (joints, samples) [rad]."""
         room, worst = self._least(position, on_the_way)
@@ -127,7 +132,7 @@ class Space:
         room, worst = np.empty(len(q)), np.empty(len(q), dtype=np.int64)
         least_room(self._chain, self._arrays, self._pairs, self._needed(on_the_way), q, room, worst)
         if on_the_way:
-            lies = np.abs(q - self.rest).max(axis=1) < LYING_RAD
+            lies = self.lies(position)
             room[lies] = np.maximum(room[lies], 0.0)
         return room, worst
 

@@ -1,7 +1,6 @@
 """The experiment of an arm in space simulated on arms that could be it: peaks against limits, and clearance.
 
-Each arm plays the whole of every path: from the rest pose there, two periods, back. Where it lies in the rest pose,
-what carries it there lets go as the feed-forward comes.
+Each arm plays the whole of every path: from the rest pose, in which it lies, there, two periods, back.
 """
 
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from hil.config.schema import Config
 from hil.dry_run.prediction import Prediction, limits_of, peaks_of
 from hil.estimator.chain.rollout import ChainArms, Loop, Motions, roll_out
 from hil.plan.chain_model import torque_limits
-from hil.plan.chain_plan import PathSegment, support_of
+from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
 
 Array = NDArray[np.float64]
@@ -109,8 +108,6 @@ def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:
     assert config.stabiliser is not None  # checked with the configuration
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     goals = np.concatenate((segment.ramp_in, *[segment.period_current] * PERIODS, segment.ramp_out))
-    there, home = support_of(segment, rate)
-    support = np.concatenate((there, np.zeros(PERIODS * len(segment.period_current)), home))
     return Loop(
         rate,
         goals * constants,
@@ -118,7 +115,6 @@ def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:
         np.array(config.stabiliser.damping),
         np.array(config.arm.rest_pose),
         torque_limits(config),
-        support,
     )
 
 
@@ -164,10 +160,16 @@ def _nearest(space: Space, position: Array, ways: int, rate: float) -> tuple[Nea
     found: tuple[Nearest, float] | None = None
     for part, on_the_way in zip(parts, (True, False, True), strict=True):
         poses = np.nan_to_num(position[:, part])
+        if on_the_way and poses.shape[1]:
+            kept = ~space.lies(poses)
+            moments = np.flatnonzero(kept)
+            poses = poses[:, kept]
+        else:
+            moments = np.arange(poses.shape[1])
         if not poses.shape[1]:
             continue
         nearest = space.nearest(poses, on_the_way)
-        moment = (part.start + every * nearest.sample) / rate
+        moment = (part.start + every * int(moments[nearest.sample])) / rate
         if found is None or nearest.room < found[0].room:
             found = nearest, moment
     assert found is not None

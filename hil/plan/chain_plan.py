@@ -121,12 +121,6 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
     return held + share * thought.of(path)
 
 
-def support_of(segment: PathSegment, rate: float) -> tuple[Array, Array]:
-    """Shares of the rest pose's weight that what the arm lies on still carries on the ways there and back."""
-    fade = _fade(segment.ramp_samples, rate)
-    return 1.0 - fade, 1.0 - fade[::-1]
-
-
 def _designed(known: KnownChain, config: Config, role: str, seed: int) -> Path:
     del role
     experiment, wanted = config.experiment, config.joint_path
