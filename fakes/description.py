@@ -52,7 +52,7 @@ class FakeServo(BaseModel):
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
     senses_supply: Annotated[
         bool | None,
-        Field(description="whether Present Current is the supply's instead of the motor's; by default as in its model"),
+        Field(description="whether Present Current is the supply current, not the motor's; default: as its model"),
     ] = None
     encoder: Annotated[Encoder, Field(description="errors of Present Position; none by default")] = PERFECT
     clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="clock error; positive: fast [ppm]")] = 0.0

@@ -269,7 +269,7 @@ class FakeBus:
         self._now = until
 
     def _servo_changed(self) -> None:
-        """Update routing and ticking after a servo has changed its ID or whether it needs ticks."""
+        """Update routing and ticking after a servo has changed its ID or its need for ticks."""
         self._instructions.route()
         self._ticks_wanted()
 
@@ -298,7 +298,7 @@ class FakeBus:
             end(fault, self._servos, self._joints.of, self.plant)
 
     def _other_master_speaks(self, servo_id: int) -> None:
-        """Another master reads a servo's Present Position; the host receives both request and reply."""
+        """Simulate another master that reads a Present Position; the host receives both request and reply."""
         request = encode(servo_id, Instruction.READ, b"\x84\x00\x04\x00")
         asked_by = self._wire.put(request, self._now)
         self._instructions.receive(Packet(servo_id, Instruction.READ, request[8:-2]), asked_by)

@@ -97,7 +97,7 @@ class Present:
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """Execute the instruction Clear (reset the turns); return the error number.
 
-        Errors other than Result Fail are unsure.
+        Errors other than Result Fail are uncertain.
         """
         if len(body) != len(_CLEAR_TURNS):
             return StatusError.DATA_LENGTH

@@ -53,7 +53,7 @@ class Register:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One servo model: its control table by name, and what the table does not say."""
+    """One servo model: its control table, and properties that the table does not contain."""
 
     name: str
     number: int
