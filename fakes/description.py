@@ -19,7 +19,7 @@ from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_chain, ma
 from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.toml_errors import describe
 
 
@@ -218,7 +218,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     Raises PlantError if a custom plant is described and cannot be created.
     """
     servos = [
-        Servo(
+        EmulatedServo(
             load_model(servo.model, servo.firmware),
             servo.id,
             zero_ticks=servo.zero_ticks,

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import VELOCITY_UNIT_RPM, Model
+from hil.fakes.servo.registers import VELOCITY_UNIT_RPM, EmulatedModel
 from hil.fakes.servo.trajectory import ACCELERATION_PER_MS, VELOCITY_TICKS_PER_MS, Trajectory, profile
 
 CURRENT_MODE = 0
@@ -103,7 +103,7 @@ class Controller:
         self._integral = self._error_before = 0.0
         self._goal_before = None
 
-    def motor_current(self, model: Model, supply_v: float, position_ticks: float, velocity: float) -> float:
+    def motor_current(self, model: EmulatedModel, supply_v: float, position_ticks: float, velocity: float) -> float:
         """Run one millisecond of control; return the motor current [A], limited by the supply voltage.
 
         velocity: velocity of the output shaft in the servo's sense of rotation [rad/s].
