@@ -1,4 +1,4 @@
-"""Slips of unit are refused by name; what real arms have is not."""
+"""Unit mistakes are refused by name; values of real arms are accepted."""
 
 from pathlib import Path
 
@@ -67,7 +67,7 @@ def test_ready_arms_pass(name: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("torque_constant = 1.81 ", "torque_constant = 9.05 "),  # a gear of 5 behind the servo
+        ("torque_constant = 1.81 ", "torque_constant = 9.05 "),  # an external gear with a ratio of 5
         ("position_limit = [-3.14, 0.00]", "position_limit = [-7.0, 4.0]"),
         ("[arm]\n", "[arm]\nlink_lengths = [0.03, 0.9]\n"),
     ],
