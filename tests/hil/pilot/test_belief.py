@@ -1,4 +1,4 @@
-"""What a run teaches of the arm, moved or not; gains for arms without a stable rest; when to give up."""
+"""Belief updates from runs with and without motion, stabiliser gains, and when the search gives up."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def config() -> Config:
 
 
 def commands(config: Config, peak: tuple[float, float]) -> np.ndarray:
-    """Ramp and one period of a pilot (joints, samples) [N m]."""
+    """Torque of the ramp and one period of a pilot (joints, samples) [N m]."""
     pilot = with_torque(pilot_config(config), np.array(peak))
     segment = make_plan(pilot).segments[0]
     constants = np.array([joint.torque_per_goal for joint in config.joints])
