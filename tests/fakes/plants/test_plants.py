@@ -1,4 +1,4 @@
-"""Backlash, cogging, stops, tilt, jams; plants of somebody else's."""
+"""Backlash, cogging, stops, tilt, jams; third-party plants."""
 
 import math
 import sys
@@ -148,7 +148,7 @@ def test_impossible_drives(changes: dict[str, Any], said: str) -> None:
         arm("pendulum", **changes)
 
 
-# Somebody else's plant
+# Third-party plants
 
 
 class Good:
