@@ -1,8 +1,8 @@
 """Excitation of a spatial arm: joint paths, played as the feed-forward torque that what is known of the arm gives.
 
-The stabiliser pulls towards the rest pose all the time. So that its spring and damper hold the arm to the path instead,
-what they will add is taken off beforehand: goal = feed-forward + stiffness (path - rest) + damping path velocity. The
-way from the rest pose to the path and back is part of what is played.
+The stabiliser always pulls towards the rest pose. To hold the arm to the path instead, its contribution is compensated
+in advance: goal = feed-forward + stiffness (path - rest) + damping path velocity. The transitions from the rest pose to
+the path and back are part of the plan.
 """
 
 from collections.abc import Callable
@@ -53,7 +53,7 @@ class PathSegment(Segment):
 
 
 def plan_of(config: Config) -> Plan:
-    """What this configuration's arm will play; raises ConfigError."""
+    """Make the plan of this configuration's arm. Raises ConfigError."""
     return make_chain_plan(config) if config.is_chain else make_plan(config)
 
 
@@ -151,8 +151,7 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
 
 
 def _ways(config: Config, path: Path) -> tuple[Path, Path]:
-    """From the rest pose into the path, which runs on all the while, and out of it back: no joint leaves the range
-    between the two."""
+    """Transitions from the rest pose into the moving path and back; no joint leaves the range between the two."""
     count = max(2, round(config.experiment.ramp * config.experiment.rate))
     samples = path.position.shape[1]
     before, after = np.arange(-count, 0) % samples, np.arange(count) % samples
@@ -162,7 +161,7 @@ def _ways(config: Config, path: Path) -> tuple[Path, Path]:
 
 
 def _blended(config: Config, path: Path, at: NDArray[np.int64], s: Array, seconds: float) -> Path:
-    """Between the rest pose, at s = 0, and the path, at 1, smooth to the second derivative."""
+    """Blend of the rest pose (s = 0) and the path (s = 1) with continuous second derivatives."""
     share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
     slope = 30.0 * s**2 * (1.0 - s) ** 2 / seconds
     bend = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / seconds**2
@@ -176,7 +175,7 @@ def _blended(config: Config, path: Path, at: NDArray[np.int64], s: Array, second
 
 
 def _fade(count: int, rate: float) -> Array:
-    """From 0 to 1 in SETTLE_IN, then 1."""
+    """Smooth rise from 0 to 1 over SETTLE_IN, then 1."""
     s = np.clip(np.arange(max(2, count)) / (SETTLE_IN * rate), 0.0, 1.0)
     fade: Array = s * s * (3.0 - 2.0 * s)
     return fade
