@@ -8,6 +8,7 @@ capsule from joint to joint, with a guessed radius, and is named.
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ GUESSED_SHARE, GUESSED_LEAST, GUESSED_MOST = 0.2, 0.015, 0.05
 """Radius of a link without geometry: this share of its length, within these bounds [m]."""
 
 MOST_STRIPS = 4
+LONGEST_PIECE = 0.08  # m
 _NOTHING = 1e-6
 
 
@@ -56,13 +58,23 @@ def shapes_of(arm: ArmDescription) -> Shapes:
         if not found or not is_whole:
             guessed.append(names[link])
             found += _from_joints(arm, link, [shift for _, _, shift, _ in here]) if link > 0 else []
-        capsules += found
+        capsules += [piece for each in found for piece in _pieces(each)]
     for each in capsules:
         if not (np.isfinite(each.ends).all() and 0.0 <= each.radius < np.inf):
             raise ArmFileError(
                 f'{arm.path}: link "{names[each.link]}": its collision geometry has a size or origin that is no number'
             )
     return Shapes(names, tuple(capsules), tuple(guessed))
+
+
+def _pieces(capsule: Capsule) -> list[Capsule]:
+    """Shorter capsules that together are the same: the part next to a joint may touch what the rest must not."""
+    length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))
+    if not length < np.inf:
+        return [capsule]  # named later
+    at = np.linspace(0.0, 1.0, max(2, int(np.ceil(length / LONGEST_PIECE)) + 1))
+    points = capsule.ends[0] + at[:, None] * (capsule.ends[1] - capsule.ends[0])
+    return [Capsule(capsule.link, np.stack(ends), capsule.radius) for ends in pairwise(points)]
 
 
 def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], bool]:

@@ -16,8 +16,11 @@ from hil.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-ALWAYS_SHARE = 0.9
-"""Of all poses: capsules that are nearer than the margin in as many are parts of one joint, which touch as built."""
+ALWAYS_SHARE = 0.75
+"""Of all poses: capsules with one link between them that are nearer than BUILT_NEAR in as many meet at its joints."""
+
+ALWAYS_SHARE_OF_OTHERS = 0.98
+BUILT_NEAR = 0.02  # m beyond the margin
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
@@ -193,13 +196,19 @@ def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool)
     return found + [(a, BOXES - box) for a in range(count) if link[a] > 0 for box in range(boxes)]
 
 
-def _touch_as_built(config: Config, chain: object, arrays: object, pairs: NDArray[np.int64], margin: float) -> Array:
-    """Of which pairs the capsules are nearer than the margin in nearly every pose within the limits (pairs,)."""
+def _touch_as_built(
+    config: Config, chain: object, arrays: tuple[NDArray[np.int64], ...], pairs: NDArray[np.int64], margin: float
+) -> Array:
+    """Of which pairs the capsules are near in nearly every pose within the limits (pairs,)."""
+    link = arrays[0]
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     poses = np.random.default_rng(1).uniform(low, high, (RANDOM_POSES, len(low)))
     distance = np.empty((RANDOM_POSES, len(pairs)))
     all_distances(chain, arrays, pairs, poses, distance)
-    near: Array = (distance < margin).mean(axis=0) >= ALWAYS_SHARE
+    second = np.maximum(pairs[:, 1], 0)
+    are_close = np.abs(link[pairs[:, 0]] - link[second]) == 2  # noqa: PLR2004 (one link in between)
+    needed = np.where(are_close, ALWAYS_SHARE, ALWAYS_SHARE_OF_OTHERS)
+    near: Array = (distance < margin + BUILT_NEAR).mean(axis=0) >= needed
     return near & (pairs[:, 1] >= 0)
 
 
