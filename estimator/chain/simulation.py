@@ -23,7 +23,7 @@ class ChainRun:
     torque: Array
     """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
     slopes: Array
-    """Its derivatives by delay and by lag (samples, steps, 2, joints) [N m/s]."""
+    """Derivatives of `torque` by delay and by lag (samples, steps, 2, joints) [N m/s]."""
     measured: Array
     """Measured angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
