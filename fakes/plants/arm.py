@@ -107,7 +107,7 @@ class Drive(BaseModel):
                 "presliding_damping needs a presliding_stiffness greater than 0: there is no spring to damp"
             )
         if self.stops is not None and self.stops[0] >= self.stops[1]:
-            raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be the smaller")
+            raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be less than the second")
         if self.backlash and not self.rotor_inertia:
             raise ValueError(
                 "backlash needs a rotor_inertia greater than 0: within the play the rotor moves on its own"
