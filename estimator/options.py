@@ -140,7 +140,7 @@ class LikelihoodOptions:
     """Maximum relative decrease of a Coulomb width per iteration with fine steps, where the cost is nearly quadratic.
     """
     max_relative_decrease_coarse: float = 0.5
-    """The same with coarse steps, far from the minimum, where the cost is far from quadratic."""
+    """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
     same_cost: float = 1.0
     """Minima whose sums of squares differ by less than this count as the same."""

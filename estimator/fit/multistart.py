@@ -189,7 +189,7 @@ class Search:
         return Refined(weighted, outliers, best, cost, sum(found.iterations for found in ends))
 
     def _distinct(self, tries: Sequence[Minimum]) -> list[Minimum]:
-        """Return the best, and those that only finer steps can distinguish from it."""
+        """Return the best minimum and those that only finer steps can distinguish from it."""
         distinct: list[Minimum] = []
         for each in sorted(tries, key=lambda found: found.at.cost):
             cost = each.at.cost

@@ -21,7 +21,10 @@ SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles 
 
 
 def place_of(term: str) -> int:
-    """Return the index of a term's constant in `Physics.vector` (for a joint's term joint 1's; joint 2's follows)."""
+    """Return the index of a term's constant in `Physics.vector`.
+
+    For a term of each joint it is the index for joint 1, which is followed by joint 2.
+    """
     return CONSTANTS.index(term if TERMS[term].scope == "arm" else f"{term}_1")
 
 

@@ -67,7 +67,7 @@ class Linearised:
     samples: int
     """Number of valid samples over all joints; it equals the sum of squares, which is weighted by the residual."""
     colour: float
-    """Factor by which the residual's correlation increases chance decreases; 1 is white."""
+    """Factor by which the residual's correlation raises the decrease expected by chance; 1 for white residuals."""
     precision: Array
     """Inverse prior variances of the parameters (parameters,), 0 without a prior."""
 

@@ -43,7 +43,7 @@ class Trial:
 
     model: Model
     estimate: Estimate | None
-    """None if the fit or the prediction did not converge."""
+    """Result of the fit; None if the fit or the prediction did not converge."""
     held_out: Array | None
     """RMS error of the free prediction relative to the motion's RMS (joints,)."""
     score: float

@@ -32,7 +32,7 @@ class Levels:
     model_error: Array
     """Residual of the fit beyond rounding and scatter."""
     lines: Distortion
-    """The same per line, with odd and even lines separated if the excitation allows it."""
+    """Levels per line, with odd and even lines separated if the excitation allows it."""
 
 
 @dataclass(frozen=True)
