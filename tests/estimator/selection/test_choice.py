@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.recorded_arm import servo_arm
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.fit.covariance import correlation_time, structured_share
@@ -19,6 +18,7 @@ from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
 from hil.fakes.plants.arm import Arm, base_parameters
 from tests.estimator.conftest import STICKING
+from tests.support.recorded_arm import servo_arm
 
 Recorder = Callable[[Arm, Multisine], SettledPeriod]
 Wave = Callable[..., Multisine]
