@@ -137,6 +137,8 @@ class LikelihoodOptions:
     max_relative_decrease_coarse: float = 0.5
     """The same far from the minimum, where it is anything but."""
 
+    same_motion: float = 0.02
+    """Relative difference of two sums of squares, in coarse and in fine steps, up to which coarse ones may lead on."""
     same_cost: float = 1.0
     """Minima whose sums of squares are this close count as the same."""
     close_cost: float = 25.0

@@ -16,6 +16,9 @@ from hil.estimator.models.terms import (
     units_of,
 )
 
+LEVER_STD = 0.05
+"""Relative standard deviation of a link's length by a ruler, over gravity by the tilt that somebody gave."""
+
 
 @dataclass(frozen=True)
 class Model:
@@ -44,9 +47,16 @@ class Model:
     drive: Drive = "delay"
     options: Collection[Option] = frozenset()
     """A frozenset once the model exists."""
+    by_voltage: Collection[int] = frozenset()
+    """Joints, from 1, that are driven by voltage, whose back-EMF passes the drive's lag as the voltage does: a share
+    back_emf of their viscous friction (`hil.estimator.simulation.back_emf`). A frozenset once the model exists."""
+    lever: float | None = None
+    """Length of link 1 over gravity [s^2], where a ruler and the arm's tilt tell it: coupling is that times gravity_2.
+    It is expected to `LEVER_STD`, no more, so that it decides only where the motion does not."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "options", frozenset(self.options))
+        object.__setattr__(self, "by_voltage", frozenset(self.by_voltage))
         base_names(self.joints)
         if self.friction not in FRICTIONS:
             raise ModelError(f"friction model {self.friction!r}: choose one of {', '.join(FRICTIONS)}")
@@ -75,7 +85,9 @@ class Model:
     def names(self) -> tuple[str, ...]:
         """The base parameters, then the other terms joint by joint, in the order in which they are declared."""
         laws = FRICTIONS[: FRICTIONS.index(self.friction) + 1]
-        return (*self.base_names, *extra_names(self.joints, frozenset((*laws, *self.options, *DRIVES[self.drive]))))
+        voltage = ("voltage",) if self.by_voltage else ()
+        parts = frozenset((*laws, *self.options, *DRIVES[self.drive], *voltage))
+        return (*self.base_names, *extra_names(self.joints, parts, frozenset(self.by_voltage)))
 
     @property
     def description(self) -> str:

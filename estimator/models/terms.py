@@ -27,7 +27,7 @@ Option = Literal[
 ]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
-Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation"]
+Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation", "cable"]
 
 FRICTIONS: tuple[Friction, ...] = get_args(Friction)
 """Laws of dry friction; each holds the terms of those before it."""
@@ -59,8 +59,8 @@ class Term:
     """Human-readable description."""
     _: KW_ONLY
     part: str
-    """What of a model brings it: "base" (the linear regression's, always there), a law of FRICTIONS, one of OPTIONS or
-    a drive's term."""
+    """What of a model brings it: "base" (the linear regression's, always there), a law of FRICTIONS, one of OPTIONS,
+    a drive's term, or "voltage" at joints that are driven by it."""
     scope: Scope = "joint"
     first_joint: int = 1
     """The first joint that has one: 2 for what is relative to joint 1 or contained in its other terms."""
@@ -209,7 +209,7 @@ _DECLARED = (
         part="cable",
         range="any",
         scale="torque",
-        spread="torque",
+        spread="cable",
     ),
     *(
         Term(
@@ -235,6 +235,14 @@ _DECLARED = (
         scale=1e-3,
         simulated=False,
         spread=1.5e-3,
+    ),
+    Term(
+        "back_emf",
+        "1",
+        "share of viscous friction that the motor generates: it passes the drive's lag as the voltage does",
+        part="voltage",
+        initial=0.92,
+        log_spread=0.08,
     ),
     Term(
         "delay",
@@ -295,13 +303,19 @@ def base_names(joints: int) -> tuple[str, ...]:
     return (*RIGID_BODY[joints], *friction)
 
 
-def extra_names(joints: int, parts: frozenset[str] | None = None) -> tuple[str, ...]:
-    """Names of what a model of these `parts` has beside the base parameters; by default of all that there is."""
+def extra_names(
+    joints: int, parts: frozenset[str] | None = None, by_voltage: frozenset[int] | None = None
+) -> tuple[str, ...]:
+    """Names of what a model of these `parts` has beside the base parameters; by default of all that there is.
+
+    by_voltage: joints, from 1, that are driven by voltage; by default all.
+    """
     return tuple(
         name
         for term in _DECLARED
         if term.part != "base" and (parts is None or (term.part in parts and term.replaced_by not in parts))
         for name in _names_of(term, joints)
+        if term.part != "voltage" or by_voltage is None or joint_of(name) in by_voltage
     )
 
 

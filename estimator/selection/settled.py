@@ -7,7 +7,7 @@ without meaning would. Without another motion the Bayesian information criterion
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -100,6 +100,8 @@ def choose(
     drive: Drive,
     *,
     torque_scale: bool = False,
+    by_voltage: Collection[int] = (),
+    lever: float | None = None,
     starts: Sequence[Mapping[str, float]] = (),
     options: SelectionOptions = DEFAULTS,
 ) -> Choice:
@@ -118,6 +120,8 @@ def choose(
         held_out: a settled period of another motion, which judges; without one, the Bayesian information criterion.
         drive: the drive's terms, of every model.
         torque_scale: whether the ratio of the torque constants stays in whatever it is.
+        by_voltage: joints, from 1, that are driven by voltage.
+        lever: as of `hil.estimator.models.model.Model`.
         starts: as of `hil.estimator.identify.identify`.
         options: thresholds.
 
@@ -125,7 +129,7 @@ def choose(
         ConvergenceError: when no model can be fitted.
     """
     search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None)
-    grown = search.grow(Model(periods[0].joints, "stribeck", drive))
+    grown = search.grow(Model(periods[0].joints, "stribeck", drive, by_voltage=by_voltage, lever=lever))
     pruned = search.prune(grown)
     return Choice(tuple(search.trials), search.judged(pruned))
 

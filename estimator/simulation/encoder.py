@@ -29,7 +29,7 @@ def measured_and_slopes(
     `derivative` (joints, samples, causes) is that of the true angles by `by_motion(names)` and then the rest.
     """
     wanted = [name for name in names if kind_of(name) in ENCODER]
-    if not wanted:
+    if not wanted and not physics.encoder.any():
         return position, derivative
     joints = position.shape[0]
     waves = _waves(position)

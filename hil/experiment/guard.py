@@ -30,6 +30,9 @@ JUMP_ALLOWANCE_RAD = 0.01
 EARLY_MOTION_RAD = 0.05
 """How far a joint may creep in the rest before the start."""
 
+FARTHER_OUT_RAD = 0.01
+"""How much farther out a joint may move that a run before this one left beyond its limit."""
+
 LONG_GAP = 3.0
 """Intervals between two samples from which on what lies between them is not known well enough to be added up."""
 
@@ -67,11 +70,14 @@ class Guard:
 
     planned: largest goal that the plan has for each joint [A, or V under PWM]; from the configuration where not given.
 
+    left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
+    have come to rest a little beyond it: a joint found there may move back in, and no farther out.
+
     passive: whether the arm cannot return more work than was put in; True for an arm that starts at stable rest
     without a stabiliser. Motors that continually take work out of it then turn the wrong way.
     """
 
-    def __init__(self, config: Config, planned: Sequence[float] | None = None) -> None:
+    def __init__(self, config: Config, planned: Sequence[float] | None = None, *, left_by_a_run: bool = False) -> None:
         rate = config.experiment.rate
         safety = config.safety
         self._names = [str(joint.joint) for joint in config.joints]
@@ -108,6 +114,8 @@ class Guard:
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
+        self._may_start_outside = left_by_a_run
+        self._found_outside: dict[int, float] = {}
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
         """Goals within each joint's current limit and slew [A]; NaN becomes a SafetyStop, never a command."""
@@ -258,8 +266,16 @@ class Guard:
             f"{most:.3f}. Check the encoder, its magnet and the supply.",
         )
 
-    def _outside(self, index: int, position: float) -> NoReturn:
+    def _outside(self, index: int, position: float) -> None:
         low, high = self._limits[index][:2]
+        former = self._position[index]
+        if former is None and self._may_start_outside:
+            self._found_outside[index] = position
+        found = self._found_outside.get(index)
+        was_inside = former is not None and low <= former <= high
+        if found is not None and not was_inside:
+            if min(low, found - FARTHER_OUT_RAD) <= position <= max(high, found + FARTHER_OUT_RAD):
+                return
         self._stop(
             index,
             Cause.POSITION,

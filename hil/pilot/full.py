@@ -14,8 +14,8 @@ from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
 
-MOST_TRIES = 3
-"""Full runs, where one passes a limit or does not settle."""
+MOST_TRIES = 6
+"""Full runs, where one passes a limit or does not settle: each has less torque than the one before."""
 
 _BACK_OFF = 0.85
 """Torque factor after a run that never settled: large motion with little friction need not settle at all."""

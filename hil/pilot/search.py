@@ -37,6 +37,8 @@ _PILOT_PERIOD_SHARE = 0.5
 _PILOT_SETTLING = 1
 _AFTER_LIMIT = 0.85
 """Of the torque under which a limit was passed: the most of what follows."""
+_INSIDE = 0.95
+"""Of the limits: where an arm is thought to start that stands beyond."""
 _MOST_RAISE = 1.6
 _AT_LIMIT = 0.99
 _MORE, _LITTLE_MORE, _FAIR = 1.15, 1.03, 0.7
@@ -85,7 +87,7 @@ class Search:
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
-        self.pose = played.seen.end
+        self.pose = _within_limits(self.config, played.seen.end)
         swing = played.seen.swing
         self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
 
@@ -226,6 +228,13 @@ def pilot_config(config: Config) -> Config:
 def _from_anywhere(config: Config) -> Config:
     """The configuration for an arm that was in its rest pose when the search began, and is where friction left it."""
     return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_tolerance": 2 * np.pi})})
+
+
+def _within_limits(config: Config, pose: Array) -> Array:
+    """A pose beyond a limit, where a stopped run may leave the arm, moved to it: the next run begins by moving in."""
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    return np.asarray(np.clip(pose, middle - _INSIDE * half, middle + _INSIDE * half))
 
 
 def only_first(found: Amplitude) -> Amplitude:
