@@ -112,7 +112,14 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, flo
         t *= 1.0 + p[SINE + joint] * math.sin(cycles * q) + p[COSINE + joint] * math.cos(cycles * q)
     level = p[COULOMB + joint] * (1.0 + p[RISE + joint] * bump_at(v / p[FADING + joint])) + p[LOAD + joint] * abs(t)
     bend, bent = bend_at(v, 1.0 / p[WIDTH + joint])
-    left = t + generated - p[OFFSET + joint] - p[CABLE + joint] * q - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
+    left = (
+        t
+        + generated
+        - p[OFFSET + joint]
+        - p[CABLE + joint] * q
+        - viscous * v
+        - (p[ASYMMETRY + joint] * v + level) * bend
+    )
     slope = viscous + level * bent
     return left, slope
 

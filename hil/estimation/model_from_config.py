@@ -1,4 +1,4 @@
-"""From `[model]` and the joints' modes to the model that the estimator fits."""
+"""Conversion of `[model]` and the joints' modes to the model that the estimator fits."""
 
 from collections.abc import Collection
 
@@ -12,7 +12,7 @@ from hil.estimator.models.terms import OPTIONS
 def wanted_model(
     wanted: ModelConfig, joints: int, by_voltage: Collection[int] = (), lever: float | None = None
 ) -> Model:
-    """What the file asks for, of an arm of `joints`; where it says "auto", Stribeck friction.
+    """The model requested by the file for an arm with `joints` joints; "auto" gives Stribeck friction.
 
     by_voltage: joints, from 1, that are driven by voltage (`voltage_driven`). lever: of the first link (`lever_of`).
     """
