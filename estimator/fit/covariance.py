@@ -104,8 +104,8 @@ def robust_covariance(
 
     The larger of the sandwich and of what independent errors would give, direction by direction: a short
     recording cannot prove that its errors cancel. Without `scatter` that of independent errors of variance 1.
-    `structured` is the part of the sum of squares that is a model's error. `expected` (coordinates, coordinates) is what a
-    prior has put into the normal equations: it stays as it is where the errors of measurement are larger than
+    `structured` is the part of the sum of squares that is a model's error. `expected` (coordinates, coordinates) is
+    what a prior has put into the normal equations: it stays as it is where the errors of measurement are larger than
     independent ones. Infinite for a coordinate without influence on the residual.
     """
     prior = np.zeros_like(at.normal) if expected is None else (1.0 - FAINT_PRIOR) * expected

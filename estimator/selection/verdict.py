@@ -24,6 +24,7 @@ EXPLAINED = 1.06  # residual over noise up to which the model has explained the 
 GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # of the motion's RMS
 MUCH_LEFT = 5.0  # residual over noise from which parameters are doubtful without a held-out check
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
+LITTLE_EFFECT = 0.02  # standard error of its torque, relative to the joint's: a parameter that hardly matters
 ALIKE = 0.99  # correlation
 NOISY = 1.25  # noise over rounding from which it is said
 IMPROVEMENT = {
@@ -84,7 +85,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
 
 def _trust(validation: Validation, evidence: Evidence) -> Trust:
     left = float(validation.residual_over_floor.max())
-    doubtful = max(validation.relative_std.values()) > WEAK or bool(evidence.doubts)
+    doubtful = any(_is_weak(validation, name) for name in validation.relative_std) or bool(evidence.doubts)
     if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"
@@ -93,6 +94,11 @@ def _trust(validation: Validation, evidence: Evidence) -> Trust:
     if not worst <= USABLE_PREDICTION:
         return "no"
     return "with care" if doubtful or left > MUCH_LEFT or worst > GOOD_PREDICTION else "yes"
+
+
+def _is_weak(validation: Validation, name: str) -> bool:
+    """Whether a parameter is poorly known and the arm's torque depends on it."""
+    return validation.relative_std[name] > WEAK and not validation.torque_std[name] <= LITTLE_EFFECT
 
 
 def _noise(validation: Validation) -> str:
@@ -200,6 +206,12 @@ def _weak(validation: Validation) -> tuple[str, ...]:
     if part <= WELL_KNOWN:
         return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
     improvement = IMPROVEMENT[kind_of(name)]
+    if part > WEAK and not _is_weak(validation, name):
+        share = 100 * validation.torque_std[name]
+        return (
+            f"The least well known parameter is {name}, to {100 * part:.2g} %, which hardly affects this arm: its "
+            f"standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
+        )
     if not np.isfinite(part):
         return (f"This motion reveals nothing of {name}. To identify it: {improvement}.",)
     return (f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}.",)

@@ -274,7 +274,8 @@ class Guard:
         found = self._found_outside.get(index)
         was_inside = former is not None and low <= former <= high
         if found is not None and not was_inside:
-            if min(low, found - FARTHER_OUT_RAD) <= position <= max(high, found + FARTHER_OUT_RAD):
+            farthest = min(low, found - FARTHER_OUT_RAD), max(high, found + FARTHER_OUT_RAD)
+            if farthest[0] <= position <= farthest[1]:
                 return
         self._stop(
             index,
