@@ -1,9 +1,9 @@
 """Any arm: arms drawn at random go the whole way from `hil init`'s file to a verdict, as a person would take them.
 
-    python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--jobs N] [--json] [--keep DIR]
+    python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 
-The distribution stands in benchmarks/population_arms.py. Each arm is identified by `hil identify` in a process of its
-own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto",
+The distribution stands in benchmarks/population_arms.py, with --others in benchmarks/population_others.py. Each arm is
+identified by `hil identify` in a process of its own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto",
 for tests.
 
 finished              share that ended with a result, nobody helping
@@ -42,8 +42,10 @@ from hil.runs.recording import Phase, load_samples
 
 try:
     from benchmarks.population_arms import DrawnArm, draw
+    from benchmarks.population_others import draw as draw_other
 except ImportError:  # run as a script
     from population_arms import DrawnArm, draw
+    from population_others import draw as draw_other
 
 FINISHED_WITHIN_S = 900.0
 JUDGED = ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb")
@@ -91,9 +93,9 @@ class Outcome:
         )
 
 
-def run(seed: int, folder: Path, *, quick: bool = False) -> Outcome:
+def run(seed: int, folder: Path, *, quick: bool = False, others: bool = False) -> Outcome:
     """Identify the arm of this seed in a process of its own, and judge what it did."""
-    arm = draw(seed)
+    arm = draw_other(seed) if others else draw(seed)
     if quick:
         arm = replace(arm, toml=arm.toml.replace('friction = "auto"  ', 'friction = "stribeck"'))
     folder.mkdir(parents=True, exist_ok=True)
@@ -221,12 +223,16 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def study(seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False) -> list[Outcome]:
+def study(
+    seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False, others: bool = False
+) -> list[Outcome]:
     """The outcome of each seed's arm; tell: called with each as it ends."""
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
         folder = keep or Path(temporary)
         outcomes = []
-        for ended in as_completed([pool.submit(run, seed, folder / str(seed), quick=quick) for seed in seeds]):
+        for ended in as_completed(
+            [pool.submit(run, seed, folder / str(seed), quick=quick, others=others) for seed in seeds]
+        ):
             outcomes.append(ended.result())
             if tell:
                 tell(outcomes[-1])
@@ -246,6 +252,7 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=200)
     parser.add_argument("--seeds", type=_seeds, help="A..B, in place of --arms")
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--others", action="store_true", help="draw from benchmarks/population_others.py")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("--keep", type=Path, help="folder for files, run folders and messages")
     options = parser.parse_args()
@@ -254,7 +261,12 @@ def main() -> None:
         print(machine())
     stream = sys.stderr if options.json else sys.stdout
     outcomes = study(
-        seeds, options.jobs, options.keep, lambda each: print(each, file=stream, flush=True), quick=options.quick
+        seeds,
+        options.jobs,
+        options.keep,
+        lambda each: print(each, file=stream, flush=True),
+        quick=options.quick,
+        others=options.others,
     )
     measured = figures(outcomes)
     if options.json:
