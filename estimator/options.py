@@ -142,6 +142,8 @@ class LikelihoodOptions:
     max_relative_decrease_coarse: float = 0.5
     """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
+    same_motion: float = 0.02
+    """Relative difference of two sums of squares, in coarse and in fine steps, up to which coarse ones may lead on."""
     same_cost: float = 1.0
     """Minima whose sums of squares differ by less than this count as the same."""
     close_cost: float = 25.0

@@ -7,7 +7,7 @@ Statistics 6 (1978) 461), with the number of samples reduced according to the re
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -102,6 +102,8 @@ def choose(
     drive: Drive,
     *,
     torque_scale: bool = False,
+    by_voltage: Collection[int] = (),
+    lever: float | None = None,
     starts: Sequence[Mapping[str, float]] = (),
     options: SelectionOptions = DEFAULTS,
 ) -> Choice:
@@ -121,6 +123,8 @@ def choose(
             used.
         drive: drive model of all candidates.
         torque_scale: whether the ratio of the torque constants is kept in any case.
+        by_voltage: joints, from 1, that are driven by voltage.
+        lever: as of `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         options: thresholds.
 
@@ -128,7 +132,7 @@ def choose(
         ConvergenceError: if no model can be fitted.
     """
     search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None)
-    grown = search.grow(Model(periods[0].joints, "stribeck", drive))
+    grown = search.grow(Model(periods[0].joints, "stribeck", drive, by_voltage=by_voltage, lever=lever))
     pruned = search.prune(grown)
     return Choice(tuple(search.trials), search.judged(pruned))
 

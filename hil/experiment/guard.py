@@ -30,6 +30,9 @@ JUMP_ALLOWANCE_RAD = 0.01
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while resting before the start [rad]."""
 
+FARTHER_OUT_RAD = 0.01
+"""How much farther out a joint may move that a run before this one left beyond its limit."""
+
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
@@ -66,11 +69,14 @@ class Guard:
 
     planned: largest planned goal of each joint [A, or V under PWM]; by default, from the configuration.
 
+    left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
+    have come to rest a little beyond it: a joint found there may move back in, and no farther out.
+
     The work of the motors is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot
     return more work than was put in, so a motor that continually takes work out of it turns the wrong way.
     """
 
-    def __init__(self, config: Config, planned: Sequence[float] | None = None) -> None:
+    def __init__(self, config: Config, planned: Sequence[float] | None = None, *, left_by_a_run: bool = False) -> None:
         rate = config.experiment.rate
         safety = config.safety
         self._names = [str(joint.joint) for joint in config.joints]
@@ -107,6 +113,8 @@ class Guard:
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
+        self._may_start_outside = left_by_a_run
+        self._found_outside: dict[int, float] = {}
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
         """Clamp goals to each joint's current limit and slew rate [A or V]. Raises SafetyStop for a goal that is not
@@ -262,8 +270,17 @@ class Guard:
             f"{most:.3f}. Check the encoder, its magnet and the supply.",
         )
 
-    def _outside(self, index: int, position: float) -> NoReturn:
+    def _outside(self, index: int, position: float) -> None:
         low, high = self._limits[index][:2]
+        former = self._position[index]
+        if former is None and self._may_start_outside:
+            self._found_outside[index] = position
+        found = self._found_outside.get(index)
+        was_inside = former is not None and low <= former <= high
+        if found is not None and not was_inside:
+            farthest = min(low, found - FARTHER_OUT_RAD), max(high, found + FARTHER_OUT_RAD)
+            if farthest[0] <= position <= farthest[1]:
+                return
         self._stop(
             index,
             Cause.POSITION,

@@ -30,6 +30,7 @@ from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
 from hil.plan.stabiliser import Stabiliser
 from hil.runs.recording import Phase, Recorder, missed
+from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
@@ -74,7 +75,8 @@ class Stream:
         self._config = config
         self._safety = config.safety
         planned = _largest_goals(plan)
-        self._guard = Guard(config, planned)
+        self._left_by_a_run = has_moved()
+        self._guard = Guard(config, planned, left_by_a_run=self._left_by_a_run)
         self._model: ModelWatch | ChainWatch = (
             ModelWatch(config, planned, arms)
             if isinstance(arms, Ensemble) or not config.is_chain
@@ -129,6 +131,12 @@ class Stream:
         self._note("rest")
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
+        window = rest_window(self._plan.rate)
+        # The stabiliser may have to bring it back first from where the run before was stopped.
+        for _ in range(0, self._plan.end_samples if self._left_by_a_run else 0, window):
+            if not moving:
+                break
+            moving = self._moving(self._play(self._silence(window), Phase.REST))
         if moving:
             raise ExperimentError(
                 f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
