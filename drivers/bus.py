@@ -1,7 +1,7 @@
 """The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from hil.drivers.control_table import ControlTable, load_control_table, model_names
@@ -14,15 +14,15 @@ from hil.drivers.errors import (
 )
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
-from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
+from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.hold import let_sink, refuse_held
 from hil.drivers.preparation.prepare import check_quiet, fault_text, learn_latency, prepare_servo, shared
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
-from hil.drivers.shield import signals_held_back
 from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_span
-from hil.drivers.sync_read import one_each
+from hil.drivers.sync_read import Answer, one_each
+from hil.drivers.torque_off import TorqueOff, cut_torque, disarm_watchdogs, signals_held_back
 
 _PROBES = 3
 """How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
@@ -35,9 +35,6 @@ _SHARE, _MOST_SHARE = 0.6, 0.9
 
 MOST_STRANGERS = 2
 """How many instructions of another master may be heard while an experiment runs; a damaged reply can look like one."""
-
-_INTERRUPTS_BORNE = 5
-"""How often confirming that a servo is off is begun again after an interrupt."""
 
 
 @dataclass(frozen=True)
@@ -71,34 +68,6 @@ class BusConfig:
         return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
 
 
-@dataclass(frozen=True)
-class TorqueOff:
-    """Result of the attempt to cut torque: joints read back as off, why the others could not be confirmed, and which of
-    all have no Bus Watchdog.
-    """
-
-    confirmed: tuple[Joint, ...]
-    unconfirmed: tuple[tuple[Joint, str], ...]
-    unwatched: frozenset[Joint] = frozenset()
-
-    def __str__(self) -> str:
-        if not self.unconfirmed:
-            servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
-            return f"Torque is off on {servos}, read back."
-        names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
-        alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
-        if alone:
-            return (
-                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
-                "Watchdog and may keep its last current: cut the supply now."
-            )
-        return (
-            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, but cut "
-            "the "
-            "supply before you reach into the arm."
-        )
-
-
 class ServoBus:
     """The servos of an arm on an open port. Use as a context manager; `close` may be called twice.
 
@@ -124,6 +93,8 @@ class ServoBus:
         self._exchange: Exchange | None = None
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
+        self._watchdog = 0.0
+        self._last_answers: Sequence[Answer] = ()
         self.torque_off_report: TorqueOff | None = None
 
     @classmethod
@@ -309,7 +280,9 @@ class ServoBus:
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
         ticks = self._converter.ticks(goals)
         exchange = self._exchange or self.prepared
-        state = self._converter.state(ticks, exchange.cycle(ticks))
+        reply = exchange.cycle(ticks)
+        self._last_answers = reply.servos
+        state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:
             raise shared(f"has sent {exchange.strangers} instructions")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
@@ -361,6 +334,7 @@ class ServoBus:
         ticks = round(watchdog / WATCHDOG_UNIT)
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
+        self._watchdog = watchdog
         for joint, servo in self._servos.items():
             watched = joint not in self._without_watchdog
             if watched:
@@ -378,65 +352,25 @@ class ServoBus:
                 raise
 
     def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back. Tries all of them whatever fails.
+        """Cut torque on every servo and read it back (`hil.drivers.torque_off`). Tries all of them whatever fails.
 
-        After each servo that cannot be confirmed all are told again: it may hear though it cannot answer, and while it
-        was asked the others' watchdogs heard packets and waited. Signals are held back until it is done; an interrupt
-        that still arrives is raised after all servos have been tried and `torque_off_report` is there.
+        Signals are held back until it is done; an interrupt that still arrives is raised after all servos have been
+        tried and `torque_off_report` is there.
         """
         interrupts: list[BaseException] = []
         with signals_held_back():
-            try:
-                self._torque_off_at_once()
-            except BaseException as interrupt:  # the servos must be tried one by one whatever happens
-                interrupts.append(interrupt)
-            confirmed, unconfirmed = self._confirm_torque_off(interrupts)
+            silent = {
+                drive
+                for drive, answer in zip(self._drives, self._last_answers, strict=False)
+                if answer is None or len(answer) == 1
+            }
+            confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
+            watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
+            disarm_watchdogs(watched, interrupts)
             self.torque_off_report = TorqueOff(confirmed, unconfirmed, frozenset(self._without_watchdog))
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report
-
-    def _confirm_torque_off(
-        self, interrupts: list[BaseException]
-    ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
-        confirmed, unconfirmed = [], []
-        for joint, servo in self._servos.items():
-            why = _write_surely(servo, "Torque Enable", 0, interrupts)
-            if why is None:
-                confirmed.append(joint)
-            else:
-                unconfirmed.append((joint, why))
-                self._torque_off_at_once()
-        for joint in confirmed:
-            if joint not in self._without_watchdog:
-                _write_surely(self._servos[joint], "Bus Watchdog", 0, interrupts)
-        return tuple(confirmed), tuple(unconfirmed)
-
-    def _torque_off_at_once(self) -> None:
-        """Torque off to all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s
-        where one is
-        silent. A Sync Write, since other servos on the bus may be in use. Twice, since a packet may be lost.
-        """
-        entry = self._servos[self._drives[0]].table["Torque Enable"]
-        body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
-        body += b"".join(bytes((drive.id, 0)) for drive in self._drives)
-        # Where this fails, the confirmed writes will say so.
-        with suppress(DriverError):
-            self.port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
-
-
-def _write_surely(servo: Servo, register: str, value: int, interrupts: list[BaseException]) -> str | None:
-    """Write a register and read it back, again after an interrupt, which is kept; why it failed, or None."""
-    for _ in range(_INTERRUPTS_BORNE):
-        try:
-            servo.write(register, value)
-        except Exception as error:  # whatever one servo does, the next must be tried
-            return str(error) or type(error).__name__
-        except BaseException as interrupt:
-            interrupts.append(interrupt)
-        else:
-            return None
-    return "It was interrupted repeatedly."
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_in
-from benchmarks.fault_campaign.draw import CAUSES, SHIFTED, UNHEARD, WORDS, Drawn
+from benchmarks.fault_campaign.draw import CAUSES, HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn
 from benchmarks.fault_campaign.middle import Traffic
 from benchmarks.fault_campaign.witness import STEP_S
 from hil.config.schema import Config
@@ -93,6 +93,8 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
 def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
     """Whether a message names the cause among at most three it offers, and whether it offers others only."""
     offered = causes_in(text)
+    if set(drawn.kinds) <= HARMLESS:
+        return False, True  # whatever it says: it should not have stopped
     right = frozenset().union(*(CAUSES[kind] for kind in drawn.kinds))
     if not right:
         return True, False  # nothing of it had to stop the run: what did is not for words to tell

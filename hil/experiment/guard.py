@@ -12,7 +12,7 @@ from typing import NamedTuple, NoReturn
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
-from hil.drivers.packet import ALERT
+from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
@@ -108,6 +108,8 @@ class Guard:
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
+        self._shortest = float("inf")
+        self._unsure = 0.0
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
         """Goals within each joint's current limit and slew [A]; NaN becomes a SafetyStop, never a command."""
@@ -164,6 +166,9 @@ class Guard:
                 f"This program stalled: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
                 Cause.LATE,
             )
+        took = state.time_after_read - now
+        self._shortest = shortest = min(self._shortest, took)
+        self._unsure = took - shortest
         self._late = 0
         if self._often_late > 0.0:
             self._judge_rate()
@@ -186,8 +191,9 @@ class Guard:
         low, high, fastest, farthest, _, work_scale, work_least = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
         interval = self._interval
+        elapsed = now - self._seen_at[index]
         # A sample on time after a late one stands for a whole interval all the same.
-        seconds = max(now - self._seen_at[index], interval * (1 + self._missing[index]))
+        seconds = max(elapsed, interval * (1 + self._missing[index]))
         former = self._position[index]
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
@@ -204,9 +210,9 @@ class Guard:
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
             self._not_followed(index, off)
         consistency = self._consistency[index]
-        if seconds > LONG_GAP * interval:
+        if elapsed > LONG_GAP * interval:
             consistency.lost()
-        if consistency.look(position, velocity, seconds):
+        if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
         work = self._work[index] = self._work[index] + work_scale * goal * velocity
         if work < work_least and self._passive:
@@ -234,7 +240,10 @@ class Guard:
         seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
         self._consistency[index].lost()
         allowed, said = self._missing_limit
-        if is_missing_too_long(self._missing[index], seconds, self._missing_limit):
+        # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
+        # was damaged.
+        refused = bool(error) and error != StatusError.CRC
+        if is_missing_too_long(self._missing[index] + refused, seconds, self._missing_limit):
             if error:
                 self._stop(
                     index,

@@ -29,6 +29,8 @@ _FRICTIONS = 8.0
 an alarm."""
 _TILT_SHARE = 0.2  # of gravity, in a direction that the angles' zero does not expect
 _STILL_RAD_S = 0.06
+_VAGUE_S = 0.004
+"""By so much longer than usual an exchange may take."""
 
 
 class ModelWatch:
@@ -49,6 +51,8 @@ class ModelWatch:
         self._names = [joint.joint.title for joint in config.joints]
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
+        self._shortest = float("inf")
+        self._long = max(interval, _VAGUE_S)
 
     def look(self, state: State) -> None:
         """Process the latest sample; raises SafetyStop if no arm in the ensemble could have moved like this."""
@@ -56,7 +60,10 @@ class ModelWatch:
             return
         goal, self._goal = self._goal, state.goal_current
         seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
-        if goal is None:
+        # When in a long exchange the servos measured is not known: the motion up to there tells nothing.
+        took = state.time_after_read - state.time_before_write
+        self._shortest = min(self._shortest, took)
+        if goal is None or took - self._shortest > self._long:
             goal, seconds = state.goal_current, float("inf")
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
