@@ -20,8 +20,8 @@ LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal"
 REFUSED, STRANGER, DISK = "refused", "stranger", "disk"
 
 WORDS = {
-    SILENCE: r"heard nothing|received nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response"
-    r"|repl(y|ies).{0,30}(missing|lost)",
+    SILENCE: r"heard nothing|received nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl"
+    r"|no response|repl(y|ies).{0,30}(missing|lost)",
     GARBLED: r"damaged|corrupt|\bCRC|not an answer|not one to the question|garbled|broken packet|incorrect|echo",
     LATE: r"\blate\b|\blater\b|deadlines?\b|latency|too slow",
     CABLE: r"[Pp]ort .{0,80}(failed|closed|lost)|unplugged|cable (is|was)|Is the cable|adapter",

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hil.config.schema import Config
+from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
@@ -28,6 +29,8 @@ _FRICTIONS = 8.0
 """Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
 an alarm."""
 _TILT_SHARE = 0.2  # of gravity, in a direction that the angles' zero does not expect
+_FRICTION_SPREAD = 3.0
+"""Times the spread of servos' own friction, for what else rubs in an arm that nobody has described."""
 _STILL_RAD_S = 0.06
 _VAGUE_S = 0.004
 """By so much longer than usual an exchange may take."""
@@ -46,7 +49,8 @@ class ModelWatch:
         mean, covariance = _known(config, largest, arms)
         interval = 1.0 / config.experiment.rate
         # A pilot's torque is hardly more than dry friction, and what that does near standstill is not in the model.
-        dry = [_FRICTIONS * mean.get(f"coulomb_{number}", 0.0) for number in range(1, len(largest) + 1)]
+        is_described = arms is not None or config.arm.link_lengths is not None
+        dry = [_FRICTIONS * is_described * mean[f"coulomb_{number}"] for number in range(1, len(largest) + 1)]
         self._observer = MomentumObserver(mean, covariance, np.maximum(largest, dry), interval)
         self._names = [joint.joint.title for joint in config.joints]
         self._goal: Sequence[float] | None = None
@@ -90,7 +94,7 @@ class ModelWatch:
 def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
     """Mean and covariance of the observer's parameters."""
     if arms is None and config.arm.link_lengths is None:
-        return {}, np.diag(_hardly_known(largest) ** 2)
+        return _hardly_known(config, largest)
     arms = prior_ensemble(config, ARMS) if arms is None else arms
     joint = np.array([1 if name.endswith("_2") else 0 for name in NAMES])
     drawn = np.array(
@@ -111,12 +115,23 @@ def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[
     return dict(zip(NAMES, mean.tolist(), strict=True)), np.asarray(covariance)
 
 
-def _hardly_known(largest: Array) -> Array:
-    """Standard deviations of the parameters of an arm of which only the required torque is known."""
-    each = {"gravity": 3.0, "tilt": 1.0, "coulomb": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
-    torque = [largest[-1] if name.endswith("_2") else largest[0] for name in NAMES]
-    share = [each.get(name.rpartition("_")[0], 3.0) for name in NAMES]
-    spread: Array = np.array(share) * np.array(torque)
-    if len(largest) == 1:
-        spread[[name in _OF_TWO for name in NAMES]] = 0.0
-    return spread
+def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Array]:
+    """Mean and covariance for an arm of which the required torque is known, and the servos' own dry friction.
+
+    That friction is what a joint that stands still is judged by: without it, any torque might be one that does not
+    suffice.
+    """
+    each = {"gravity": 3.0, "tilt": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
+    guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
+    mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
+    spread = np.zeros(len(NAMES))
+    for index, name in enumerate(NAMES):
+        if len(largest) == 1 and name in _OF_TWO:
+            continue
+        joint = len(largest) - 1 if name.endswith("_2") else 0
+        term = name.rpartition("_")[0]
+        if term == "coulomb":
+            spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
+        else:
+            spread[index] = each.get(term, 3.0) * largest[joint]
+    return mean, np.diag(spread**2)
