@@ -1,15 +1,15 @@
-"""Cutting torque: every servo is told and asked, whatever fails and whoever interrupts.
+"""Cutting torque: every servo is told and polled, whatever fails and whoever interrupts.
 
-The order matters. All are told at once, which takes 0.3 ms. Then each is asked once whether its torque is off; a
-silent one costs some 40 ms, so all are told again behind it: it may hear though it cannot answer, and a packet may have
-been lost. With a servo that still cannot be confirmed the bus is left in silence for as long as its Bus Watchdog waits:
-questions are packets too, and they feed the watchdog of a servo that hears everything and does not obey, because it
-refuses, or has another ID since. So who did not answer the last exchange is not even asked before. Then each is asked
-again, with patience.
+The order matters. Torque off is sent to all servos at once, which takes 0.3 ms. Then each servo is polled once; one
+that does not reply costs about 40 ms, so torque off is sent to all again afterwards: a servo may receive without being
+able to reply, and a packet may have been lost. If a servo still cannot be confirmed, the bus stays silent for as long
+as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives and does not obey, because it
+refuses or has another ID by now. For the same reason servos that did not answer the last exchange are not polled
+before. Then the remaining servos are tried again, patiently.
 
-A Ctrl-C raises KeyboardInterrupt wherever the program happens to be, also between the two servos whose torque is being
-cut. A program that uses the driver as a library has no handlers that would only take note of it, so the driver itself
-holds signals back for the few milliseconds in which torque is cut.
+Ctrl-C raises KeyboardInterrupt wherever the program happens to be, even between two servos while torque is being cut. A
+program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
+signals back while torque is cut.
 """
 
 import signal
@@ -29,16 +29,19 @@ from hil.drivers.servo_model import WATCHDOG_UNIT
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _INTERRUPTS_BORNE = 5
-"""How often confirming that a servo is off is begun again after an interrupt."""
+"""Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 _TRIP_S = WATCHDOG_UNIT + 5e-3
-"""How much later than its time a watchdog may act: it counts in steps."""
+"""Delay with which a watchdog may act after its time is over, since it counts in steps [s]."""
 
 
 @dataclass(frozen=True)
 class TorqueOff:
-    """Result of the attempt to cut torque: joints read back as off, why the others could not be confirmed, and which of
-    all have no Bus Watchdog.
+    """Result of an attempt to cut torque.
+
+    confirmed: joints whose servos were read back as off.
+    unconfirmed: the other joints, each with the reason.
+    unwatched: joints, of either group, whose servos have no Bus Watchdog.
     """
 
     confirmed: tuple[Joint, ...]
@@ -57,9 +60,8 @@ class TorqueOff:
                 "Watchdog and may keep its last current: cut the supply now."
             )
         return (
-            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, but cut "
-            "the "
-            "supply before you reach into the arm."
+            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
+            "but cut the supply before you reach into the arm."
         )
 
 
@@ -72,8 +74,9 @@ def cut_torque(
 ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
     """Cut torque on all servos and read it back. Returns the confirmed ones, and the others with the reason.
 
-    silent: those that did not answer last time. watchdog: seconds without a packet after which the servos stop by
-    themselves. interrupts: receives every interrupt that arrives meanwhile; none ends it.
+    silent: servos that did not answer the last exchange.
+    watchdog: the servos' Bus Watchdog [s].
+    interrupts: receives every interrupt that arrives meanwhile.
     """
     left = dict(servos)
     why: dict[Joint, str] = {}
@@ -96,8 +99,9 @@ def cut_torque(
 
 
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
-    """Torque off to all servos at once. A Sync Write, since other servos on the bus may be in use; twice, since a
-    packet may be lost. Where it fails, reading back will say so.
+    """Send torque off to all servos in one packet; a failure shows when they are read back.
+
+    It is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be lost.
     """
     every = list(servos.values())
     entry = every[0].table["Torque Enable"]
@@ -108,35 +112,38 @@ def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
 
 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> None:
-    """Bus Watchdogs off, where torque is off: nobody feeds them any more."""
+    """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more."""
     for servo in servos.values():
         _uninterrupted(lambda servo=servo: servo.write("Bus Watchdog", 0), interrupts)  # type: ignore[misc]
 
 
 def _confirm(servo: Servo, attempts: int | None, interrupts: list[BaseException]) -> str | None:
-    """Write torque off and read it back; why that failed, or None. attempts: of each packet, by default as usual."""
+    """Write torque off and read it back; return None, or the reason for the failure."""
     return _uninterrupted(lambda: servo.write("Torque Enable", 0, attempts), interrupts)
 
 
 def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> str | None:
-    """Run it, again after an interrupt, which is kept; why it failed, or None."""
+    """Run `action`; return None, or the reason for the failure.
+
+    An interrupt is appended to `interrupts` and the action is run again.
+    """
     for _ in range(_INTERRUPTS_BORNE):
         try:
             action()
-        except Exception as error:  # whatever one servo does, the next must be tried
+        except Exception as error:  # whatever fails on one servo, the next must still be tried
             return str(error) or type(error).__name__
         except BaseException as interrupt:
             interrupts.append(interrupt)
         else:
             return None
-    return "It was interrupted repeatedly."
+    return "The write was interrupted repeatedly."
 
 
 @contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Inside the block SIGINT, SIGTERM and SIGHUP are noted; each kind that came is raised again after it, once.
+    """Hold back SIGINT, SIGTERM and SIGHUP in the block; each kind that arrived is raised once afterwards.
 
-    Only the main thread gets signals; in another one this does nothing.
+    Only the main thread receives signals; in any other thread this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -147,7 +154,7 @@ def signals_held_back() -> Iterator[None]:
         if number not in came:
             came.append(number)
 
-    # None is a handler that was not installed from Python: it could not be put back, so it stays.
+    # None is a handler that was not installed from Python: it could not be restored, so it is left alone.
     former = {number: handler for number in _SIGNALS if (handler := signal.getsignal(number)) is not None}
     try:
         for number in former:

@@ -9,6 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError, PeriodicityError, ShapeError
+from hil.estimator.fit.fitted_parameters import FittedParameters
 from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.fit.stage2 import Near, fit_runs
 from hil.estimator.models.model import Model
@@ -23,7 +24,7 @@ SETTLING = SettlingOptions()
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(FittedParameters):
     """What settled periods say of the arm.
 
     `std` and `covariance` hold what position errors leave open, scaled by the residual as it is and widened
@@ -36,45 +37,16 @@ class Estimate:
 
     model: Model
     """The fitted model."""
-    names: tuple[str, ...]
-    """The base parameters, then the friction terms and the drive's."""
-    units: tuple[str, ...]
-    """Of each."""
-    value: Array
-    """(parameters,) [SI]."""
-    covariance: Array
-    """(parameters, parameters)."""
     start: Array
     """Angles and velocities at the first sample (2, joints) [rad, rad/s]."""
     position: Array
     """Simulated positions (joints, samples) [rad]."""
-    residual: Array
-    """Measured minus simulated position (joints, samples) [rad]; NaN where a sample is missing."""
-    position_step: Array
-    """The encoders' steps (joints,) [rad]."""
     iterations: int
     """Simulations with derivatives that the likelihood took."""
     outliers: int = 0
     """Samples left out or downweighted because they are far from their neighbours or from the model."""
     correlation_time: float = 1.0
     """Samples over which the residual is seen to be correlated; 1 is white. `covariance` allows for more."""
-
-    @property
-    def std(self) -> Array:
-        """Standard errors (parameters,)."""
-        std: Array = np.sqrt(np.diag(self.covariance))
-        return std
-
-    @property
-    def residual_steps(self) -> Array:
-        """RMS of the residual in encoder steps (joints,); rounding alone leaves 0.2887."""
-        rms: Array = np.sqrt(np.nanmean(self.residual**2, axis=1)) / self.position_step
-        return rms
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Values by name [SI]."""
-        return dict(zip(self.names, self.value.tolist(), strict=True))
 
 
 @one_blas_thread
@@ -117,18 +89,18 @@ def identify(
     fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, near=near, options=options)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
-        model,
-        model.names,
-        model.units,
-        fit.value,
-        fit.covariance,
-        fit.starts[0],
-        fit.positions[0],
-        np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
-        used[0].position_step,
-        fit.iterations,
-        fit.outliers + spikes,
-        fit.correlation_time,
+        names=model.names,
+        units=model.units,
+        value=fit.value,
+        covariance=fit.covariance,
+        residual=np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
+        position_step=used[0].position_step,
+        model=model,
+        start=fit.starts[0],
+        position=fit.positions[0],
+        iterations=fit.iterations,
+        outliers=fit.outliers + spikes,
+        correlation_time=fit.correlation_time,
     )
 
 

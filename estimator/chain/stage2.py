@@ -25,6 +25,7 @@ from hil.estimator.fit.covariance import (
     structured_share,
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
+from hil.estimator.fit.noise_weights import noise_weights
 from hil.estimator.options import CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
@@ -122,8 +123,8 @@ def fit_periods(
     near = fine.minimise(found.x, options.ftol_near)
     positions = fine.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
-    weights, outliers = _weights(periods, positions, options.outlier_threshold)
-    last = replace(fine, weights=weights)
+    weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
+    last = replace(fine, weights=tuple(weight.T for weight in weights))
     minimum = last.minimise(near.x, options.ftol, MINIMISER.min_damping)
     return _fit(last, minimum, outliers, COVARIANCE, spent + near.iterations + minimum.iterations)
 
@@ -169,25 +170,6 @@ def _towards_prior(problem: ChainProblem, x: Array, options: ChainOptions) -> Ar
 
 def _steps(periods: Sequence[SettledPeriod], longest: float) -> int:
     return max(steps_per_sample(period.rate, longest) for period in periods)
-
-
-def _weights(
-    periods: Sequence[SettledPeriod], positions: Sequence[Array], outlier: float
-) -> tuple[tuple[Array, ...], int]:
-    """Weights by how large each joint's errors turned out, and the number of outliers."""
-    weights = []
-    outliers = 0
-    for period, position in zip(periods, positions, strict=True):
-        error = np.where(period.valid, np.abs(period.position - position), 0.0)
-        # 1.35 medians are a standard deviation between those of rounding (1.15) and of normal errors (1.48).
-        typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
-        spread = np.maximum(typical, period.noise)[:, None]
-        far = error > outlier * spread
-        weight = np.where(far, np.sqrt(outlier * spread / np.where(far, error, 1.0)), 1.0)
-        rms = np.sqrt(np.nanmean(np.where(far | ~period.valid, np.nan, error) ** 2, axis=1))[:, None]
-        weights.append(np.where(period.valid, weight / np.maximum(rms, period.noise[:, None]), 0.0).T)
-        outliers += int(far.sum())
-    return tuple(weights), outliers
 
 
 def _fit(

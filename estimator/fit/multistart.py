@@ -10,12 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
-
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.levenberg_marquardt import Minimum
+from hil.estimator.fit.noise_weights import noise_weights
 from hil.estimator.fit.objective import Objective
 from hil.estimator.models.terms import TERMS, kind_of
 from hil.estimator.options import LikelihoodOptions
@@ -181,7 +180,7 @@ class Search:
     def _compare(self, tries: Sequence[Minimum], ftol: float) -> Refined:
         """The best of `tries` in fine steps, samples weighted by what the best of them leaves."""
         positions = self.fine.positions(_best(tries).x)
-        weights, outliers = _weights(self.periods, positions, self.options.outlier_threshold)
+        weights, outliers = noise_weights(self.periods, positions, self.options.outlier_threshold)
         weighted = replace(self.fine, weights=weights)
         ends = self._at_once([partial(weighted.minimise, each.x, ftol) for each in self._distinct(tries)])
         best = _best(ends)
@@ -225,23 +224,3 @@ class Search:
 
 def _best(tries: Sequence[Minimum]) -> Minimum:
     return min(tries, key=lambda found: found.at.cost)
-
-
-def _weights(
-    periods: Sequence[SettledPeriod], positions: Sequence[Array], threshold: float
-) -> tuple[tuple[Array, ...], int]:
-    """Weights by how large each joint's errors turned out, and the number of outliers."""
-    weights = []
-    outliers = 0
-    for period, position in zip(periods, positions, strict=True):
-        error = np.where(period.valid, np.abs(period.position - position), 0.0)
-        # 1.35 medians are a standard deviation between those of rounding (1.15) and of normal errors (1.48).
-        typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
-        spread = np.maximum(typical, period.noise)[:, None]
-        far = error > threshold * spread
-        weight = np.where(far, np.sqrt(threshold * spread / np.where(far, error, 1.0)), 1.0)
-        inside = np.where(far | ~period.valid, np.nan, error)
-        rms = np.sqrt(np.nanmean(inside**2, axis=1))[:, None]
-        weights.append(np.where(period.valid, weight / np.maximum(rms, period.noise[:, None]), 0.0))
-        outliers += int(far.sum())
-    return tuple(weights), outliers

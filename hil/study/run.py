@@ -1,4 +1,4 @@
-"""A study from its file to its rows: specifications out to the workers, rows back into the dataset."""
+"""Run a study: send specifications to the workers and write the returned rows to the dataset."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _AHEAD = 8
-"""Runs given to each worker beyond the one it works on: enough that none waits, few enough that memory stays flat."""
+"""Number of runs queued per worker in addition to the current one: no worker waits, and memory use stays constant."""
 
 _ROWS_A_PART, _SECONDS_A_PART = 1000, 5.0
 
@@ -38,7 +38,7 @@ DEFAULT_COLUMNS["estimate"] = (*DEFAULT_COLUMNS["identify"], "recording", "confi
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """How far it is. failed: runs that ended in an error, of those done. dashboard: the engine's own page."""
+    """Progress of a study; failed: number of runs that ended in an error; dashboard: URL of Dask's dashboard."""
 
     done: int
     runs: int
@@ -59,7 +59,10 @@ def run_study(
     worker_count: int | None = None,
     watch: Watch = lambda _: None,
 ) -> Dataset:
-    """Do all runs that have no row yet. Raises ConfigError and RunFolderError before anything runs, MissingExtra."""
+    """Do all runs that have no row yet.
+
+    Raises ConfigError, RunFolderError or MissingExtra before anything runs.
+    """
     runs = check_study(study, out)
     dataset = _opened(study, out, runs, resume)
     missing = sorted(set(range(runs)) - dataset.done())
@@ -71,13 +74,13 @@ def run_study(
 
 
 def _opened(study: Study, out: Path, runs: int, resume: bool) -> Dataset:
-    """The dataset in `out`, new or of the same study."""
+    """Open the dataset in `out`, which must be new or belong to the same study."""
     rows, copy = out / "rows", out / "study.toml"
     text = study.path.read_bytes()
     if copy.is_file():
         if not resume:
             raise RunFolderError(
-                f"{out} holds a study already: go on with --resume, or name another folder with --out."
+                f"{out} already holds a study: continue it with --resume, or choose another folder with --out."
             )
         if copy.read_bytes() != text:
             raise ConfigError(f"{study.path} is not the study that {out} holds ({copy} differs): it cannot be resumed.")
@@ -93,7 +96,7 @@ def _opened(study: Study, out: Path, runs: int, resume: bool) -> Dataset:
 
 
 def specifications(study: Study, out: Path, numbers: list[int]) -> Iterator[Spec]:
-    """What each run is given, made as it is needed."""
+    """Yield the specification of each run, created on demand."""
     columns = tuple(study.keep.columns or DEFAULT_COLUMNS[study.study.task])
     found = recordings(study) if study.study.task == "estimate" else []
     for run in numbers:
@@ -105,7 +108,7 @@ def specifications(study: Study, out: Path, numbers: list[int]) -> Iterator[Spec
 def _work_through(
     client: "Client", study: Study, out: Path, numbers: list[int], dataset: Dataset, runs: int, watch: Watch
 ) -> None:
-    """Keep every worker supplied, and write rows as they come; what has come is written whatever ends this."""
+    """Keep all workers supplied and write the rows as they arrive; rows received are written even after an error."""
     from distributed import as_completed
 
     waiting = specifications(study, out, numbers)

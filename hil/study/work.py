@@ -1,4 +1,4 @@
-"""One run of a study, done by a worker: from its specification to one flat row. Whatever goes wrong is a row too."""
+"""One run of a study, done by a worker: turns a specification into one flat row, even if the run fails."""
 
 import os
 import shutil
@@ -20,14 +20,15 @@ Cell = bool | int | float | str | None
 Row = dict[str, Cell]
 
 TIMINGS = ("seconds", "cpu_seconds", "worker")
-"""Columns that differ from machine to machine; all others are the same whoever works."""
+"""Columns that depend on the machine; all others are the same on every worker."""
 
 
 @dataclass(frozen=True)
 class Spec:
-    """What a worker needs for one run. toml: the arm's file with this run's values in it, or "".
+    """Specification of one run.
 
-    recording: the run folder to estimate, or None. keep_in: where the run folder stays, None for nowhere.
+    toml: the arm's file with this run's values, or "". recording: the run folder to estimate, or None. keep_in: where
+    the run folder is kept, or None.
     """
 
     run: int
@@ -40,7 +41,7 @@ class Spec:
 
 
 def work(spec: Spec) -> Row:
-    """Do the run; its row. Nothing is raised but what stops the process (KeyboardInterrupt, SystemExit)."""
+    """Do one run and return its row. Raises only KeyboardInterrupt and SystemExit."""
     row: Row = {"run": spec.run, "task": spec.task, "status": "done", "message": ""}
     row |= {f"vary.{key}": value for key, value in spec.varied.items()}
     row |= {"config_sha256": sha256(spec.toml.encode()).hexdigest()[:16], "hil": __version__}
@@ -58,7 +59,7 @@ def work(spec: Spec) -> Row:
 
 
 def flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Cell]]:
-    """Names with dots and plain values of nested dictionaries; lists by number, nothing longer than a few entries."""
+    """Flatten nested dictionaries and short lists to (dotted name, plain value) pairs."""
     if isinstance(value, Mapping):
         for key, entry in value.items():
             yield from flat(entry, f"{prefix}.{key}" if prefix else str(key))
@@ -71,7 +72,7 @@ def flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Cell]]:
 
 
 _MOST_ENTRIES = 8
-"""A longer list (a covariance, a spectrum) is no figure of a row."""
+"""Longest list that is flattened; longer ones (a covariance, a spectrum) are left out."""
 
 
 def _kept(name: str, columns: tuple[str, ...]) -> bool:
@@ -97,7 +98,7 @@ def _done(spec: Spec) -> Any:
 def _identified(arm: Path, folder: Path) -> Any:
     from hil.api.experiment import identify
 
-    shutil.rmtree(folder / "run", ignore_errors=True)  # of a worker that died on it
+    shutil.rmtree(folder / "run", ignore_errors=True)  # left by a worker that died during this run
     return identify(arm, out=folder / "run").to_json()
 
 
@@ -111,11 +112,11 @@ def _dry_run(arm: Path) -> Any:
 
 
 def _estimated(spec: Spec) -> Any:
-    """Estimate a copy of the recording, so that the fleet's own folders stay as they are."""
+    """Estimate from a copy of the recording, so that the original folder is not changed."""
     from hil.estimation.settled_estimate import estimate_run
     from hil.runs.run_folder import RunFolder
 
-    assert spec.recording is not None  # of this task
+    assert spec.recording is not None  # required for this task
     source = Path(spec.recording)
     with tempfile.TemporaryDirectory(prefix="hil-study-") as folder:
         copy = Path(folder) / "run"

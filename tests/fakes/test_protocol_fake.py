@@ -66,7 +66,7 @@ def test_read_waits_for_the_timeout_only(port: FakeSerial) -> None:
 def test_read_without_timeout_never_hangs(port: FakeSerial) -> None:
     port.timeout = None
     port.write(PING)
-    with pytest.raises(serial.SerialException, match="would wait for ever: 14 are there"):
+    with pytest.raises(serial.SerialException, match="would block forever: 14 have arrived"):
         port.read(15)
     assert port.read(14) == PONG
 
@@ -135,7 +135,7 @@ def test_port_that_was_never_opened() -> None:
 @pytest.mark.parametrize(
     ("url", "said"),
     [
-        ("fake://", "names no file"),
+        ("fake://", "does not name a file"),
         ("fake:///nowhere/arm.toml", "cannot be read"),
         (f"fake://{Path(__file__)}", "is not TOML"),
     ],

@@ -111,7 +111,7 @@ def test_a_link_that_exists_or_cannot_be_made(tmp_path: Path) -> None:
     descriptors = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
     with pytest.raises(LinkError, match="arm exists already; remove it or choose another"):
         PtyServer(load_fake(CONFIG), taken)
-    with pytest.raises(LinkError, match="cannot be made: No such file or directory"):
+    with pytest.raises(LinkError, match="cannot be created: No such file or directory"):
         PtyServer(load_fake(CONFIG), tmp_path / "nowhere" / "arm")
     assert taken.read_text() == "mine"
     assert len(os.listdir("/proc/self/fd")) == descriptors  # noqa: PTH208

@@ -207,7 +207,10 @@ def test_current_follows_a_first_order_lag() -> None:
         ({"drives": ({**DRIVE, "coulomb_width": 1e-5}, DRIVE)}, "coulomb_width"),
         ({"drives": ({**DRIVE, "presliding_stiffness": 9.0}, DRIVE)}, "needs a coulomb"),
         ({"drives": ({**DRIVE, "presliding_damping": 0.1}, DRIVE)}, "needs a presliding_stiffness"),
-        ({"drives": ({**DRIVE, "presliding_stiffness": 9.0, "coulomb": 0.1, "coulomb_width": 0.1}, DRIVE)}, "give one"),
+        (
+            {"drives": ({**DRIVE, "presliding_stiffness": 9.0, "coulomb": 0.1, "coulomb_width": 0.1}, DRIVE)},
+            "give only one",
+        ),
     ],
 )
 def test_a_wrong_arm_is_refused_by_name(change: dict[str, Any], named: str) -> None:

@@ -100,11 +100,11 @@ def test_a_csv_that_is_wrong_is_named(
     [
         (
             lambda columns: columns | {"q1": np.degrees(columns["q1"])},
-            "if it did not, its positions are not in the stated unit",
+            "if that is not true, its positions are not in the stated unit",
         ),
         (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
         (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),
-        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "encoder steps only"),
+        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "moved by only"),
     ],
 )
 def test_data_that_is_doubtful_comes_with_a_warning(

@@ -100,4 +100,4 @@ def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tm
     ) as error:
         identify_in_steps(held, RunFolder.create(tmp_path / "run", held), path, lambda _: None, said.append)
     assert "current limits allow" in str(error.value) and "stronger servo" in str(error.value)
-    assert any("did not move: friction exceeds this torque" in line for line in said)
+    assert any("did not move: friction is larger than this torque" in line for line in said)
