@@ -9,6 +9,7 @@ computer. It is judged by the emulated servos' own record of every millisecond (
 unsafe          current flowed for more than 100 ms (where the program cannot reach the servo: its watchdog's time)
                 after the first moment at which something was wrong for good, or at all after the program's end
 beyond_limit    a joint farther beyond its limit than `hil dry-run` predicts
+seen_later      of all: the fault could not be seen before, by a detector that knows the arm's noise beforehand
 unreadable      an error that the program does not foresee, no message, or a recording that cannot be read
 unnamed         the message does not name the cause, judged against the words for all causes; misleading: only others
 not_restored    a register that differs from before, after the run and the next start
@@ -64,6 +65,7 @@ def figures(outcomes: Iterable[Outcome]) -> dict[str, Any]:
         "unsafe": sum(each.verdict.unsafe for each in every),
         "beyond_limit": sum(each.beyond_limit for each in every),
         "unreadable": sum(each.unreadable for each in every),
+        "seen_later": sum(each.verdict.unseen for each in every),
         "stopped": len(stopped),
         "unnamed": sum(not each.verdict.named for each in stopped),
         "misleading": sum(each.verdict.misleading for each in stopped),

@@ -295,6 +295,10 @@ class ServoBus:
             raise shared(f"has sent {exchange.strangers} instructions")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
+    def read_status_next(self) -> None:
+        """Read the servos' status in the next exchange, if they report one at all."""
+        self.prepared.read_status_next()
+
     def check_alerts(self, state: State) -> None:
         """Read the cause wherever a servo has raised its alert bit; raises ServoFault naming all of them."""
         raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]

@@ -34,6 +34,9 @@ _INTERRUPTS_BORNE = 5
 _TRIP_S = WATCHDOG_UNIT + 5e-3
 """Delay with which a watchdog may act after its time is over, since it counts in steps [s]."""
 
+_REPEATS, _REPEAT_S = 2, 0.003
+"""Further torque-off packets and the time between them [s]: one that meets a reply on the wire is lost."""
+
 
 @dataclass(frozen=True)
 class TorqueOff:
@@ -91,9 +94,15 @@ def cut_torque(
                 why[joint] = failed
                 _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
 
+    def wait(seconds: float) -> None:
+        _uninterrupted(lambda: port.clock.wait_until(port.clock.now() + seconds), interrupts)
+
     confirm({joint: servo for joint, servo in servos.items() if joint not in silent}, attempts=1)
     if left:
-        _uninterrupted(lambda: port.clock.wait_until(port.clock.now() + watchdog + _TRIP_S), interrupts)
+        for _ in range(_REPEATS):
+            wait(_REPEAT_S)
+            _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
+        wait(watchdog + _TRIP_S)
         confirm(dict(left), attempts=None)
     return tuple(joint for joint in servos if joint not in left), tuple((joint, why[joint]) for joint in left)
 

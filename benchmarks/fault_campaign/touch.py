@@ -20,6 +20,7 @@ _ELSEWHERE_ID = 200
 _SLOWEST_REPLY = 254  # Return Delay Time
 _ROOM_BYTES = 1 << 12  # a file may grow to this once the disk is full
 _WRAP_S = 32.768
+_SHORT_BOOT_S = 5e-3
 
 
 class Killed(BaseException):
@@ -56,12 +57,12 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
             return [
                 undo
                 for servo in port.bus._servos
-                if attack.concerns(servo.id) and (undo := _touch(attack, servo)) is not None
+                if attack.concerns(servo.id) and (undo := _touch(attack, servo, port.clock.now())) is not None
             ]
     return []
 
 
-def _touch(attack: Attack, servo: Servo) -> Undo | None:
+def _touch(attack: Attack, servo: Servo, now: float) -> Undo | None:
     match attack.kind:
         case Kind.TORQUE_TAKEN:
             servo.write(64, b"\x00")
@@ -72,15 +73,17 @@ def _touch(attack: Attack, servo: Servo) -> Undo | None:
                 goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
                 servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
         case Kind.WATCHDOG_OFF:
-            return _change(servo, "Bus Watchdog", 0, undone=False)
+            return _change(servo, "Bus Watchdog", 0)
         case Kind.WATCHDOG_LONG:
-            return _change(servo, "Bus Watchdog", 127, undone=False)
+            return _change(servo, "Bus Watchdog", 127)
         case Kind.LOWERED_LIMIT if "Current Limit" in servo.memory:
-            return _change(servo, "Current Limit", round(attack.amount * servo.value("Current Limit")), undone=False)
+            return _change(servo, "Current Limit", round(attack.amount * servo.value("Current Limit")))
         case Kind.RAISED_LIMIT if "Current Limit" in servo.memory:
-            return _change(servo, "Current Limit", 2 * servo.value("Current Limit"), undone=False)
+            return _change(servo, "Current Limit", 2 * servo.value("Current Limit"))
         case Kind.TURNED_ROUND:
-            return _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
+            undo = _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
+            servo.reboot(now, _SHORT_BOOT_S)  # with torque on it could not be written
+            return undo
         case Kind.SLOW_REPLIES:
             return _change(servo, "Return Delay Time", _SLOWEST_REPLY)
         case Kind.NEW_ID:
@@ -92,17 +95,16 @@ def _touch(attack: Attack, servo: Servo) -> Undo | None:
     return None
 
 
-def _change(servo: Servo, register: str, value: int, *, undone: bool = True) -> Undo | None:
-    """Another program writes a register. undone: it is no setting that the program under test could put back."""
+def _change(servo: Servo, register: str, value: int) -> Undo:
+    """Another program writes a register: the program under test is not to be blamed where that value stays."""
     before = servo.value(register)
     servo.memory.set(register, value)
     servo._derive()
-    if not undone:
-        return None
 
     def undo() -> None:
-        servo.memory.set(register, before)
-        servo._derive()
+        if servo.value(register) == value:
+            servo.memory.set(register, before)
+            servo._derive()
 
     return undo
 

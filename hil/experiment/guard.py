@@ -188,6 +188,11 @@ class Guard:
         if state.status is not None:
             self._look_status(state.status, state)
 
+    @property
+    def wants_status(self) -> bool:
+        """Whether the servos' status should be read again in the next exchange."""
+        return self._status.is_in_doubt
+
     def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
         low, high, fastest, farthest, _, work_scale, work_least = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]

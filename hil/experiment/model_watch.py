@@ -45,7 +45,7 @@ class ModelWatch:
     def __init__(self, config: Config, planned: Sequence[float], arms: Ensemble | None = None) -> None:
         self._constants = [joint.torque_per_goal for joint in config.joints]
         largest = np.array([constant * goal for constant, goal in zip(self._constants, planned, strict=True)])
-        mean, covariance = _known(config, largest, arms)
+        mean, covariance = known_arm(config, largest, arms)
         interval = 1.0 / config.experiment.rate
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         is_described = arms is not None or config.arm.link_lengths is not None
@@ -90,7 +90,7 @@ class ModelWatch:
         raise SafetyStop(said, Cause.UNEXPECTED)
 
 
-def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
+def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
     """Mean and covariance of the observer's parameters."""
     if arms is None and config.arm.link_lengths is None:
         return _hardly_known(config, largest)

@@ -223,6 +223,8 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        if state.status is not None and self._guard.wants_status:
+            self._bus.read_status_next()
         if self._model is not None:
             self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
