@@ -1,14 +1,14 @@
-"""Studies on a distributed engine: how two workers compare with one, what a task costs, what a killed worker loses.
+"""Studies on a distributed engine: speed-up with two workers, overhead per run, and robustness against killed workers.
 
     python benchmarks/study.py [--runs 200] [--empty 10000] [--json]
 
-speedup_2         wall time of one worker over that of two, the same short identifications
+speedup_2         wall time with one worker over that with two, for the same short identifications
 overhead_ms       wall time of an empty run with one worker, scheduler and writer included [ms]
-same              whether 1, 2 and 4 workers gave the same rows to the last digit, timings aside
-lost_after_kill   rows missing or double after five kills of a worker and one of the whole engine (then --resume)
-bytes_a_run       of Parquet, identifications with their default columns
-worker_mb         largest memory of a worker over the empty runs; worker_mb_growth: from their first tenth to their end
-rows              of the empty runs, all of them
+same              whether 1, 2 and 4 workers give exactly the same rows, except for timings
+lost_after_kill   rows missing or duplicated after killing a worker five times and the whole engine once (then --resume)
+bytes_a_run       Parquet size per identification with the default columns
+worker_mb         largest memory of a worker during the empty runs; worker_mb_growth: its growth after the first tenth
+rows              number of rows of the empty runs
 """
 
 import argparse
@@ -44,7 +44,7 @@ KILLS = 5
 
 
 def study_file(folder: Path, text: str) -> Path:
-    """The study beside an arm with short periods."""
+    """Write the study next to an arm with short periods."""
     arm = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
     for old, new in (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]")):
         arm = arm.replace(old, new)
@@ -55,14 +55,14 @@ def study_file(folder: Path, text: str) -> Path:
 
 
 def timed(path: Path, out: Path, workers: int) -> tuple[float, Dataset]:
-    """Wall time from the first row to the last [s], which leaves the workers' start out; the rows."""
+    """Wall time from the first row to the last [s], which excludes starting the workers; and the dataset."""
     seen: list[float] = []
     dataset = run_study(load_study(path), out, worker_count=workers, watch=lambda _: seen.append(time.perf_counter()))
     return seen[-1] - seen[min(workers, len(seen) - 1) - 1], dataset
 
 
 def workers_of(parent: int) -> list[int]:
-    """Process numbers below `parent` that are Dask workers, by their memory's size descending."""
+    """Process IDs of the Dask workers below `parent`, by decreasing memory size."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and parent in _ancestors(int(entry.name)):
@@ -115,7 +115,7 @@ def empty_runs(folder: Path, runs: int) -> dict[str, Any]:
 
 
 def killed(folder: Path, runs: int) -> int:
-    """Rows lost or doubled when workers are killed `KILLS` times and then the engine itself, and the study resumed."""
+    """Rows lost or duplicated after killing workers `KILLS` times, then the engine, and resuming the study."""
     path = study_file(folder, IDENTIFY.format(runs=runs))
     out = folder / "out"
     command = [sys.executable, "-m", "hil", "study", str(path), "--out", str(out), "--workers", "2", "--quiet"]
@@ -134,7 +134,7 @@ def killed(folder: Path, runs: int) -> int:
 
 
 def _after(out: Path, rows: int, process: "subprocess.Popen[bytes]") -> int:
-    """Wait until there are so many rows; how many there are."""
+    """Wait until there are at least `rows` rows; return their number."""
     while process.poll() is None:
         found = len(Dataset(out / "rows").done()) if (out / "rows").is_dir() else 0
         if found >= rows:

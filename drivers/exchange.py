@@ -29,7 +29,7 @@ PATIENCE_SHARE = 0.5
 """Minimum reply timeout as a fraction of the time between two cycles."""
 
 MOST_PATIENCE_S = 0.02
-"""Upper limit of that minimum [s]: in a slow cycle too, a silent servo must not keep the others waiting."""
+"""Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 _NEVER = 1 << 62
 _DOUBTS = 3

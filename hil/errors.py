@@ -1,8 +1,8 @@
-"""All exceptions of hil, as one tree; each leaf names a situation.
+"""All exceptions of hil, as a tree, with their exit codes.
 
 HilError                    exit code
 ├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
-├── CsvError                2   a CSV file lacks columns, or numeric fields that are not numbers
+├── CsvError                2   a CSV file lacks columns or has fields that are not numbers
 ├── MissingExtra            2   an optional package is not installed
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
 ├── ResultError             2   result.json is missing, incomplete, damaged, or from a newer hil
@@ -50,6 +50,11 @@ class Cause(Enum):
     def allows_braking(self) -> bool:
         """Whether the measured velocity and the commanded current can still be trusted."""
         return self in {Cause.POSITION, Cause.VELOCITY, Cause.TEMPERATURE, Cause.VOLTAGE}
+
+    @property
+    def allows_lowering(self) -> bool:
+        """Whether the servos still take commands, so that an arm that would fall may be lowered, watched all the way."""
+        return self.allows_braking or self in {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER}
 
 
 class HilError(Exception):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.fault_campaign.attack import ON_MOTORS, Attack, Kind
 from benchmarks.fault_campaign.witness import Witness
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 if TYPE_CHECKING:
     from benchmarks.fault_campaign.middle import Middle
@@ -62,7 +62,7 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
     return []
 
 
-def _touch(attack: Attack, servo: Servo, now: float) -> Undo | None:
+def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
     match attack.kind:
         case Kind.TORQUE_TAKEN:
             servo.write(64, b"\x00")
@@ -95,7 +95,7 @@ def _touch(attack: Attack, servo: Servo, now: float) -> Undo | None:
     return None
 
 
-def _change(servo: Servo, register: str, value: int) -> Undo:
+def _change(servo: EmulatedServo, register: str, value: int) -> Undo:
     """Another program writes a register: the program under test is not to be blamed where that value stays."""
     before = servo.value(register)
     servo.memory.set(register, value)

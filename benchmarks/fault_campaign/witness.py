@@ -1,4 +1,4 @@
-"""The emulated servos' own record: every millisecond of what each was told, what its motor carried and how it moved."""
+"""The emulated servos' own record: goals, motor currents and motion, every millisecond."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from benchmarks.fault_campaign.attack import Attack, Kind
 from hil.fakes.bus.bus import FakeBus
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
@@ -33,7 +33,7 @@ class Witness:
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant
-        self._servos: tuple[Servo, ...] = bus._servos
+        self._servos: tuple[EmulatedServo, ...] = bus._servos
         self._next = bus.time + STEP_S
         self._rows: list[list[tuple[Any, ...]]] = []
         self._disturbed: list[tuple[int, Attack]] = []
@@ -98,12 +98,12 @@ class Witness:
         plant.advance(until, self._driven_by(current, until) if self._disturbed else current)
 
     def record(self) -> NDArray[Any]:
-        """The record so far, (milliseconds, joints) of `RECORD`."""
+        """The record so far (milliseconds, joints), with dtype `RECORD`."""
         return np.array(self._rows, dtype=RECORD).reshape(-1, self.joints)
 
 
-def _told(servo: Servo) -> tuple[bool, bool, int]:
-    """Whether the servo drives its motor, whether torque is on, and the goal of its mode [ticks]."""
+def _told(servo: EmulatedServo) -> tuple[bool, bool, int]:
+    """Whether the servo drives its motor, whether torque is on, and the goal in its mode [ticks]."""
     memory = servo.memory
     torque = memory.get("Torque Enable") == 1
     mode = memory.get("Operating Mode")
@@ -112,5 +112,5 @@ def _told(servo: Servo) -> tuple[bool, bool, int]:
     elif mode == PWM_MODE:
         goal = memory.get("Goal PWM")
     else:
-        goal = int(torque)  # position and velocity control drive as soon as torque is on
+        goal = int(torque)  # position and velocity control drive the motor whenever torque is on
     return torque and goal != 0, torque, goal

@@ -15,16 +15,16 @@ from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError
 from hil.estimator.fit.fitted_parameters import FittedParameters
 
-BELIEVED = 0.5  # of the prior's standard deviation: what data leave wider than that comes from the prior
+BELIEVED = 0.5  # standard errors above this fraction of the prior's count as coming from the prior
 
 
 @dataclass(frozen=True)
 class ChainEstimate(FittedParameters):
-    """Estimate of a spatial arm from settled periods; members as in `hil.estimator.identify.Estimate`."""
+    """Parameters of a spatial arm estimated from settled periods; see also `hil.estimator.identify.Estimate`."""
 
     model: ChainModel
     linear_value: Array
-    """Stage 1's, in the order of `ChainModel.linear_names`."""
+    """Result of stage 1, in the order of `ChainModel.linear_names`."""
     start: Array
     """Angles and velocities at the first sample (2, joints)."""
     position: Array
@@ -34,17 +34,17 @@ class ChainEstimate(FittedParameters):
     white_std: Array
     correlation_time: float
     softness: float
-    """Natural frequency of the observer that the simulation was drawn to the measurements by [Hz]."""
+    """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
     from_prior: tuple[str, ...]
-    """Base parameters that the data hardly determine: their values come from the description."""
+    """Base parameters that the data hardly determine, so that their values come from the prior."""
 
 
 @one_blas_thread
 def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
-    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. Raises ModelError when `model`
-    has another number of joints than a period, ConvergenceError.
+    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. Raises ModelError if `model` and a
+    period differ in their number of joints, ConvergenceError if no minimum is found.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:

@@ -9,7 +9,7 @@ from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE
 from hil.fakes.servo.encoder import Reading
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
+from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, EmulatedModel
 
 PRESENT_START = 120
 PRESENT_END = 147
@@ -17,7 +17,7 @@ PRESENT_END = 147
 
 STATE_START = 126
 STATE_END = 136
-"""The same for Present Current, Velocity and Position, which a control cycle reads."""
+"""Address of the first and the address after the last of Present Current, Velocity and Position."""
 
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
@@ -41,7 +41,7 @@ class Present:
     def __init__(
         self,
         memory: Memory,
-        model: Model,
+        model: EmulatedModel,
         zero_ticks: int,
         direction: int,
         clock_rate: float,
@@ -55,7 +55,7 @@ class Present:
         self.sign = direction
         """+1 or -1: sign of the servo's current, velocity and PWM relative to the joint's."""
         self.position_sign = direction
-        """The same for its position, which Reverse Mode inverts on every model."""
+        """+1 or -1: sign of the servo's position relative to the joint's; Reverse Mode inverts it on every model."""
         self.jump_ticks = 0
         """Error of the encoder injected by a fault [ticks]."""
         self._memory = memory
@@ -97,7 +97,7 @@ class Present:
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """Execute the instruction Clear (reset the turns); return the error number.
 
-        Errors other than Result Fail are unsure.
+        Errors other than Result Fail are uncertain.
         """
         if len(body) != len(_CLEAR_TURNS):
             return StatusError.DATA_LENGTH
@@ -109,12 +109,12 @@ class Present:
         return StatusError.NONE
 
     def ticks(self, position: float) -> float:
-        """Return Present Position at a joint angle [rad], before rounding and without noise."""
+        """Return Present Position [ticks] for a joint angle [rad], before rounding and without noise."""
         ticks = self._encoder.steady(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
         return (TICKS_PER_TURN - ticks if self._reversed else ticks) + self._shift
 
     def angle(self, ticks: float) -> float:
-        """Return the joint angle [rad] at a Present Position."""
+        """Return the joint angle [rad] for a Present Position [ticks]."""
         ticks -= self._shift
         if self._reversed:
             ticks = TICKS_PER_TURN - ticks

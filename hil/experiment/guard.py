@@ -128,6 +128,10 @@ class Guard:
         self._former_goal = clamped
         return clamped
 
+    def holding(self, goal: Sequence[float]) -> None:
+        """The goals that the servos have now [A]: `clamp` goes on from there."""
+        self._former_goal = list(goal)
+
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._late += 1

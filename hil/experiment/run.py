@@ -13,6 +13,7 @@ from hil.drivers.latency import command_to_set, latency_timer
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
+from hil.estimator.chain.rollout import ChainArms
 from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
@@ -48,7 +49,7 @@ def run_experiment(
     shown_path: Path,
     watch: Watch,
     plan: Plan | None = None,
-    arms: Ensemble | None = None,
+    arms: Ensemble | ChainArms | None = None,
 ) -> str:
     """Run the configured experiment and record it in `run`. Returns a sentence about the final torque state.
 
@@ -106,7 +107,7 @@ def _play(
     stop: StopRequest,
     watch: Watch,
     note: Note,
-    arms: Ensemble | None,
+    arms: Ensemble | ChainArms | None,
 ) -> None:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event."""
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)

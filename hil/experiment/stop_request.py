@@ -76,6 +76,11 @@ class StopRequest:
         """Whether a second signal arrived, which ends braking."""
         return self._count > 1
 
+    @property
+    def count(self) -> int:
+        """How many signals came."""
+        return self._count
+
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1
         self._received = signal.Signals(number)

@@ -19,8 +19,11 @@ from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import DidNotMove, ExperimentError, NotSettled
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.estimator.chain.rollout import ChainArms
+from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
+from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
@@ -66,7 +69,7 @@ class Stream:
         stop: StopRequest,
         watch: Watch,
         note: Note,
-        arms: Ensemble | None = None,
+        arms: Ensemble | ChainArms | None = None,
     ) -> None:
         self._bus = bus
         self._clock = bus.port.clock
@@ -75,8 +78,12 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._guard = Guard(config, planned)
-        # Chains have no such model yet: only position, velocity, current and status are checked.
-        self._model = None if config.is_chain else ModelWatch(config, planned, arms)
+        self._model: ModelWatch | ChainWatch = (
+            ModelWatch(config, planned, arms)
+            if isinstance(arms, Ensemble) or not config.is_chain
+            else ChainWatch(config, planned, arms)
+        )
+        self._lowering = Lowering(config, plan) if config.is_chain else None
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -106,7 +113,9 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
-            if may_brake(self._config, error):
+            if self._lowering is not None and may_lower(self._config, error):
+                self._lower(self._lowering, error)
+            elif may_brake(self._config, error):
                 self._brake()
             raise
 
@@ -225,8 +234,7 @@ class Stream:
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
         if state.status is not None and self._guard.wants_status:
             self._bus.read_status_next()
-        if self._model is not None:
-            self._model.look(state)
+        self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 
@@ -245,6 +253,43 @@ class Stream:
                 state = self._bus.exchange(goals)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
+    def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
+        """Brake and lower the arm until it lies, anything is wrong, or a second signal comes. Never raises."""
+        state, asked = self._state, max(1, self._stop.count)
+        if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
+            return
+        self._note(f"lowering the arm after: {error}")
+        try:
+            for index in range(lowering.begin(state, self._goal)):
+                deadline, now, late = self._ticks.wait()
+                if self._stop.count > asked:
+                    raise SafetyStop("A second signal came.", Cause.UNEXPECTED)
+                if late:
+                    self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
+                    lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
+                    continue
+                self._goal = lowering.goals(index, state)
+                former, state = state.time_before_write, self._bus.exchange(self._goal)
+                self._sent_at = state.time_before_write
+                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
+                lowering.look(index, state, state.time_before_write - former)
+        except (SafetyStop, DriverError) as ended:
+            self._told(
+                error, f"Torque was cut while the arm was being lowered, so it fell the rest of the way: {ended}"
+            )
+            return
+        lies = lowering.lies(state)
+        self._told(
+            error,
+            "The arm was lowered to its rest pose."
+            if lies
+            else "The arm was lowered, but does not lie in its rest pose.",
+        )
+
+    def _told(self, error: ExperimentError, what: str) -> None:
+        error.add_note(what)
+        self._note(what)
+
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))
 
@@ -259,5 +304,4 @@ class Stream:
 
 def _largest_goals(plan: Plan) -> list[float]:
     """Largest goal of each joint [A, or V under PWM]; NaN counts as 0 here, since the guard rejects it."""
-    peaks = [np.nan_to_num(np.abs(segment.period_current)).max(axis=0) for segment in plan.segments]
-    return [float(peak) for peak in np.max(peaks, axis=0)]
+    return [float(peak) for peak in np.max([segment.peak_goal for segment in plan.segments], axis=0)]

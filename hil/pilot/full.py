@@ -8,6 +8,7 @@ from hil.dry_run.amplitude import Amplitude
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
+from hil.pilot.chain_search import identify_chain_in_steps
 from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player, Say
 from hil.results.result import SettledResult
@@ -28,6 +29,8 @@ def identify_in_steps(
 
     Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
     """
+    if config.is_chain:
+        return identify_chain_in_steps(config, run, shown_path, watch, say)
     # A stop request in one step also cancels all later ones. Servo settings are saved and restored once for all steps,
     # because EEPROM wears.
     with StopRequest(), servo_session(config, run.path, say):

@@ -239,7 +239,7 @@ def test_sdk_writes_groups(sdk: Sdk) -> None:
 
 
 def test_sdk_sends_a_header_in_its_data_unstuffed_and_is_understood(sdk: Sdk) -> None:
-    """dynamixel-sdk 4.1.0 does not stuff. Its length and CRC fit what it sends, so the bytes are taken as they are."""
+    """dynamixel-sdk 4.1.0 does not stuff; its length and CRC match what it sends, so the bytes are accepted."""
     handler, port, fake = sdk
     assert handler.write1ByteTxRx(port, 1, 11, 4) == (COMM_SUCCESS, 0)
     assert handler.write4ByteTxRx(port, 1, 116, 0xFF_FD_FF_FF) == (COMM_SUCCESS, 0)

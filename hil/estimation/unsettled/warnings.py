@@ -56,9 +56,7 @@ def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]
         )
     turns = swing / (2.0 * np.pi)
     if turns > MANY_TURNS:
-        found.append(
-            f"{name} moved over {turns:.0f} turns: if that is not true, its positions are not in the stated unit."
-        )
+        found.append(f"{name} moved over {turns:.0f} turns; if it did not, its positions are not in the stated unit.")
     lost = 1.0 - float(np.mean(np.concatenate([np.isfinite(each.position[joint]) for each in recordings])))
     if lost > LOST:
         found.append(f"{name}: {100 * lost:.1f} % of its positions are missing.")

@@ -1,4 +1,4 @@
-"""The pieces of a study without workers: draws, keys, datasets, figures, fleets, what is refused beforehand."""
+"""Parts of a study without workers: draws, keys, datasets, figures, fleets, and checks before the start."""
 
 import math
 from pathlib import Path
@@ -199,7 +199,7 @@ def test_the_arm_unlike_its_fleet_is_found_and_no_other() -> None:
     friction = 0.05 * (1 + 0.05 * rng.standard_normal(20))
     friction[7] = 0.08
     poor = rng.standard_normal(20) * 0.002 + 0.3
-    poor[3] = 0.4  # far off, but with a standard error that says so
+    poor[3] = 0.4  # far off, but with a correspondingly large standard error
     std = np.full(20, 1e-4)
     std[3] = 0.1
     table = pa.table(
