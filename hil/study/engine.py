@@ -1,8 +1,12 @@
 """The workers: this machine's cores, a running Dask scheduler by its address, or a Slurm queue."""
 
+import logging
 import os
+import sys
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +24,9 @@ ONE_THREAD = dict.fromkeys(
 
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
-_MOST_DEATHS = 1000
-"""Of workers on one run, before it is given up: a machine that reboots is no fault of the run."""
+_MOST_DEATHS = 10
+"""Of workers on one run, before it is given up: a machine that reboots is no fault of the run, memory that is never
+enough is."""
 
 
 @contextmanager
@@ -37,6 +42,7 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
     except ImportError as error:
         raise MissingExtra("hil study needs Dask: pip install 'hil[study]'.") from error
     dask.config.set({"distributed.scheduler.allowed-failures": _MOST_DEATHS, "distributed.worker.daemon": False})
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by whoever asked
     wanted = count or engine.workers or os.cpu_count() or 1
     with _cluster(engine, scheduler, wanted) as address:
         try:
@@ -56,17 +62,7 @@ def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator
     """What a client connects to; what was started here is closed again."""
     memory = f"{engine.worker_memory_gib:g}GiB"
     if scheduler is None:
-        from distributed import LocalCluster
-
-        with LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            memory_limit=memory,
-            env=ONE_THREAD,
-            dashboard_address="127.0.0.1:0",
-            host="127.0.0.1",
-            silence_logs=50,
-        ) as cluster:
+        with _local(count, memory) as cluster:
             yield cluster
     elif scheduler == "slurm":
         try:
@@ -81,9 +77,50 @@ def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator
         yield scheduler
 
 
-def _versions() -> dict[str, str]:
-    """Of this process: of a worker, where Dask runs it there."""
-    return {"hil": __version__, **{name: version(name) for name in _PACKAGES}}
+def _local(count: int, memory: str) -> Any:
+    from distributed import LocalCluster
+
+    try:
+        return LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            memory_limit=memory,
+            env=ONE_THREAD,
+            dashboard_address="127.0.0.1:0",
+            host="127.0.0.1",
+            silence_logs=50,
+        )
+    except RuntimeError as error:
+        raise ConfigError(
+            f"The workers did not start ({error}). A script that starts them does so below `if __name__ == "
+            '"__main__":`, since each worker imports it; with little memory, ask for fewer (--workers).'
+        ) from error
+
+
+@contextmanager
+def executor(scheduler: str | None = None, count: int | None = None) -> Iterator[Executor]:
+    """The same workers with the interface of concurrent.futures, for `executor=` of a dry run or an estimate.
+
+    Args:
+        scheduler: as of `workers`.
+        count: workers; one per core unless given.
+
+    Raises:
+        ConfigError, MissingExtra: as of `workers`.
+    """
+    with workers(EngineTable(), scheduler, count) as client:
+        yield client.get_executor(pure=False)
+
+
+def versions() -> dict[str, str]:
+    """Of what makes the numbers, in this process: of a worker, where Dask runs it there."""
+    return {"hil": __version__, **_package_versions()}
+
+
+@cache
+def _package_versions() -> dict[str, str]:
+    python = f"{sys.version_info.major}.{sys.version_info.minor}"
+    return {"python": python, **{name: version(name) for name in _PACKAGES}}
 
 
 def _check_versions(client: "Client", scheduler: str | None) -> None:
@@ -92,9 +129,9 @@ def _check_versions(client: "Client", scheduler: str | None) -> None:
         client.wait_for_workers(1, timeout=600 if scheduler == "slurm" else 60)
     except TimeoutError as error:
         raise ConfigError(f"The scheduler {scheduler or 'on this machine'} has no worker.") from error
-    here = _versions()
+    here = versions()
     try:
-        everywhere = client.run(_versions)
+        everywhere = client.run(versions)
     except Exception as error:
         raise ConfigError(f"A worker cannot import hil ({error}): install hil {__version__} there.") from error
     for worker, there in everywhere.items():
