@@ -22,6 +22,15 @@ ONE_THREAD = dict.fromkeys(
 )
 """A worker is one process with one thread: of BLAS, of numba, and of ours."""
 
+_DASK: dict[str, Any] = {
+    "distributed.worker.daemon": False,
+    # Dask's own logs and profiles, which grow for hours with every task before they reach their length.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.log-length": 100,
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.admin.system-monitor.log-length": 240,
+}
+
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
@@ -41,8 +50,8 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
         from distributed import Client
     except ImportError as error:
         raise MissingExtra("hil study needs Dask: pip install 'hil[study]'.") from error
-    dask.config.set({"distributed.scheduler.allowed-failures": _MOST_DEATHS, "distributed.worker.daemon": False})
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by whoever asked
+    dask.config.set({**_DASK, "distributed.scheduler.allowed-failures": _MOST_DEATHS})
+    _silence()
     wanted = count or engine.workers or os.cpu_count() or 1
     with _cluster(engine, scheduler, wanted) as address:
         try:
@@ -55,6 +64,12 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
         with client:
             _check_versions(client, scheduler)
             yield client
+
+
+def _silence() -> None:
+    """Keep Dask's own log off the terminal: whoever asked tells what went wrong."""
+    for name in [each for each in logging.root.manager.loggerDict if each.split(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Independent jobs on the workers: few in flight at a time, results as they end, whatever becomes of a worker."""
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
@@ -24,6 +25,10 @@ _AHEAD = 8
 
 _TASK_S, _MOST_IN_A_TASK = 0.1, 50
 """Jobs that are shorter than this go several together: a task costs some milliseconds, whatever it does."""
+
+
+_COUNTED_EVERY_S = 1.0
+"""How often workers are counted, which asks the scheduler."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +56,13 @@ def run_jobs(
     """
     from distributed import as_completed
 
-    flight = _Flight(client, function, iter(items))
     try:
+        flight = _Flight(client, function, iter(items))
         futures: Any = as_completed(  # type: ignore[no-untyped-call]
-            flight.start(_window(client)), loop=client.loop, with_results=True, raise_errors=False
+            flight.start(flight.room), loop=client.loop, with_results=True, raise_errors=False
         )
         for batch in futures.batches():
-            # More workers may have come meanwhile, and they wait.
-            futures.update(flight.start(len(batch) + max(0, _window(client) - len(flight.tasks))))
+            futures.update(flight.start(len(batch) + max(0, flight.room)))
             for future, result in batch:
                 if future.cancelled() or isinstance(result, CancelledError):
                     raise SchedulerLost(_LOST)
@@ -83,7 +87,16 @@ class _Flight(Generic[Item, Result]):
         self._submitted = 0
         # A scheduler has one name space: two studies on it must not get each other's results.
         self._name = f"job-{uuid4().hex[:12]}"
-        self.tasks: dict[str, list[tuple[int, Item]]] = {}
+        self._tasks: dict[str, list[tuple[int, Item]]] = {}
+        self._window, self._counted = 0, -math.inf
+
+    @property
+    def room(self) -> int:
+        """How many tasks more may be in flight. Workers may come at any time, and then they wait."""
+        if time.monotonic() - self._counted > _COUNTED_EVERY_S:
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+            self._window, self._counted = max(1, len(workers)) * (1 + _AHEAD), time.monotonic()
+        return self._window - len(self._tasks)
 
     def start(self, count: int) -> list[Any]:
         """Futures of so many tasks more, as far as there are jobs."""
@@ -95,13 +108,13 @@ class _Flight(Generic[Item, Result]):
             return []
         keys = [f"{self._name}-{self._submitted + index}" for index in range(len(tasks))]
         self._submitted += len(tasks)
-        self.tasks.update(zip(keys, tasks, strict=True))
+        self._tasks.update(zip(keys, tasks, strict=True))
         items = [[item for _, item in jobs] for jobs in tasks]
         return self._client.map(_call, [self._function] * len(tasks), items, key=keys, pure=False)
 
     def end(self, key: str, result: Any, *, lost: bool) -> tuple[list[Any], list[Ended[Item, Result]]]:
         """Futures of jobs to be done again, and those that have ended."""
-        jobs = self.tasks.pop(key)
+        jobs = self._tasks.pop(key)
         if lost and len(jobs) > 1:
             return self._submit([[job] for job in jobs]), []  # one of them takes its worker with it
         if lost:
@@ -125,11 +138,6 @@ def _call(
 
 
 _LOST = "The scheduler answers no more. What was done is kept: start it again, then go on with --resume."
-
-
-def _window(client: "Client") -> int:
-    """How many jobs may be in flight."""
-    return max(1, len(client.scheduler_info(n_workers=-1)["workers"])) * (1 + _AHEAD)
 
 
 def each(

@@ -97,7 +97,7 @@ def _work_through(
     specs = ((spec.run, spec) for spec in specifications(study, out, numbers))
     rows: list[Row] = []
     done, failed, began, written = runs - len(numbers), _failed(dataset), time.monotonic(), time.monotonic()
-    first = done
+    first, dashboard = done, client.dashboard_link or ""
     try:
         for ended in run_jobs(client, work, specs):
             row = ended.result or lost_row(ended.item, ended.error)
@@ -107,7 +107,7 @@ def _work_through(
                 dataset.append(rows)
                 rows, written = [], time.monotonic()
             left = (time.monotonic() - began) / (done - first) * (runs - done)
-            watch(StudyProgress(done, runs, failed, left, client.dashboard_link or ""))
+            watch(StudyProgress(done, runs, failed, left, dashboard))
     finally:
         dataset.append(rows)
 
