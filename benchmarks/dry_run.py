@@ -1,18 +1,18 @@
-"""What dry runs foresee against what then happens, on realistic fake arms.
+"""Predictions of dry runs compared with the subsequent experiments, on realistic fake arms.
 
     python benchmarks/dry_run.py [--json] [--arms N] [--pilots N]
 
 `--arms` arms are drawn from a prior with 30 % spread; each plays, in virtual time, the largest experiment that a dry
-run of that prior allows. The arm of configs/first_time.toml then goes the whole way, from joint limits and link lengths
-only: pilot, full; with --pilots N, so do N - 1 more arms drawn from the prior, and the least of all counts.
+run of that prior allows. The arm of configs/first_time.toml is then identified from joint limits and link lengths
+only, with pilot and full run; with --pilots N, so are N - 1 more arms drawn from the prior; the smallest value counts.
 
-within_quantile       share of arms whose seen peaks all stay within the predicted 99 %
+within_quantile       share of arms whose measured peaks all stay within the predicted 99 %
 limit_touched         arms that the guard had to stop
-range_used            of the allowed positions, by the full run's worse joint; the least of the pilot arms
-std_ratio_pilot_full  worst relative standard error (offsets against dry friction) of the pilot over the full run's; the
-                      least of the pilot arms
-std_ratio_least       the same parameter by parameter: the least of all
-predicted_over_seen   after the pilot: largest relative distance of predicted from seen peak
+range_used            share of the position range used by the full run's worse joint; smallest of the pilot arms
+std_ratio_pilot_full  worst relative standard error (offsets relative to dry friction) of the pilot over the full run's;
+                      smallest of the pilot arms
+std_ratio_least       the same ratio per parameter, smallest of all
+predicted_over_seen   after the pilot: largest relative deviation of a predicted from a measured peak
 worst_std_ratio       designed over plain multisine, same limits and duration: worst relative standard error
 """
 
@@ -55,7 +55,7 @@ ARMS_IN_PRIOR = 192
 
 
 def study_config() -> Config:
-    """A short experiment on the realistic arm, known to 30 %."""
+    """A short experiment on the realistic arm, with a prior of 30 % spread."""
     text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
     for old, new in (
         ("[experiment]\n", f"{PRIOR}\n[experiment]\nheld_out = false\nsettle_within = 0.2\n"),
@@ -105,20 +105,20 @@ def drawn_arm(config: Config, random: np.random.Generator) -> Config:
 
 
 def run_on(config: Config, found: Amplitude, folder: Path) -> np.ndarray | None:
-    """Seen peaks (quantities, joints); None when the guard stopped the arm."""
+    """Measured peaks (quantities, joints) of a run; None if the guard stopped the arm."""
     run = RunFolder.create(folder / "run", config)
     try:
         run_experiment(config, run, config.path, lambda _: None, found.plan)
     except SafetyStop:
         return None
     except NotSettled:
-        pass  # an odd arm; its peaks count all the same
+        pass  # an unusual arm; its peaks still count
     samples = load_samples(run.samples_path, len(config.joints))
     return peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
 
 
 def prior_study(arms: int, seed: int = 1) -> dict[str, Any]:
-    """The largest safe experiment of one prior, on arms drawn from it."""
+    """Play the largest safe experiment of one prior on arms drawn from it."""
     config = study_config()
     found = largest_amplitude(config, prior_ensemble(config, ARMS_IN_PRIOR))
     quantile = found.prediction.quantile
@@ -133,7 +133,7 @@ def prior_study(arms: int, seed: int = 1) -> dict[str, Any]:
 
 
 def is_within(config: Config, seen: np.ndarray, quantile: np.ndarray) -> bool:
-    """Whether all seen peaks stay within the predicted ones, an encoder step and a tick of velocity aside."""
+    """Whether all measured peaks stay within the predicted ones, up to one encoder step and one tick of velocity."""
     low, high, velocity = seen[:GUARDED]
     return bool(
         (low >= quantile[0] - 0.0016).all()
@@ -143,7 +143,7 @@ def is_within(config: Config, seen: np.ndarray, quantile: np.ndarray) -> bool:
 
 
 class fake_of:  # noqa: N801  (a context manager that reads like a function)
-    """A configuration file of its own for a drawn arm, since fake:// reads the arm from a file."""
+    """A separate configuration file for a drawn arm, because fake:// reads the arm from a file."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -160,7 +160,7 @@ class fake_of:  # noqa: N801  (a context manager that reads like a function)
 
 
 def with_fake(config: Config) -> str:
-    """The configuration's text with its fake arm's numbers in place of the file's."""
+    """The configuration's text with the numbers of its fake arm inserted."""
     text = config.path.read_text(encoding="utf-8")
     assert config.fake is not None
     head, _, _ = text.partition("[[fake.arm.links]]")
@@ -174,7 +174,7 @@ def with_fake(config: Config) -> str:
 
 
 def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
-    """The whole way from joint limits and link lengths, on arms drawn from the prior."""
+    """Identify arms drawn from the prior, starting from joint limits and link lengths only."""
     plain = parse_config((CONFIGS / "first_time.toml").read_text(encoding="utf-8"), CONFIGS / "first_time.toml")
     random = np.random.default_rng((seed, 22))
     used, ratios, least, distances, touched = [], [], [], [], 0
@@ -208,20 +208,20 @@ def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
 
 
 def first_estimate(run: Path) -> SettledResult:
-    """Of the first pilot in which every joint moved: the last one below the run."""
+    """Estimate from the last pilot, the first one in which every joint moved."""
     last = sorted(run.glob("pilot-*"), key=lambda path: int(path.name.removeprefix("pilot-")))[-1]
     return estimate_run(RunFolder.open(last))
 
 
 def worst_relative_std(result: Result) -> float:
-    """Over the base parameters; an offset counts against its joint's dry friction, since it may be zero."""
+    """The largest relative standard error of the base parameters; offsets are related to the joint's dry friction."""
     entries = result.parameters
     against = {name: entries[name.replace("offset", "coulomb")].value for name in entries}
     return max(entry.std / abs(against[name]) for name, entry in entries.items())
 
 
 def design_study(seeds: int = 2) -> dict[str, Any]:
-    """Designed against plain, both scaled to the same limits, judged on the true arm's nominal model."""
+    """Compare designed and plain multisines, both scaled to the same limits, on the nominal model of the true arm."""
     from hil.estimator.excitation.optimal_design import design_optimal
     from hil.estimator.models.parameters import Physics
     from hil.fakes.plants.arm import base_parameters

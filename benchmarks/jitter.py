@@ -1,9 +1,9 @@
-"""The cost of a late computer: the ideal fake arm with a jittering loop, with and without correction for actual times.
+"""Effect of timing jitter on the estimate, with and without correction for the actual times, on the ideal fake arm.
 
     python benchmarks/jitter.py [--json] [--rms-us 0 200 500] [--config configs/fake_two_link_ideal.toml]
 
-Each write leaves a random time after its deadline, half a normal distribution with the RMS given. The same recording is
-estimated twice: as it is, and with its times put back to the deadlines, as if nobody had looked at the clock.
+Each write happens at a random time after its deadline, drawn from a half-normal distribution with the given RMS. The
+same recording is estimated twice: as it is, and with its times replaced by the deadlines.
 """
 
 import argparse

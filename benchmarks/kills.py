@@ -1,9 +1,9 @@
-"""SIGKILL at random moments of an experiment on a pty, whose fake servos live in another process.
+"""SIGKILL at random moments of an experiment on a pty, with the fake servos in another process.
 
     python benchmarks/kills.py [--kills N] [--json]
 
-105 ms after each kill, the servos are asked over the same terminal: each Bus Watchdog must have tripped and each Goal
-Current be 0. The 5 ms are for this computer's own scheduling; a question that came earlier would feed the watchdog.
+105 ms after each kill, the servos are read over the same terminal: each Bus Watchdog must have tripped and each Goal
+Current must be 0. The 5 ms allow for this computer's scheduling; an earlier read would restart the watchdog.
 
 Every kill meets an arm of its own that hangs at rest: dry friction may hold one that was killed in mid-motion so far
 from its rest pose that the next experiment rightly refuses to start. A kill tells nothing where the experiment had
@@ -37,17 +37,19 @@ CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 ASKED_AFTER_S = 0.105
 ANSWERED_BEFORE_S = 0.120
 LONGEST_S = 2.6
-"""From torque on to a kill: rest, ramp in, settling and used period, ramp out."""
+"""Longest time from torque on to a kill [s]: rest, ramp in, settling and recorded period, ramp out."""
 START_UP_S = 60.0
 PATIENCE = 50
 PRIORITY = 30
-"""SCHED_FIFO's, above hil's own."""
+"""SCHED_FIFO priority of the fake arm, above hil's own."""
 
 
 @dataclass(frozen=True)
 class Kill:
-    """watchdogs, torque, goals: what the servos' registers read. answered_after: seconds from the kill to the
-    answer about the watchdogs. ended: what the run had ended with by itself before the kill.
+    """The outcome of one kill.
+
+    watchdogs, torque, goals: register values of the servos. answered_after: time from the kill to the answer about the
+    watchdogs [s]. ended: message if the run had ended by itself before the kill.
     """
 
     watchdogs: list[int]
@@ -62,7 +64,7 @@ class Kill:
 
     @property
     def safe(self) -> bool:
-        """Torque was on when the kill came; then only a tripped watchdog will do."""
+        """Whether every servo that had torque at the kill has a tripped watchdog, and all goals are 0."""
         stopped = [
             watchdog in {-1, 255} or not torque for watchdog, torque in zip(self.watchdogs, self.torque, strict=True)
         ]
@@ -70,8 +72,9 @@ class Kill:
 
 
 def kill_campaign(kills: int, folder: Path, seed: int = 1) -> list[Kill]:
-    """Kill child processes that run an experiment on the pty until `kills` of them count; those that do not are among
-    the result. Raises RuntimeError when too few kills count, with what the experiments ended with.
+    """Kill child processes that run an experiment on the pty until `kills` of them count; all kills are returned.
+
+    Raises RuntimeError if too few kills count, with the messages of the experiments.
     """
     random = Random(seed)
     done: list[Kill] = []
@@ -84,15 +87,15 @@ def kill_campaign(kills: int, folder: Path, seed: int = 1) -> list[Kill]:
             return done
     ended = [kill.ended for kill in done if kill.ended]
     raise RuntimeError(
-        f"{sum(kill.counts for kill in done)} of {len(done)} kills count, {kills} are wanted; is the computer busy? "
-        f"Answered {max(1e3 * kill.answered_after for kill in done):.0f} ms after a kill at the latest; {len(ended)} "
+        f"{sum(kill.counts for kill in done)} of {len(done)} kills count, {kills} are needed; is the computer busy? "
+        f"Latest answer {max(1e3 * kill.answered_after for kill in done):.0f} ms after a kill; {len(ended)} "
         "runs ended by themselves, with:\n" + "\n".join(sorted(set(ended)))
     )
 
 
 @contextmanager
 def fake_arm(link: Path) -> Iterator[None]:
-    """A fake arm on a pty, served by another process."""
+    """Serve a fake arm on a pty from another process."""
     server = subprocess.Popen(
         [sys.executable, "-m", "hil", "fake", str(CONFIG), "--pty", "--link", str(link), "--quiet"],
         stdout=subprocess.PIPE,
@@ -112,7 +115,7 @@ def fake_arm(link: Path) -> Iterator[None]:
 
 
 def pty_config(link: Path) -> Config:
-    """The fake arm on that terminal, with an experiment of some three seconds."""
+    """The configuration of the fake arm on that terminal, with an experiment of about three seconds."""
     text = CONFIG.read_text(encoding="utf-8")
     for old, new in (
         ('url = "fake://" ', f'url = "{link}" '),
@@ -128,7 +131,7 @@ def pty_config(link: Path) -> Config:
 
 
 def _kill_once(config: Config, folder: Path, wait: float) -> Kill:
-    """Start an experiment, kill it `wait` seconds after torque came on, and ask the servos."""
+    """Start an experiment, kill it `wait` seconds after torque was switched on, and read the servos."""
     run = RunFolder.create(folder / "run", config)
     ending = folder / "ending.txt"
     child = _start(config, run, ending)
@@ -150,15 +153,15 @@ def _kill_once(config: Config, folder: Path, wait: float) -> Kill:
 
 
 def _ask(bus: ServoBus, register: str) -> list[int]:
-    """What a register reads, per joint; a busy computer may need some time to hear it."""
+    """Value of a register for each joint; retries, because a busy computer may miss replies."""
     for _ in range(PATIENCE):
         with suppress(DriverError):
             return [bus.servo(joint).read(register) for joint in bus.joints]
-    raise RuntimeError(f"The servos on the pty do not tell their {register}.")
+    raise RuntimeError(f"The servos on the pty do not return their {register}.")
 
 
 def _start(config: Config, run: RunFolder, ending: Path) -> int:
-    """The process id of a child that runs the experiment, and leaves in `ending` what it ended with."""
+    """Start a child that runs the experiment and writes its final message to `ending`; return its process ID."""
     child = os.fork()
     if child == 0:
         try:
@@ -171,7 +174,7 @@ def _start(config: Config, run: RunFolder, ending: Path) -> int:
 
 
 def _torque_came_on(run: RunFolder, ending: Path) -> bool:
-    """Wait for it; False when the run ended before."""
+    """Wait until torque is on; false if the run ended before."""
     events = run.path / "events.jsonl"
     give_up = time.monotonic() + START_UP_S
     while time.monotonic() < give_up and not ending.is_file():

@@ -1,4 +1,4 @@
-"""The realistic fake arm with an experiment of some four seconds, for what needs many runs."""
+"""The realistic fake arm with an experiment of about four seconds, for benchmarks and tests that need many runs."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ coulomb = [0.055, 0.050]
 
 
 def short_config(text: str) -> Config:
-    """The arm of this TOML text with an experiment of some four seconds."""
+    """The arm of this TOML text with an experiment of about four seconds."""
     for old, new in (
         ("rate = 400.0 ", "rate = 200.0 "),
         ("period = 10.0 ", "period = 1.0 "),

@@ -1,16 +1,16 @@
-"""Studies on a distributed engine: how two workers compare with one, what a task costs, what a killed worker loses.
+"""Studies on a distributed engine: speed-up with two workers, overhead per run, and robustness against killed workers.
 
     python benchmarks/study.py [--runs 200] [--empty 10000] [--killed 50] [--only PART ...] [--json]
 
 Parts: speed (one, two and four workers), empty, killed; all of them take a quarter of an hour on two quiet cores.
 
-speedup_2         wall time of one worker over that of two, the same short identifications
+speedup_2         wall time with one worker over that with two, for the same short identifications
 overhead_ms       wall time of an empty run with one worker, scheduler and writer included [ms]
-same              whether 1, 2 and 4 workers, and the study that was killed, gave the same rows to the last digit,
-                  timings aside
-lost_after_kill   rows missing or double after five kills of a worker and one of the whole engine (then --resume)
-bytes_a_run       of Parquet, identifications with their default columns
-worker_mb         largest memory of a worker over the empty runs; scheduler_mb: of the process with scheduler, client and
+same              whether 1, 2 and 4 workers, and the study that was killed, give exactly the same rows,
+                  except for timings
+lost_after_kill   rows missing or duplicated after killing a worker five times, the engine once (then --resume)
+bytes_a_run       Parquet size per identification with the default columns
+worker_mb         largest memory of a worker in the empty runs; scheduler_mb: of the process with scheduler and
                   writer; *_growth: from their first tenth to their end
 rows              of the empty runs, all of them
 seconds_a_run     processor time of a short identification, and the wall time of all of them with 1, 2 and 4 workers
@@ -49,7 +49,7 @@ KILLS = 5
 
 
 def study_file(folder: Path, text: str) -> Path:
-    """The study beside an arm with short periods."""
+    """Write the study next to an arm with short periods."""
     arm = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
     for old, new in (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]")):
         arm = arm.replace(old, new)
@@ -72,7 +72,7 @@ def rows_of(dataset: Dataset) -> Any:
 
 
 def workers_of(parent: int) -> list[int]:
-    """Process numbers below `parent` that are Dask workers, by their memory's size descending."""
+    """Process IDs of the Dask workers below `parent`, by decreasing memory size."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and parent in _ancestors(int(entry.name)):
@@ -169,7 +169,7 @@ def killed(folder: Path, runs: int) -> dict[str, Any]:
 
 
 def _after(out: Path, rows: int, process: "subprocess.Popen[bytes]") -> int:
-    """Wait until there are so many rows; how many there are."""
+    """Wait until there are at least `rows` rows; return their number."""
     while process.poll() is None:
         found = len(Dataset(out / "rows").done()) if (out / "rows").is_dir() else 0
         if found >= rows:

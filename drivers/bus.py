@@ -1,4 +1,4 @@
-"""The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
+"""The servos of one arm on one port: preparation, the control cycle, and torque off afterwards."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -25,30 +25,33 @@ from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_
 from hil.drivers.sync_read import one_each
 
 _PROBES = 3
-"""How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
+"""Unanswered Fast Sync Reads after which Sync Read is used instead."""
 
 STATUS_S = 0.035
-"""From one status of the servos to the next [s]."""
+"""Time between two status reads [s]."""
 
 _SHARE, _MOST_SHARE = 0.6, 0.9
-"""Of a cycle that a status may take on the wire; adapter and computer need the rest."""
+"""Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer."""
 
 MOST_STRANGERS = 2
-"""How many instructions of another master may be heard while an experiment runs; a damaged reply can look like one."""
+"""Tolerated number of foreign instructions heard during an experiment; a corrupted reply can look like one."""
 
 _INTERRUPTS_BORNE = 5
-"""How often confirming that a servo is off is begun again after an interrupt."""
+"""Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 
 @dataclass(frozen=True)
 class BusConfig:
     """Location of the servos and how to communicate with them.
 
-    url: device or pyserial URL. one_write: Sync Write and group read leave in one write; False where `hil check` finds
-    that an arm needs two. fast_sync_read: use it where every servo's firmware has it. slow_every: cycles from one
-    reading of tick or voltage and temperature to the next. watchdog_required: refuse firmware without Bus Watchdog.
-    take_over: take over an arm whose torque is on: let it sink slowly, then cut torque; otherwise refuse it.
-    interval: s from one exchange to the next, 0 where there is no fixed rate; servos then report no status.
+    url: device or pyserial URL.
+    one_write: send Sync Write and group read in one write; False where `hil check` finds that an arm needs two.
+    fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
+    slow_every: number of cycles between two slow reads, which alternate between the servo clock (Realtime Tick) and
+    voltage with temperature.
+    watchdog_required: reject firmware without Bus Watchdog.
+    take_over: if torque is already on, let the arm sink slowly, then cut torque; otherwise refuse to start.
+    interval: time between two exchanges [s]; 0 without a fixed rate, in which case the servos' status is not read.
     """
 
     url: str
@@ -67,14 +70,17 @@ class BusConfig:
             raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}: each needs its own ID.")
 
     def is_same_arm(self, other: "BusConfig") -> bool:
-        """Whether both are the same servos on the same port."""
+        """Return whether both configurations describe the same servos on the same port."""
         return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
 
 
 @dataclass(frozen=True)
 class TorqueOff:
-    """Result of the attempt to cut torque: joints read back as off, why the others could not be confirmed, and which of
-    all have no Bus Watchdog.
+    """Result of an attempt to cut torque.
+
+    confirmed: joints whose servos were read back as off.
+    unconfirmed: the other joints, each with the reason.
+    unwatched: joints, of either group, whose servos have no Bus Watchdog.
     """
 
     confirmed: tuple[Joint, ...]
@@ -93,9 +99,8 @@ class TorqueOff:
                 "Watchdog and may keep its last current: cut the supply now."
             )
         return (
-            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, but cut "
-            "the "
-            "supply before you reach into the arm."
+            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
+            "but cut the supply before you reach into the arm."
         )
 
 
@@ -105,7 +110,7 @@ class ServoBus:
         with ServoBus.open(BusConfig("/dev/ttyUSB0", 1_000_000, joints)) as bus, bus.torque(watchdog=0.1):
             state = bus.exchange([0.1, 0.0])
 
-    After any error the same object can still send torque off, and `torque_off_report` says whether that succeeded.
+    After any error the same object can still cut torque; `torque_off_report` then says whether that succeeded.
     """
 
     def __init__(self, port: Port, config: BusConfig) -> None:
@@ -113,14 +118,14 @@ class ServoBus:
         self.config = config
         self.joints = config.joints
         self._drives = tuple(drive for joint in self.joints for drive in joint.drives)
-        """One for each servo."""
+        """One entry per servo, each a joint with a single servo."""
         self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
         self._in_pairs = len(self._drives) > len(self.joints)
         self._servos = {
             drive: Servo(port, drive.id, load_control_table(drive.servo.name), drive.title) for drive in self._drives
         }
         self._measured = self._drives
-        """The same with the zero of the turn in which they are."""
+        """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
@@ -128,9 +133,9 @@ class ServoBus:
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check who answers and that nobody holds the arm, set every servo's mode.
+        """Open the port, check that the expected servos answer and nobody holds the arm, and set every servo's mode.
 
-        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting, TorqueHeld; the port is closed then.
+        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting or TorqueHeld, after closing the port.
         """
         bus = cls.connect(config)
         try:
@@ -144,7 +149,7 @@ class ServoBus:
 
     @classmethod
     def connect(cls, config: BusConfig) -> "ServoBus":
-        """Open the port and send nothing, for set-up work; raises PortNotOpened."""
+        """Open the port without sending anything, for set-up work; raises PortNotOpened."""
         port = open_port(config.url, config.baud)
         try:
             return cls(port, config)
@@ -162,16 +167,16 @@ class ServoBus:
         self.port.close()
 
     def servo(self, joint: Joint) -> Servo:
-        """The joint's servo, the first where it has two, for reading and writing registers."""
+        """Return the joint's servo (the first if it has several), for reading and writing registers."""
         return self.servos(joint)[0]
 
     @property
     def drives(self) -> Mapping[Joint, Servo]:
-        """Every servo, by a joint of its own: those of `Joint.drives`, in their order."""
+        """All servos, each keyed by a single-servo joint from `Joint.drives`, in bus order."""
         return self._servos
 
     def servos(self, joint: Joint) -> tuple[Servo, ...]:
-        """All servos of a joint, in the order of its `drives`."""
+        """Return all servos of a joint, in the order of its `drives`."""
         return tuple(self._servos[drive] for drive in joint.drives)
 
     def check_identity(self) -> None:
@@ -202,8 +207,10 @@ class ServoBus:
         self._without_watchdog.add(joint)
 
     def release_held(self, ours: Collection[Joint] = ()) -> None:
-        """Ensure that no servo has torque before anything is written: raises TorqueHeld, or with
-        `BusConfig.take_over` lets the arm sink. ours: joints that a program of this user left behind, cut at once.
+        """Ensure that no servo has torque on before anything is written.
+
+        If one has, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
+        ours: joints that an earlier program of this user left with torque on; it is cut immediately.
         """
         for joint in ours:
             if self._servos[joint].read("Torque Enable"):
@@ -238,15 +245,18 @@ class ServoBus:
         self._exchange = exchange
 
     def knows_fast_sync_read(self) -> bool:
-        """Whether every servo's firmware supports Fast Sync Read."""
+        """Return whether every servo's firmware supports Fast Sync Read."""
         return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
 
     def make_exchange(
         self, *, fast: bool, one_write: bool, slow_every: int | None = None, status: bool = True
     ) -> Exchange:
-        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first.
+        """Return an exchange with these servos, after reading their Return Delay Times.
 
-        status: whether the servos report their status periodically, if time allows.
+        fast: use Fast Sync Read instead of Sync Read.
+        one_write: send the goals and the read request in one write instead of two.
+        slow_every: cycles between two slow reads; by default `BusConfig.slow_every`.
+        status: read the servos' status periodically, if there is time.
         """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
@@ -271,11 +281,11 @@ class ServoBus:
         )
 
     def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Spans | None, int]:
-        """The status registers read and the number of cycles between reads; None if there is no time."""
+        """Return the status registers to read and the number of cycles between reads; None if there is no time."""
         interval, modes, count = self.config.interval, [drive.mode for drive in self._drives], len(self._drives)
         if not interval:
             return None, 0
-        # Without a sensor in the motor lost torque shows in Torque Enable first, so that is worth a late sample.
+        # Without a current sensor in the motor, a loss of torque shows first in Torque Enable: worth a late sample.
         share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
         for whole in (True, False):
             span = status_span(modes, tables, whole=whole)
@@ -293,17 +303,17 @@ class ServoBus:
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Every joint's angle [rad], by set-up reads; a joint with two servos has the first one's."""
+        """Read each joint's angle [rad] outside the control cycle; a joint with several servos has the first's."""
         first = [self._of.index(index) for index in range(len(self.joints))]
         return tuple(
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
         )
 
     def exchange(self, goals: Sequence[float]) -> State:
-        """Send goals, one per joint [A, or V under PWM], and read the arm's state.
+        """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
-        A silent servo is marked missing. Raises PortLost; BusShared when another master's instructions are heard again
-        and again; ValueError for a goal that is not a number.
+        A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
+        are heard repeatedly; ValueError for a goal that is not a finite number.
         """
         if self._in_pairs and len(goals) == len(self.joints):
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
@@ -315,19 +325,22 @@ class ServoBus:
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_alerts(self, state: State) -> None:
-        """Where a servo raised its alert bit, read the cause; raises ServoFault, which names all of them."""
+        """Read the cause wherever a servo has raised its alert bit; raises ServoFault naming all of them."""
         raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
         faults = [text for joint in raised if (text := self._faults(joint))]
         if faults:
             raise ServoFault(" ".join(faults))
 
     def _faults(self, joint: Joint) -> str:
-        """The faults of the servos of a joint that raised its alert."""
+        """Return the faults of a joint's servos after one of them has raised its alert."""
         texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
         return " ".join(filter(None, texts))
 
     def _fault(self, drive: Joint, *, alone: bool = True) -> str:
-        """What is wrong with one servo; alone: it is certainly this one."""
+        """Return the fault of one servo as text, or "" if it reports none and may not be the one that raised the alert.
+
+        alone: the joint has no other servo, so the alert is certainly this one's.
+        """
         try:
             error = self._servos[drive].hardware_error()
             cause = describe_error(error)
@@ -337,17 +350,17 @@ class ServoBus:
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
-        """Torque is on inside the block and off after it, however the block is left.
+        """Switch torque on for the block and off afterwards, however the block is left.
 
-        watchdog: seconds without a packet after which a servo stops by itself (20 ms steps, at most 2.54 s).
-        Raises TorqueNotOff on leaving when a servo could not be confirmed off; `torque_off_report` tells which.
+        watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
+        Raises TorqueNotOff on exit if torque off could not be confirmed; `torque_off_report` lists the servos.
         """
         self.torque_off_report = None
         try:
             self._torque_on(watchdog)
             yield
         finally:
-            # Nothing stands between `finally` and `try`: an interrupt that comes before the shield is up is met here.
+            # No statement may stand between `finally` and `try`, so that an interrupt before torque_off is caught here.
             try:
                 report = self.torque_off()
             except BaseException:
@@ -365,7 +378,7 @@ class ServoBus:
             watched = joint not in self._without_watchdog
             if watched:
                 servo.write("Bus Watchdog", 0)
-            # Changing Operating Mode leaves Goal Current at Current Limit.
+            # A change of Operating Mode leaves Goal Current at Current Limit, so it is zeroed before torque is on.
             servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
             if watched:
                 servo.write("Bus Watchdog", ticks)
@@ -378,11 +391,12 @@ class ServoBus:
                 raise
 
     def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back. Tries all of them whatever fails.
+        """Cut torque on every servo and read it back. All servos are tried, whatever fails.
 
-        After each servo that cannot be confirmed all are told again: it may hear though it cannot answer, and while it
-        was asked the others' watchdogs heard packets and waited. Signals are held back until it is done; an interrupt
-        that still arrives is raised after all servos have been tried and `torque_off_report` is there.
+        After each servo that cannot be confirmed, torque off is sent to all again: the servo may receive without being
+        able to reply, and while it was being polled the other servos' watchdogs saw traffic and did not trip. Signals
+        are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
+        `torque_off_report` is set.
         """
         interrupts: list[BaseException] = []
         with signals_held_back():
@@ -413,30 +427,35 @@ class ServoBus:
         return tuple(confirmed), tuple(unconfirmed)
 
     def _torque_off_at_once(self) -> None:
-        """Torque off to all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s
-        where one is
-        silent. A Sync Write, since other servos on the bus may be in use. Twice, since a packet may be lost.
+        """Send torque off to all servos of the arm in one broadcast.
+
+        The broadcast takes 0.3 ms; confirmed writes take a few ms per servo, and 0.1 s for one that does not reply. It
+        is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be
+        lost.
         """
         entry = self._servos[self._drives[0]].table["Torque Enable"]
         body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
         body += b"".join(bytes((drive.id, 0)) for drive in self._drives)
-        # Where this fails, the confirmed writes will say so.
+        # If this fails, the confirmed writes that follow report it.
         with suppress(DriverError):
             self.port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
 
 
 def _write_surely(servo: Servo, register: str, value: int, interrupts: list[BaseException]) -> str | None:
-    """Write a register and read it back, again after an interrupt, which is kept; why it failed, or None."""
+    """Write a register and read it back; return None, or the reason for the failure.
+
+    An interrupt is appended to `interrupts` and the write is tried again.
+    """
     for _ in range(_INTERRUPTS_BORNE):
         try:
             servo.write(register, value)
-        except Exception as error:  # whatever one servo does, the next must be tried
+        except Exception as error:  # whatever fails on one servo, the next must still be tried
             return str(error) or type(error).__name__
         except BaseException as interrupt:
             interrupts.append(interrupt)
         else:
             return None
-    return "It was interrupted repeatedly."
+    return "The write was interrupted repeatedly."
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

@@ -1,8 +1,8 @@
 """Critical sections: signals that arrive inside are delivered afterwards.
 
-A Ctrl-C raises KeyboardInterrupt wherever the program happens to be, also between the two servos whose torque is being
-cut. A program that uses the driver as a library has no handlers that would only take note of it, so the driver itself
-holds signals back for the few milliseconds in which torque is cut.
+Ctrl-C raises KeyboardInterrupt wherever the program happens to be, even between two servos while torque is being cut. A
+program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
+signals back for the few milliseconds in which torque is cut.
 """
 
 import signal
@@ -16,9 +16,9 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Inside the block SIGINT, SIGTERM and SIGHUP are noted; each kind that came is raised again after it, once.
+    """Hold back SIGINT, SIGTERM and SIGHUP in the block; each kind that arrived is raised once afterwards.
 
-    Only the main thread gets signals; in another one this does nothing.
+    Only the main thread receives signals; in any other thread this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -29,7 +29,7 @@ def signals_held_back() -> Iterator[None]:
         if number not in came:
             came.append(number)
 
-    # None is a handler that was not installed from Python: it could not be put back, so it stays.
+    # None is a handler that was not installed from Python: it could not be restored, so it is left alone.
     former = {number: handler for number in _SIGNALS if (handler := signal.getsignal(number)) is not None}
     try:
         for number in former:

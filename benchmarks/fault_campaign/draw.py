@@ -1,4 +1,4 @@
-"""Which faults befall a run, drawn at random in kind, time, length, strength and combination; the words for them."""
+"""Random faults of a run (kind, time, duration, strength, combination) and the words by which messages name causes."""
 
 import math
 from collections.abc import Sequence
@@ -9,10 +9,10 @@ from benchmarks.fault_campaign.attack import AT_ONCE, Attack, Kind
 from hil.fakes.bus.faults import INSTRUCTION_FAULTS, REPLY_FAULTS, Fault, FaultKind
 
 PAIRS = 0.35
-"""Share of injections that are two faults."""
+"""Probability that an injection consists of two faults."""
 
 TOGETHER_S = 0.3
-"""Half of the pairs follow each other this closely [s]."""
+"""Half of the pairs follow each other within this time [s]."""
 
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
@@ -43,7 +43,7 @@ WORDS = {
     STRANGER: r"another (program|master)|somebody else|not asked for|collision|other master",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
 }
-"""What a message has to say for a cause to count as named."""
+"""A message names a cause if it matches this pattern."""
 
 _FORGED = frozenset({ENCODER, STUCK, MODEL, TORQUE, SIGN})
 _LOST_GOALS = frozenset({TORQUE, MODEL, STUCK})
@@ -92,7 +92,7 @@ CAUSES: dict[str, frozenset[str]] = {
     FaultKind.STATUS_ERROR: frozenset({REFUSED, SILENCE, TORQUE}),
     FaultKind.OTHER_MASTER: _BYTES | {STRANGER, LATE},
 }
-"""What each fault may rightly be called. Held fast and a dead encoder cannot be told apart from the host's side."""
+"""Causes that a message may name for each fault. The host cannot distinguish a jammed joint from a dead encoder."""
 
 _INSTRUCTIONS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
 UNHEARD = _INSTRUCTIONS | {
@@ -104,17 +104,19 @@ UNHEARD = _INSTRUCTIONS | {
     FaultKind.REBOOT,
     FaultKind.STATUS_ERROR,
 }
-"""Where the program cannot reach a servo, the watchdog's time counts."""
+"""Faults during which the program cannot reach a servo, so that the watchdog's timeout applies."""
 
 SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SPLIT, FaultKind.LATE_REPLY})
-"""After these the program may rightly play its plan later than undisturbed."""
+"""Faults after which the program may play its plan later than in an undisturbed run."""
 
 _LAST = frozenset({Kind.KILLED})
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is done to one run: attacks of the man in the middle, faults of the fake bus, timed from its start."""
+    """The faults of one run: attacks by the man in the middle and faults of the fake bus, timed from the start of the
+    run.
+    """
 
     attacks: tuple[Attack, ...]
     faults: tuple[Fault, ...]
@@ -142,7 +144,7 @@ class Drawn:
 
 
 def draw(seed: object, until: float, ids: Sequence[int]) -> Drawn:
-    """One fault or two within an undisturbed run that lasts `until` [s]; the same seed draws the same."""
+    """Draw one or two faults for a run that lasts `until` [s] undisturbed; the same seed gives the same faults."""
     random = Random(f"drawn {seed}")
     first = random.uniform(0.0, until)
     times = [first]
@@ -161,7 +163,7 @@ def draw(seed: object, until: float, ids: Sequence[int]) -> Drawn:
 
 
 def _length(random: Random) -> float:
-    """Of a fault [s]: from some milliseconds to the end of the run."""
+    """Duration of a fault [s]: from a few milliseconds to the end of the run."""
     return math.inf if random.random() < 0.4 else 10 ** random.uniform(-2.3, 0.7)
 
 
@@ -183,7 +185,7 @@ def _attack(kind: Kind, at: float, ids: Sequence[int], random: Random) -> Attack
         Kind.SCALE: random.choice((-1.0, 0.0, 0.5, 0.8, 1.25, 2.0)),
         Kind.REPLAY: random.uniform(0.02, 0.5),
     }
-    # A forged value stays forged: one that comes and goes is another fault at every sample.
+    # Forged values stay forged: an intermittent forgery would be a new fault at every sample.
     chance = 1.0 if kind in (Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY, Kind.ECHO) else _chance(random)
     field = random.choice(("state", "position", "velocity", "current"))
     return Attack(kind, at, at + _length(random), random.choice((None, *ids)), chance, amounts.get(kind, 0.0), field)

@@ -1,7 +1,7 @@
-"""The man in the middle: a serial port between the program and the fake bus that does to the bytes what attacks say.
+"""The man in the middle: a serial port between program and fake bus that modifies bytes as the attacks demand.
 
-Outside an attack's time bytes pass as they are, at no cost. Within it every reply is taken apart, changed, and handed
-on when it is due; what the host reads and writes is kept with its time either way.
+Outside an attack's time bytes pass unchanged, at no cost. During an attack every reply is parsed, modified, and passed
+on when it is due. In either case, everything the host reads and writes is stored with its time.
 """
 
 import contextlib
@@ -33,26 +33,26 @@ from hil.fakes.protocol_fake import FakeSerial
 
 FORGED = {Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY}
 LOOK_BACK_S = 0.5
-"""How long before a replay replies are kept for it."""
+"""Time before a replay attack from which replies are stored for it [s]."""
 
 
 @dataclass
 class Traffic:
-    """What went over the port: (time [s], bytes) of every write and every read."""
+    """Bytes that passed the port: (time [s], bytes) of every write and every read."""
 
     written: list[tuple[float, bytes]] = field(default_factory=list)
     read: list[tuple[float, bytes]] = field(default_factory=list)
 
 
 class Middle(FakeSerial):
-    """A port onto a fake arm with somebody in between."""
+    """A port of a fake arm with a man in the middle."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.traffic = Traffic()
         self.over = False
-        """The program is done: nothing is done to it any more."""
+        """The program has ended, so no further attacks are made."""
         self.dead = False
-        """The program was killed, though its clean-up still runs in this process."""
+        """The program was killed, although its clean-up still runs in this process."""
         self._attacks: Sequence[Attack] = ()
         self._random = Random(0)
         self._wakes = math.inf
@@ -65,7 +65,7 @@ class Middle(FakeSerial):
         super().__init__(*args, **kwargs)
 
     def attack(self, attacks: Sequence[Attack], seed: int) -> None:
-        """Do these, with chance drawn from `seed`."""
+        """Schedule these attacks; chance is drawn from `seed`."""
         self._attacks = attacks
         self._random = Random(seed)
         self._to_come = sorted((each for each in attacks if each.kind in AT_ONCE), key=lambda each: each.start)
@@ -147,7 +147,7 @@ class Middle(FakeSerial):
         return taken
 
     def _take(self, byte: bytes) -> None:
-        """A byte from the servos: hand on the packet that it completes, changed."""
+        """Take a byte from the servos; pass on the packet that it completes, with its changes."""
         raw = self._raw
         raw += byte
         if len(raw) >= 7 and raw.startswith(HEADER):
@@ -164,7 +164,7 @@ class Middle(FakeSerial):
             self._queue.append((due, data))
 
     def _changed(self, packet: bytes, now: float) -> Iterator[tuple[float, bytes]]:
-        """What becomes of a reply: seconds that it is held, and bytes."""
+        """The (delay [s], bytes) pairs that a reply turns into."""
         servo_id = packet[4] if len(packet) > 4 else None
         packet = self._forger.keep_and_forge(packet, self._request, now, self._forging(now))
         wait, copies, gap = 0.0, 1, None
@@ -261,7 +261,7 @@ def _do(attack: Attack, port: Middle) -> None:
 
 
 class Forger:
-    """Changes values inside whole answers and seals them again, so that nothing but their content tells."""
+    """Changes values inside complete answers and recomputes the CRCs, so that only the values are wrong."""
 
     def __init__(self) -> None:
         self._latest: dict[int, tuple[int, bytes]] = {}
@@ -320,4 +320,4 @@ Opened = Callable[[Middle], None]
 
 
 class Killed(BaseException):
-    """The program is gone: whatever it still tries on this port, nothing leaves it any more."""
+    """The program was killed: nothing it still tries on this port leaves it."""

@@ -1,4 +1,4 @@
-"""The emulated servos' own record: every millisecond of what each was told, what its motor carried and how it moved."""
+"""The emulated servos' own record: goals, motor currents and motion, every millisecond."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,7 +26,7 @@ RECORD = np.dtype(
 
 
 class Witness:
-    """Stands where the plant stands, sees every step of it, and changes nothing."""
+    """Replaces the plant and forwards every step unchanged, recording it."""
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant
@@ -65,12 +65,12 @@ class Witness:
         plant.advance(until, current)
 
     def record(self) -> NDArray[Any]:
-        """The record so far, (milliseconds, joints) of `RECORD`."""
+        """The record so far (milliseconds, joints), with dtype `RECORD`."""
         return np.array(self._rows, dtype=RECORD).reshape(-1, self.joints)
 
 
 def _told(servo: Servo) -> tuple[bool, bool, int]:
-    """Whether the servo drives its motor, whether torque is on, and the goal of its mode [ticks]."""
+    """Whether the servo drives its motor, whether torque is on, and the goal in its mode [ticks]."""
     memory = servo.memory
     torque = memory.get("Torque Enable") == 1
     mode = memory.get("Operating Mode")
@@ -79,5 +79,5 @@ def _told(servo: Servo) -> tuple[bool, bool, int]:
     elif mode == PWM_MODE:
         goal = memory.get("Goal PWM")
     else:
-        goal = int(torque)  # position and velocity control drive as soon as torque is on
+        goal = int(torque)  # position and velocity control drive the motor whenever torque is on
     return torque and goal != 0, torque, goal

@@ -1,11 +1,11 @@
-"""Missing model terms, judged without fitting them: the score test, and the effect of omission on standard errors.
+"""Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
 
-About an estimate the motion is linear in small changes of any parameter, those of terms that the model lacks too. One
-simulation with the derivatives by all of them gives the decrease of the sum of squares if a term were added
-(C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50), and how far the fitted parameters would move. Terms
-that cannot be ruled out, such as an encoder's zero or torque saturation, thus widen the standard errors even where the
-motion does not show them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with what is
-usual of them as the prior and what the motion says of them on top.
+Near an estimate the motion is linear in small changes of any parameter, including those of terms that the model lacks.
+One simulation with the derivatives by all of them yields the decrease of the sum of squares if a term were added (C. R.
+Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted parameters. Terms
+that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard errors even if
+the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with
+their typical size as the prior and the information from the motion in addition.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import FRICTIONS, OPTIONS, term_of
 from hil.estimator.options import IntegrationOptions
 
-MAX_LAG_SHARE = 0.05  # of the samples, over which a residual's correlation is summed
+MAX_LAG_SHARE = 0.05  # fraction of the samples over which a residual's autocorrelation is summed
 INTEGRATION = IntegrationOptions()
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 
@@ -38,47 +38,53 @@ class Candidate:
 
     model: Model
     part: str
-    """The option or friction law that it adds."""
+    """The option or friction law that is added."""
     names: tuple[str, ...]
-    """The parameters that it adds."""
+    """Names of the parameters that are added."""
     evidence: float
     """Decrease of the sum of squares relative to that expected by chance: above 1 it is significant."""
     explained: float
-    """Share of the sum of squares that it explains."""
+    """Fraction of the sum of squares that it explains."""
     values: Mapping[str, float]
-    """First guesses of the added parameters."""
+    """Initial guesses of the added parameters."""
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """The weighted sum of squares about an estimate, by changes of parameters, then of the first state."""
+    """Quadratic approximation of the weighted sum of squares near an estimate.
+
+    The causes are the parameters, followed by the initial state.
+    """
 
     names: tuple[str, ...]
-    """Of the parameters: those of the estimate and those of candidates."""
+    """Names of the parameters: those of the estimate and those of candidates."""
     value: Array
     """Point of expansion (parameters,) [SI]."""
     normal: Array
     """J'WJ (causes, causes)."""
     gradient: Array
-    """J'Wr, r simulated minus measured (causes,)."""
+    """J'Wr with r simulated minus measured (causes,)."""
     samples: int
-    """Of all joints: the sum of squares, weighted by the residual as it is."""
+    """Number of valid samples over all joints; it equals the sum of squares, which is weighted by the residual."""
     colour: float
-    """By how much the residual's correlation makes chance larger: 1 is white."""
+    """Factor by which the residual's correlation increases chance decreases; 1 is white."""
     precision: Array
-    """Inverse variances expected of the parameters (parameters,), 0 where nothing is."""
+    """Inverse prior variances of the parameters (parameters,), 0 without a prior."""
 
     @cached_property
     def states(self) -> list[int]:
-        """Places of the first state's causes."""
+        """Indices of the initial state among the causes."""
         return list(range(len(self.names), len(self.normal)))
 
     def places(self, names: Sequence[str]) -> list[int]:
-        """Places of parameters."""
+        """Return the indices of parameters among the causes."""
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
-        """Decrease of the sum of squares when these parameters and the first state are freed, and their changes."""
+        """Return the decrease of the sum of squares if these parameters are freed, and their changes.
+
+        The initial state is freed as well.
+        """
         at = [*self.places(names), *self.states]
         normal, gradient = self.normal[np.ix_(at, at)], self.gradient[at]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -93,7 +99,7 @@ def linearised(
 ) -> Linearised:
     """Expand the sum of squares of `period` about `estimate`, which was fitted to it.
 
-    `names`: parameters beside the estimate's; they are expanded about what `known` says, else where they are absent.
+    `names`: additional parameters; they are expanded about their value in `known`, or else where they have no effect.
     """
     used = without_spikes(period)
     added = [name for name in names if name not in estimate.names]
@@ -125,9 +131,9 @@ def linearised(
 
 
 def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
-    """Terms that could be added to the estimate's model, most significant first.
+    """Return the terms that could be added to the estimate's model, most significant first.
 
-    `known`: where ripple repeats (`ripple_cycles`), by parameter name; without it ripple is none of them.
+    `known`: the period of ripple (`ripple_cycles`), by parameter name; without it, ripple is not considered.
     """
     model = estimate.model
     richer = _richer(model)
@@ -156,10 +162,10 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 
 
 def considered(period: SettledPeriod, estimate: Estimate) -> Array:
-    """The estimate's covariance (parameters, parameters) including omitted terms that cannot be ruled out.
+    """Return the estimate's covariance (parameters, parameters) including omitted terms that cannot be ruled out.
 
-    Of each such parameter the prior and what the motion says of it are taken together. It is as if it were fitted too,
-    but for the value, which stays where it is: by how far it would move comes on top.
+    Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
+    Since its value actually stays unchanged, the resulting shift of the other parameters is added.
     """
     model = estimate.model
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
@@ -189,14 +195,17 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def simulated_run(period: SettledPeriod) -> Run:
-    """A period as simulated here, with the integration steps of a fit's result."""
+    """Return a period's simulation with the integration steps of a fit's result."""
     if period.stabiliser is None:
         return SimulatedRun.of(period, INTEGRATION)
     return StabilisedRun.of(period, period.stabiliser, INTEGRATION)
 
 
 def colour(residual: Array) -> float:
-    """Integrated autocorrelation of a residual (joints, samples), worst joint, missing samples as 0; 1 is white."""
+    """Return the integrated autocorrelation of a residual (joints, samples), worst joint; 1 is white.
+
+    Missing samples count as 0.
+    """
     worst = 1.0
     for row in np.nan_to_num(residual):
         rho = autocorrelation(row, max(2, int(MAX_LAG_SHARE * row.size)))
@@ -207,7 +216,7 @@ def colour(residual: Array) -> float:
 
 
 def _richer(model: Model) -> dict[str, Model]:
-    """Models with one option, or one law of friction, more: those that are linear in what they add."""
+    """Return the models with one more option or friction law, limited to those that are linear in the added terms."""
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     richer: dict[str, Model] = {option: model.having(option) for option in absent if option != "presliding"}
     higher = FRICTIONS[FRICTIONS.index(model.friction) + 1 :][:1]
@@ -239,9 +248,10 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
 
 
 def ripple_cycles(period: SettledPeriod, estimate: Estimate, cycles: Sequence[float]) -> dict[str, float]:
-    """Where ripple of each joint would explain most of what `estimate` leaves, of these `cycles` a turn, by name.
+    """Return the numbers of `cycles` per turn for which ripple of each joint would explain most of the residual.
 
-    The score test of ripple for one number of cycles after the other, what the fitted parameters explain taken off.
+    This is the score test of ripple for one number of cycles after the other, after removing what the fitted parameters
+    explain. The result is by parameter name.
     """
     used = without_spikes(period)
     run = simulated_run(used).integrated(COARSE)
@@ -266,7 +276,7 @@ def ripple_cycles(period: SettledPeriod, estimate: Estimate, cycles: Sequence[fl
 
 
 def _columns(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
-    """Weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
+    """Return weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
     pieces = list(run.pieces(physics, start, names))
     derivative = np.concatenate([each for _, _, each in pieces], axis=1) * weight[:, :, None]
     position = np.concatenate([each for _, each, _ in pieces], axis=1)

@@ -1,8 +1,8 @@
 """Friction model selection for recordings without a settled period, judged on held-out segments.
 
-Every other segment of each recording is fitted and the others are predicted, each from the state given by its first
-samples. The model that predicts them best is fitted once more to all. (The short segments that only find a start are
-not kept apart so; what is judged has seen none but its own half.)
+Every other segment of each recording is fitted, and the remaining ones are predicted, each from the initial state given
+by its first samples. The model that predicts them best is finally fitted to all segments. (The short segments used for
+initial guesses are not split in this way, but the models that are compared only use their half.)
 """
 
 import time
@@ -31,15 +31,15 @@ class SegmentTrial:
 
     model: Model
     held_out: Array | None
-    """RMS error over the motion's RMS (joints,); None where the fit found no end."""
+    """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Of the usual segment, the median, all joints together: where an arm turns over, one can be off by any amount."""
+    """Median of the segments' relative errors over all joints: a segment in which the arm turns over can be far off."""
     seconds: float
 
 
 @dataclass(frozen=True)
 class SegmentChoice:
-    """The models tried, in order, the one chosen, and its fit to all segments."""
+    """The models tried, in order, the chosen one, and its fit to all segments."""
 
     trials: tuple[SegmentTrial, ...]
     chosen: SegmentTrial
@@ -47,7 +47,7 @@ class SegmentChoice:
 
     @property
     def gained(self) -> float:
-        """The plainest model's error over the chosen one's."""
+        """Ratio of the simplest model's error to the chosen one's."""
         return self.trials[0].score / self.chosen.score
 
 
@@ -61,16 +61,16 @@ def choose_by_shooting(
     torque_scale: bool = False,
     options: SelectionOptions = DEFAULTS,
 ) -> SegmentChoice:
-    """Fit richer and richer friction, presliding and asymmetry on the best, as long as held-out segments are predicted
-    better.
+    """Fit increasingly rich friction models as long as the prediction of held-out segments improves.
 
-    Arguments as of `estimate_by_shooting`; `torque_scale` is part of every model, or of none. Raises RecordingError for
-    recordings of fewer than two segments each, ConvergenceError when no model can be fitted.
+    Presliding and asymmetry are then tried with the best of them. Arguments as in `estimate_by_shooting`;
+    `torque_scale` is part of every model or of none. Raises RecordingError for recordings with fewer than two segments
+    each, ConvergenceError if no model can be fitted.
     """
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(
-            f"no recording holds two segments of {length:g} s, one to fit and one to check: set model.friction to one "
-            "of the models, record longer, or choose shorter segments"
+            f"no recording has two segments of {length:g} s, one to fit and one to check: set model.friction to a "
+            "specific model, record longer, or choose shorter segments"
         )
 
     def tried(model: Model) -> SegmentTrial:

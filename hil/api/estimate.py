@@ -1,4 +1,4 @@
-"""`hil.estimate`: from a recording to a result, without touching an arm."""
+"""`hil.estimate`: estimate parameters from a recording, without touching an arm."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -29,7 +29,7 @@ def estimate(
     Args:
         recording: a run folder or a `Run`, whose result.json is rewritten; or one or more CSV files of one arm.
         config: for CSV files, the TOML file whose [columns] table describes them.
-        all_samples: of a run, use every sample by multiple shooting; no settled period is needed.
+        all_samples: use every sample of the run, by multiple shooting; no settled period is needed.
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:
@@ -39,9 +39,9 @@ def estimate(
         RunFolderError: the folder holds no readable run.
         CsvError: a CSV file cannot be read as a recording.
         ConfigError: a CSV file was given without `config`, or `config` is wrong.
-        RecordingCutShort: the run holds no settled period; `all_samples` can do without.
+        RecordingCutShort: the run holds no settled period; `all_samples` does not need one.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
-        ValueError: run folders and CSV files together, or several run folders.
+        ValueError: `recording` mixes run folders and CSV files, or names several run folders.
     """
     if isinstance(recording, Run):
         paths = [recording.path]
@@ -69,7 +69,7 @@ def estimate(
 
 
 def are_csv(paths: Sequence[Path]) -> bool:
-    """Whether these are CSV files and not one run folder; raises ValueError for a mixture."""
+    """Whether all paths are CSV files (true) or the only path is a run folder (false). Raises ValueError otherwise."""
     files = [path.suffix.lower() == ".csv" for path in paths]
     if any(files) and not all(files):
         raise ValueError("give either one run folder or CSV files, not both.")

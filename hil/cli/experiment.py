@@ -1,6 +1,6 @@
-"""The subcommands from an arm to its parameters: identify, record, estimate.
+"""The subcommands that identify, record and estimate.
 
-The modules that do the work are imported inside the commands, so that `hil --help` answers at once.
+The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,8 @@ Recordings = Annotated[
     list[Path], typer.Argument(metavar="RUN | FILE.csv ..", help="Run folder, or CSV files of one arm with --config.")
 ]
 ArmPath = Annotated[
-    Path | None, typer.Option("--config", metavar="ARM.toml", help="For CSV files: its [columns] table describes them.")
+    Path | None,
+    typer.Option("--config", metavar="ARM.toml", help="For CSV files: TOML file whose [columns] table describes them."),
 ]
 AllSamples = Annotated[
     bool, typer.Option("--all-samples", help="Use every sample, by multiple shooting; no settled period is needed.")
@@ -30,7 +31,7 @@ AllSamples = Annotated[
 
 
 def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
-    """Excite the arm, take one settled period, print its parameters with error bars."""
+    """Excite the arm, record one settled period, and print its parameters with error bars."""
     from hil.api.experiment import identify as identify_arm
     from hil.cli.terminal import Terminal
 
@@ -40,7 +41,7 @@ def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = Fals
 
 
 def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
-    """Play the experiment and keep its recording, for `hil estimate`."""
+    """Play the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
     from hil.cli.terminal import Terminal
     from hil.results.json_form import to_json
@@ -57,7 +58,7 @@ def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False,
 def estimate(
     recordings: Recordings, config: ArmPath = None, all_samples: AllSamples = False, json_only: Json = False
 ) -> None:
-    """Estimate again from a recording; writes its result.json anew. Or from CSV files of any motion."""
+    """Estimate again from a recorded run and rewrite its result.json, or estimate from CSV files of any motion."""
     from hil.api.estimate import are_csv
     from hil.api.estimate import estimate as estimate_arm
     from hil.cli.terminal import Terminal

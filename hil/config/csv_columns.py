@@ -1,6 +1,6 @@
-"""What a recording made elsewhere needs beside its numbers: columns, units, and the arm's few facts.
+"""Description of a recording made elsewhere: its columns, their units, and a few facts about the arm.
 
-The same TOML as for an experiment will do, or a shorter one; tables that only the bus needs are ignored.
+The TOML file of an experiment can be used, or a shorter one; tables that only the bus needs are ignored.
 
     [arm]
     gravity = 9.81
@@ -8,7 +8,7 @@ The same TOML as for an experiment will do, or a shorter one; tables that only t
     friction = "stribeck"
     drive = "delay"
     [columns]
-    time = "time"                                     # seconds unless said otherwise
+    time = "time"                                     # in seconds unless time_unit is given
     position = ["pos_meas1", "pos_meas2"]             # one per joint
     torque = ["tau_meas1", "tau_meas2"]               # or current, which needs torque_constant
     position_unit = "rad"                             # rad, deg, turns
@@ -74,7 +74,7 @@ class Columns(_Table):
 
 
 class ArmFacts(BaseModel):
-    """`[arm]`, of which only gravity is used here."""
+    """`[arm]`; only gravity is used here."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 
@@ -82,7 +82,7 @@ class ArmFacts(BaseModel):
 
 
 class CsvConfig(BaseModel):
-    """The tables of an arm's TOML that a recording made elsewhere needs."""
+    """The tables of an arm's TOML file that are needed for a recording made elsewhere."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
@@ -93,7 +93,7 @@ class CsvConfig(BaseModel):
 
 
 def load_csv_config(path: Path) -> CsvConfig:
-    """Read and check; raises ConfigError."""
+    """Read and check the TOML file. Raises ConfigError."""
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -102,7 +102,7 @@ def load_csv_config(path: Path) -> CsvConfig:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     if "columns" not in values:
         raise ConfigError(
-            f"{path}: has no [columns] table, which says what each CSV column holds. Example:\n[columns]\n"
+            f"{path}: has no [columns] table, which describes the CSV columns. Example:\n[columns]\n"
             'time = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
         )
     try:

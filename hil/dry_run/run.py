@@ -1,4 +1,4 @@
-"""What `hil dry-run` does: an ensemble, the experiment on it, the largest safe torque."""
+"""The work of `hil dry-run`: simulate the experiment on an ensemble and find the largest safe torque."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +16,13 @@ from hil.setup.idle_bus import quiet_stream
 
 ARMS = 128
 SHOWN = 30
-"""Arms whose motion is kept for the picture."""
+"""Number of arms whose motion is stored for the plot."""
 
 
 def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos: bool = False) -> DryRun:
-    """Simulate the configured experiment. result: run folder or result.json of an earlier identification.
+    """Simulate the configured experiment; `result` is a run folder or result.json of an earlier identification.
 
-    Raises ConfigError, ResultError, RunFolderError, ExperimentError; with `servos`, DriverError.
+    Raises ConfigError, ResultError, RunFolderError, ExperimentError and, with `servos`, DriverError.
     """
     only_planar(config, "a dry run")
     ensemble = ensemble_of(config, result, arms)
@@ -37,5 +37,5 @@ def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos
 
 
 def ensemble_of(config: Config, result: Path | None, arms: int) -> Ensemble:
-    """From the prior, or from an earlier result."""
+    """Draw an ensemble from the earlier result, or from the prior if `result` is None."""
     return prior_ensemble(config, arms) if result is None else result_ensemble(read_result(result), arms)

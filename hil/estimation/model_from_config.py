@@ -1,4 +1,4 @@
-"""From `[model]` to the model that the estimator fits."""
+"""Conversion of `[model]` to the model that the estimator fits."""
 
 from hil.config.experiment import ModelConfig
 from hil.estimator.models.model import Model
@@ -6,7 +6,7 @@ from hil.estimator.models.terms import OPTIONS
 
 
 def wanted_model(wanted: ModelConfig, joints: int) -> Model:
-    """What the file asks for, of an arm of `joints`; where it says "auto", Stribeck friction."""
+    """The model requested by the file for an arm with `joints` joints; "auto" gives Stribeck friction."""
     return Model(
         joints,
         wanted.fixed_friction,

@@ -1,4 +1,4 @@
-"""From a run folder to its result: settled period, both stages, and validation on a held-out multisine."""
+"""From a run folder to its result: settled period, both estimation stages, and validation on a held-out multisine."""
 
 import logging
 import time
@@ -36,7 +36,10 @@ log = logging.getLogger(__name__)
 
 
 def estimate_run(run: RunFolder) -> SettledResult:
-    """Estimate from the recording in `run` and write its result.json; the result. Raises HilError, EstimationError."""
+    """Estimate from the recording in `run`, write its result.json and return the result.
+
+    Raises HilError, EstimationError.
+    """
     config, facts = run.load_config(), run.load_facts()
     if config.is_chain:
         return estimate_chain_run(run, config, facts)
@@ -82,13 +85,13 @@ def estimate_run(run: RunFolder) -> SettledResult:
 
 
 def _drift(facts: RunFacts, samples: NDArray[np.void], other: SettledPeriod, estimate: Estimate) -> Drift:
-    """How friction changed from what was fitted to the motion held out."""
+    """Estimate how friction changed between the fitted and the held-out motion."""
     between = _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
     return friction_change(other, estimate, between)
 
 
 def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
-    """When the last periods of a multisine were played, on the port's clock [s]."""
+    """Mean time of the last period of a multisine, on the port's clock [s]."""
     rows = samples[(samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))]
     last = rows["period"] == rows["period"].max()
     return float(rows["deadline"][last].mean())
@@ -97,7 +100,7 @@ def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
 def _estimate(
     config: Config, period: SettledPeriod, other: SettledPeriod | None, starts: list[dict[str, float]]
 ) -> tuple[Estimate, Choice | None]:
-    """The estimate of the model that the configuration asks for, or of the one chosen, with how it was."""
+    """Fit the configured model, or choose one; the choice is None if the model is fixed."""
     wanted = config.model
     if wanted.friction == "auto":
         choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts)

@@ -1,7 +1,7 @@
-"""Checks every sample and stops the arm when a limit is passed or a reply is inconsistent.
+"""Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
-Two joints cost a few us a sample: plain floats, one pass over the joints, everything known beforehand computed once.
-What needs more than one sample is kept by modules of their own: `following` (does the motor carry the commanded
+The checks take a few us per sample for two joints: plain floats, one pass over the joints, constants precomputed.
+Checks that need more than one sample are in separate modules: `following` (does the motor carry the commanded
 current), `consistency` (do position and velocity agree), `status_check` (slow status
 registers), `silence` (time without replies or commands).
 """
@@ -22,36 +22,35 @@ from hil.experiment.status_check import StatusCheck
 from hil.plan.silence import is_missing_too_long, late_limit, missing_limit
 
 JUMP_FACTOR = 1.5
-"""How much farther than its velocity limit allows a joint may seem to move from one sample to the next."""
+"""Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
 
 JUMP_ALLOWANCE_RAD = 0.01
-"""Rounding and a worn encoder's scatter."""
+"""Allowance for rounding and the noise of a worn encoder [rad]."""
 
 EARLY_MOTION_RAD = 0.05
-"""How far a joint may creep in the rest before the start."""
+"""Largest motion allowed while resting before the start [rad]."""
 
 LONG_GAP = 3.0
-"""Intervals between two samples from which on what lies between them is not known well enough to be added up."""
+"""Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
 LATE_SHARE = 0.2
-"""Of the deadlines that may be missed for long."""
+"""Fraction of deadlines that may be missed permanently."""
 
 _OFTEN_LATE = 5.0
-_OF_ONE_STALL = 2  # deadlines that count, of those that one stall makes late
+_OF_ONE_STALL = 2  # number of deadlines counted per stall
 
 WORK_TOLERANCE_RAD = 0.03
-"""Work that a joint may seem to give out before its sign is called wrong: this angle at its largest torque."""
+"""Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest torque."""
 
 
 _WHY_LATE = (
     "This program was stopped (Ctrl-Z, SIGSTOP, a debugger), the computer was suspended, or other programs kept it "
-    "busy: "
-    "close those programs, or lower experiment.rate."
+    "busy: close those programs, or lower experiment.rate."
 )
 
 
 class _Limits(NamedTuple):
-    """One joint's limits, in the order of use."""
+    """One joint's limits, in order of use."""
 
     low: float
     high: float
@@ -65,10 +64,10 @@ class _Limits(NamedTuple):
 class Guard:
     """Compares each sample with the limits of the configuration. `look` raises SafetyStop.
 
-    planned: largest goal that the plan has for each joint [A, or V under PWM]; from the configuration where not given.
+    planned: largest planned goal of each joint [A, or V under PWM]; by default, from the configuration.
 
-    passive: whether the arm cannot return more work than was put in; True for an arm that starts at stable rest
-    without a stabiliser. Motors that continually take work out of it then turn the wrong way.
+    The work of the motors is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot
+    return more work than was put in, so a motor that continually takes work out of it turns the wrong way.
     """
 
     def __init__(self, config: Config, planned: Sequence[float] | None = None) -> None:
@@ -110,7 +109,9 @@ class Guard:
         self._resting: tuple[float, ...] | None = None
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
-        """Goals within each joint's current limit and slew [A]; NaN becomes a SafetyStop, never a command."""
+        """Clamp goals to each joint's current limit and slew rate [A or V]. Raises SafetyStop for a goal that is not
+        finite.
+        """
         slew = self._slew
         clamped = []
         for index, (goal, former, limits) in enumerate(zip(goal_current, self._former_goal, self._limits, strict=True)):
@@ -126,7 +127,7 @@ class Guard:
         return clamped
 
     def late(self, seconds: float = 0.0) -> None:
-        """A deadline passed unused, `seconds` after the last command. Raises SafetyStop after too long a time."""
+        """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._late += 1
         if self._late <= _OF_ONE_STALL:
             self._often_late += 1.0
@@ -142,7 +143,7 @@ class Guard:
         )
 
     def _judge_rate(self) -> None:
-        """Stop if more than a certain share of deadlines is missed; a single stall does not count."""
+        """Stop if too large a share of the deadlines is missed; a single stall does not count."""
         self._often_late = max(0.0, self._often_late - LATE_SHARE)
         if self._often_late >= max(_OFTEN_LATE, 0.5 * self._late_limit.seconds / self._interval):
             raise SafetyStop(
@@ -153,9 +154,9 @@ class Guard:
             )
 
     def look(self, state: State, watchdog_gap: float = 0.0) -> None:
-        """Raise SafetyStop when a limit is passed or a reply is inconsistent.
+        """Check one sample. Raises SafetyStop when a limit is exceeded or a reply is inconsistent.
 
-        watchdog_gap: s since the exchange before this one.
+        watchdog_gap: time since the previous exchange [s].
         """
         now = state.time_before_write
         gap = max(watchdog_gap, state.time_after_read - now)
@@ -186,7 +187,7 @@ class Guard:
         low, high, fastest, farthest, _, work_scale, work_least = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
         interval = self._interval
-        # A sample on time after a late one stands for a whole interval all the same.
+        # A punctual sample after a late one still represents a whole interval.
         seconds = max(now - self._seen_at[index], interval * (1 + self._missing[index]))
         former = self._position[index]
         if former is not None:
@@ -213,7 +214,7 @@ class Guard:
             self._judge_work(index)
 
     def look_at_rest(self, state: State) -> None:
-        """Raise SafetyStop when a joint moves although nothing has been commanded yet."""
+        """Raise SafetyStop when a joint moves before anything has been commanded."""
         if self._resting is None:
             if not any(state.missing):
                 self._resting = state.position
@@ -224,7 +225,7 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    "is allowed. Let the arm hang still; check for a draught, a dragging cable or a hand.",
+                    "is allowed. Let the arm come to rest; check for a draught, a dragging cable or a hand.",
                 )
 
     def _count_missing(self, index: int, error: int, now: float) -> None:
@@ -246,8 +247,7 @@ class Guard:
                 index,
                 Cause.MISSING,
                 f"missed {self._missing[index]} replies in a row; its last reply was {1e3 * seconds:.0f} ms ago; "
-                f"{said} "
-                f"allows {1e3 * allowed:.0f} ms. Check its cable and its supply.",
+                f"{said} allows {1e3 * allowed:.0f} ms. Check its cable and its supply.",
             )
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
@@ -281,8 +281,7 @@ class Guard:
             Cause.NOT_FOLLOWING,
             f"carries {off.carried:.3f} where {off.goal:.3f} is commanded, for {1e3 * off.seconds:.0f} ms. Its torque "
             "is off, it was rebooted, its watchdog acted, or it cannot deliver this much at its speed and supply "
-            "voltage "
-            "(safety.follow_share).",
+            "voltage (safety.follow_share).",
         )
 
     def _disagree(self, index: int, position: float, velocity: float) -> NoReturn:
@@ -307,7 +306,7 @@ class Guard:
                 self._stop(index, *wrong)
 
     def _judge_work(self, index: int) -> None:
-        """Friction takes energy: a joint whose motor has only ever taken energy out turns against its command."""
+        """Stop a joint whose motor has taken out more energy than friction allows: it moves against its command."""
         others = sum(work for other, work in enumerate(self._work) if other != index and work > 0)
         if self._work[index] < self._limits[index].work_least - 0.5 * others:
             self._stop(
@@ -336,7 +335,7 @@ class Guard:
                 )
 
     def _acted(self, seconds: float) -> str:
-        """What the servos' watchdogs did meanwhile."""
+        """What the servos' watchdogs did during the gap."""
         watchdog = self._safety.watchdog
         if seconds < watchdog:
             return ""
@@ -352,12 +351,12 @@ def _told(seconds: float) -> str:
 
 
 def _measures_supply(joint: JointConfig) -> bool:
-    """Whether the measured current is the supply's, not the motor's: then judge only motion and status."""
+    """Whether the reported current is the supply's instead of the motor's; then only motion and status are checked."""
     return joint.drive_mode is Mode.CURRENT and joint.joint.servo.senses_supply
 
 
 def _planned(config: Config) -> list[float]:
-    """Largest goals that the configuration asks for [A or V]; where it leaves them open, the current limits."""
+    """Largest configured goals [A or V]; the current limits if no torque is configured."""
     peaks = config.experiment.peak_torque
     if peaks is None:
         return [joint.goal_limit for joint in config.joints]

@@ -1,8 +1,8 @@
-"""The real-time loop: at each tick one exchange, a guard check and a recorded sample.
+"""The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-Played in order: rest; for each multisine a ramp in, periods until two successive ones match, the periods to
-be used, a ramp out; then no current until the arm is at rest. Where a stop allows it, the arm is braked before `run`
-raises; torque is cut by whoever switched it on.
+The sequence is: rest; for each multisine a ramp in, periods until two successive ones match, the remaining periods to
+be recorded, and a ramp out; then no current until the arm is at rest. If the cause of a stop allows it, the arm is
+braked before `run` raises; the caller that switched torque on switches it off.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ _LEAST_MOTION_STEPS = 4
 
 
 class Progress(NamedTuple):
-    """Progress for the user: samples taken, the number expected, the phase, and the latest state."""
+    """Progress for the user: samples taken, the number expected, phase, role of the multisine, and the latest state."""
 
     taken: int
     expected: int
@@ -49,9 +49,9 @@ Note = Callable[[str], None]
 class Stream:
     """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
 
-    watch: called about 20 times a second with the progress. note: called with each event worth keeping. Neither may
-    block. arms: prior knowledge of the arm, by default from the configuration. Create it before torque is on: it
-    precomputes everything it can.
+    watch: called with the progress about 20 times a second. note: called with each event to be logged. Neither may
+    block. arms: prior knowledge of the arm; by default, from the configuration. Create the stream before torque is on:
+    it precomputes as much as possible.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._guard = Guard(config, planned)
-        # Of a chain there is no such model yet: position, velocity, current and status are what is looked at.
+        # Chains have no such model yet: only position, velocity, current and status are checked.
         self._model = None if config.is_chain else ModelWatch(config, planned, arms)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
@@ -97,7 +97,7 @@ class Stream:
         return self._state
 
     def run(self) -> None:
-        """Play the whole plan; raises ExperimentError, SafetyStop, StopRequested, PortLost."""
+        """Play the whole plan. Raises ExperimentError, SafetyStop, StopRequested, PortLost."""
         try:
             self._play_all()
         except ExperimentError as error:
@@ -121,10 +121,14 @@ class Stream:
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
         if moving:
-            raise ExperimentError(f"The arm is moving before the start: {moving}. Let it hang still, then start again.")
+            raise ExperimentError(
+                f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
+            )
 
     def _play_periods(self, segment: Segment) -> None:
-        """Play periods until one matches its predecessor, which is then the first settled one; then the rest."""
+        """Play periods until one matches its predecessor; it is the first settled one. Then play the other periods to
+        record.
+        """
         samples = len(segment.period_current)
         repetition = self._repetition
         self._play_period(segment, 0)
@@ -144,12 +148,11 @@ class Stream:
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
             f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. Check for play, a "
-            "dragging cable or a slipping joint; or raise "
-            "max_settling_periods."
+            "dragging cable or a slipping joint; or raise max_settling_periods."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
-        """Detect a joint held by friction or an obstacle after one period, before minutes are wasted."""
+        """Detect a joint held by friction or an obstacle after one period, before more time is wasted."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 raise DidNotMove(
@@ -158,7 +161,7 @@ class Stream:
                 )
 
     def _play_period(self, segment: Segment, period: int) -> None:
-        """Play one period; each sample is compared with the same of the period before as it comes."""
+        """Play one period and compare each sample with the one in the period before."""
         repetition = self._repetition
         repetition.begin(len(segment.period_current))
         for index, row in enumerate(segment.period_current):
@@ -171,7 +174,7 @@ class Stream:
         for _ in range(0, self._plan.end_samples, window):
             self._play(self._silence(window), Phase.COMING_TO_REST)
             speeds = np.abs(self._recorder.samples["velocity"][-window:])
-            # Replies that are missing say nothing; a joint of which none came is not known to be at rest.
+            # Missing replies are ignored; a joint without any reply does not count as being at rest.
             fastest = np.fmax.reduce(speeds, axis=0)
             if (fastest < self._safety.rest_velocity).all():
                 self._note("at rest")
@@ -180,16 +183,16 @@ class Stream:
         self._note(f"still moving at {told} rad/s after {self._safety.rest_time:g} s without current")
 
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
-        """Send goal currents, (samples, joints) [A], one row a tick; the last state."""
+        """Send goal currents (samples, joints) [A], one row per tick; return the last state."""
         state = missed(self._goal, self._clock.now())
-        for row in goals:  # row by row: all at once would hold up the loop where a period is long
+        for row in goals:  # row by row: converting a long period at once would delay the loop
             state = self._sample(row.tolist(), phase, period)
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
         deadline, now, late = self._ticks.wait()
         if late:
-            # Skipped, never caught up in a burst: the servos keep the former goal.
+            # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
             state = missed(self._goal, now)
         else:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
@@ -203,7 +206,7 @@ class Stream:
         else:
             self._look(state, phase)
         self._stop.check()
-        # Heat and supply come with one sample in many: that one is always shown.
+        # Temperature and voltage come with only a few samples, which are always shown.
         if self._index % self._watch_every == 0 or state.slow is not None:
             role = self._plan.segments[self._segment].role
             self._watch(Progress(self._index, self._plan.expected, phase, role, state))
@@ -218,7 +221,7 @@ class Stream:
             self._guard.look_at_rest(state)
 
     def _brake(self) -> None:
-        """Brake until the arm is slow, sensing fails, time is up, or a second signal comes. Never raises."""
+        """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""
         brake = Brake(self._config)
         state = self._state
         with suppress(DriverError):
@@ -245,6 +248,6 @@ class Stream:
 
 
 def _largest_goals(plan: Plan) -> list[float]:
-    """Of each joint [A, or V under PWM]; the guard rejects values that are not numbers."""
+    """Largest goal of each joint [A, or V under PWM]; NaN counts as 0 here, since the guard rejects it."""
     peaks = [np.nan_to_num(np.abs(segment.period_current)).max(axis=0) for segment in plan.segments]
     return [float(peak) for peak in np.max(peaks, axis=0)]

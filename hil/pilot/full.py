@@ -1,4 +1,4 @@
-"""From link lengths to the result: the search, the full run, its estimate."""
+"""From link lengths to the result: the amplitude search, the full run, and its estimate."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,21 +15,21 @@ from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
 
 MOST_TRIES = 3
-"""Full runs, where one passes a limit or does not settle."""
+"""Largest number of full runs if one exceeds a limit or does not settle."""
 
 _BACK_OFF = 0.85
-"""Torque factor after a run that never settled: large motion with little friction need not settle at all."""
+"""Torque factor after a run that never settled: large motion with little friction may never settle."""
 
 
 def identify_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
 ) -> tuple[str, SettledResult]:
-    """From link lengths to the result. Returns the sentence about torque and the result.
+    """Identify an arm from link lengths only. Returns the sentence about the torque state and the result.
 
-    Raises what a run raises, and ExperimentError when a joint does not move at its current limit.
+    Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
     """
-    # A request to stop that comes in one step, however late, is for all that would follow. What the servos were set to
-    # is kept once for all steps, and put back once: EEPROM wears.
+    # A stop request in one step also cancels all later ones. Servo settings are saved and restored once for all steps,
+    # because EEPROM wears.
     with StopRequest(), servo_session(config, run.path, say):
         search = Search.of(config, run, Player(shown_path, watch, say))
         played = _full(search, *search.find())
@@ -40,7 +40,7 @@ def identify_in_steps(
 
 
 def _full(search: Search, config: Config, found: Amplitude) -> Played:
-    """Play the full run, with less torque where it passed a limit or did not settle."""
+    """Play the full run; repeat it with less torque if it exceeded a limit or did not settle."""
     run, say = search.run, search.player.say
     number = 0
     while True:

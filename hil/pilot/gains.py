@@ -1,7 +1,7 @@
-"""Gains of a software spring and damper for an arm that does not come back to its rest pose: flat, or upright.
+"""Gains of a software spring and damper for an arm that does not return to its rest pose: horizontal, or upright.
 
-Stiff enough to outweigh gravity in nearly every arm that could be this one and to overcome friction within a radian,
-soft enough to leave most of the torque to the excitation.
+The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
+and soft enough to leave most of the torque to the excitation.
 """
 
 import numpy as np
@@ -12,11 +12,11 @@ from hil.pilot.belief import Belief
 
 Array = NDArray[np.float64]
 
-_FREQUENCY = 0.7  # Hz, of each joint on its spring alone
+_FREQUENCY = 0.7  # Hz, natural frequency of each joint on its own spring
 _DAMPING_RATIO = 0.35
-_OUTWEIGHS = 1.3  # times gravity's pull away from the pose in the arm that it pulls most
+_OUTWEIGHS = 1.3  # relative to the largest destabilising gravity stiffness of all arms
 _FRICTIONS_PER_RADIAN = 1.5
-_TORQUE_SHARE = 0.35  # of the torque limit at a radian, at most, beyond what gravity needs
+_TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
 def needs_stabiliser(config: Config, belief: Belief) -> bool:
@@ -25,20 +25,20 @@ def needs_stabiliser(config: Config, belief: Belief) -> bool:
 
 
 def with_stabiliser(config: Config, belief: Belief) -> Config:
-    """The configuration with gains where it has none and needs some."""
+    """Add gains to a configuration that needs a stabiliser and has none."""
     if config.stabiliser is not None or not needs_stabiliser(config, belief):
         return config
     return config.model_copy(update={"stabiliser": proposed(config, belief)})
 
 
 def proposed(config: Config, belief: Belief) -> StabiliserConfig:
-    """Gains for the arms of `belief`."""
+    """Gains suitable for the arms of `belief`."""
     parameters = belief.parameters
     away = np.max([_pull_away(config, each) for each in parameters], axis=0)
     inertia = np.median([_inertia(config, each) for each in parameters], axis=0)
     friction, viscous = (np.median(_per_joint(config, parameters, name), axis=0) for name in ("coulomb", "viscous"))
     limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
-    # With both joints on springs of their own frequency the pair is slower than each; gravity comes on top.
+    # Two coupled joints on such springs oscillate more slowly than each alone; gravity is added.
     spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
     stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)
@@ -46,7 +46,7 @@ def proposed(config: Config, belief: Belief) -> StabiliserConfig:
 
 
 def gravity_stiffness(config: Config, parameters: dict[str, float]) -> Array:
-    """Torque by which gravity draws the arm back per angle from its rest pose (joints, joints) [N m/rad]."""
+    """Restoring torque of gravity per angle from the rest pose (joints, joints) [N m/rad]."""
     pose = np.array(config.arm.rest_pose)
     first = -parameters["gravity_1"] * np.sin(pose[0])
     if len(pose) == 1:
@@ -56,13 +56,13 @@ def gravity_stiffness(config: Config, parameters: dict[str, float]) -> Array:
 
 
 def _pull_away(config: Config, parameters: dict[str, float]) -> Array:
-    """Stiffness per joint (joints,) [N m/rad] that just outweighs gravity: its rows, coupling included."""
+    """Stiffness per joint (joints,) [N m/rad] that just outweighs gravity, coupling included."""
     away: Array = np.maximum(-gravity_stiffness(config, parameters), 0.0).sum(axis=1)
     return away
 
 
 def _inertia(config: Config, parameters: dict[str, float]) -> Array:
-    """Of each joint with the others free to follow as they are, in the rest pose (joints,) [kg m^2]."""
+    """Inertia of each joint in the rest pose (joints,) [kg m^2]."""
     if len(config.joints) == 1:
         return np.array([parameters["inertia_1"]])
     coupling = parameters["coupling"] * np.cos(config.arm.rest_pose[1])

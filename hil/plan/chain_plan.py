@@ -1,8 +1,8 @@
-"""Excitation of a spatial arm: a joint path, played as the feed-forward torque that its description gives.
+"""Excitation of a spatial arm: a joint path, played as the feed-forward torque computed from the arm's description.
 
-The stabiliser pulls towards the rest pose all the time. So that its spring and damper hold the arm to the path instead,
-what they will add is taken off beforehand: goal = feed-forward + stiffness (path - rest) + damping path velocity. The
-way from the rest pose to the path and back is part of what is played.
+The stabiliser always pulls towards the rest pose. To hold the arm to the path instead, its contribution is compensated
+in advance: goal = feed-forward + stiffness (path - rest) + damping path velocity. The transitions from the rest pose to
+the path and back are part of the plan.
 """
 
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ from hil.plan.plan import Plan, Segment, make_plan, plan_with
 
 Array = NDArray[np.float64]
 
-ARMATURE = 0.01  # kg m^2: what the feed-forward supposes of every rotor
-ROUGH_FRICTION = 0.02  # of a joint's largest torque: what the feed-forward supposes
-SLOW = 0.1  # rad/s: where the supposed friction turns round
-SETTLE_IN = 0.3  # s in which the feed-forward comes and goes
+ARMATURE = 0.01  # kg m^2, assumed by the feed-forward for every rotor
+ROUGH_FRICTION = 0.02  # relative to a joint's largest torque, assumed by the feed-forward
+SLOW = 0.1  # rad/s, width of the assumed friction's step
+SETTLE_IN = 0.3  # s, time over which the feed-forward is faded in and out
 
 
 @dataclass(frozen=True)
 class PathSegment(Segment):
-    """A path, its multisine being the torque that is played for it; `way` (samples, joints) [A] leads there."""
+    """A path; its multisine is the torque played for it. way, back: goals of the transitions (samples, joints) [A]."""
 
     way: Array
     back: Array
@@ -49,16 +49,16 @@ class PathSegment(Segment):
 
 @dataclass(frozen=True)
 class KnownChain:
-    """What the configuration says of an arm in space before anything is identified."""
+    """What the configuration says about a spatial arm before identification."""
 
     base: BaseParameters
     prior: Prior
     described: Array
-    """All parameters of the description (11 joints,) [SI]."""
+    """All inertial parameters of the description (11 joints,) [SI]."""
 
 
 def known_chain(config: Config) -> KnownChain:
-    """From the configuration's URDF; raises ArmFileError."""
+    """Read the arm from the configuration's URDF. Raises ArmFileError."""
     arm = described_arm(config)
     gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
     base = BaseParameters.of(Chain(*arm.geometry, gravity))
@@ -67,7 +67,7 @@ def known_chain(config: Config) -> KnownChain:
 
 
 def plan_of(config: Config) -> Plan:
-    """What this configuration's arm will play; raises ConfigError."""
+    """Make the plan of this configuration's arm. Raises ConfigError."""
     return make_chain_plan(config) if config.is_chain else make_plan(config)
 
 
@@ -77,9 +77,8 @@ def make_chain_plan(config: Config) -> Plan:
     if not config.is_fake:
         raise ConfigError(
             f"{config.path}: port.url = {config.port.url!r}: experiments on real spatial arms are not supported yet: "
-            "there is no collision check and no safe way to lower the arm after a stop. The fake arm can be "
-            "identified, and "
-            "`hil scan` and `hil check` work with real servos."
+            "there is no collision check and no safe way to lower the arm after a stop. Identify a fake arm "
+            "instead; `hil scan` and `hil check` work with real servos."
         )
     if config.joint_path is None or experiment.band is None:
         raise ConfigError(f"{config.path}: joint_path is missing: [joint_path] with centre, swing and speed per joint.")
@@ -125,7 +124,7 @@ def _segment(known: KnownChain, config: Config, role: str, seed: int) -> PathSeg
 
 
 def _torque(config: Config, known: KnownChain, path: Path, share: Array | float = 1.0) -> Array:
-    """To be played for a path (joints, samples) [N m], `share` of its feed-forward."""
+    """Torque to be played for a path (joints, samples) [N m], with this share of the feed-forward."""
     assert config.stabiliser is not None
     stiffness, damping = (np.array(each)[:, None] for each in (config.stabiliser.stiffness, config.stabiliser.damping))
     rest = np.array(config.arm.rest_pose)[:, None]
@@ -140,21 +139,19 @@ def _feed_forward(config: Config, known: KnownChain, path: Path) -> Array:
 
 
 def _check_torque(config: Config, known: KnownChain, path: Path) -> None:
-    """Check that the path leaves the motors headroom for errors of the description."""
+    """Check that the path leaves the motors headroom for errors of the description. Raises ConfigError."""
     peaks = np.abs(_feed_forward(config, known, path)).max(axis=1)
     for joint, peak in zip(config.joints, peaks.tolist(), strict=True):
         most = joint.goal_limit * joint.torque_per_goal
         if peak > 0.8 * most:
             raise ConfigError(
-                f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path but has "
-                f"{most:.3g}: "
-                "lower joint_path.speed or swing, or raise its current_limit."
+                f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path but has only "
+                f"{most:.3g}: lower joint_path.speed or swing, or raise its current_limit."
             )
 
 
 def _ways(config: Config, path: Path) -> tuple[Path, Path]:
-    """From the rest pose into the path, which runs on all the while, and out of it back: no joint leaves the range
-    between the two."""
+    """Transitions from the rest pose into the moving path and back; no joint leaves the range between the two."""
     count = max(2, round(config.experiment.ramp * config.experiment.rate))
     samples = path.position.shape[1]
     before, after = np.arange(-count, 0) % samples, np.arange(count) % samples
@@ -164,7 +161,7 @@ def _ways(config: Config, path: Path) -> tuple[Path, Path]:
 
 
 def _blended(config: Config, path: Path, at: NDArray[np.int64], s: Array, seconds: float) -> Path:
-    """Between the rest pose, at s = 0, and the path, at 1, smooth to the second derivative."""
+    """Blend of the rest pose (s = 0) and the path (s = 1) with continuous second derivatives."""
     share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
     slope = 30.0 * s**2 * (1.0 - s) ** 2 / seconds
     bend = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / seconds**2
@@ -178,7 +175,7 @@ def _blended(config: Config, path: Path, at: NDArray[np.int64], s: Array, second
 
 
 def _fade(count: int, rate: float) -> Array:
-    """From 0 to 1 in SETTLE_IN, then 1."""
+    """Smooth rise from 0 to 1 over SETTLE_IN, then 1."""
     s = np.clip(np.arange(max(2, count)) / (SETTLE_IN * rate), 0.0, 1.0)
     fade: Array = s * s * (3.0 - 2.0 * s)
     return fade

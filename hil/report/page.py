@@ -1,4 +1,4 @@
-"""The page: its sections in their order, one template, one style sheet, one script, all in one file."""
+"""The report page: all sections, rendered by one template into a single self-contained file."""
 
 from collections.abc import Callable
 from datetime import datetime
@@ -43,7 +43,7 @@ SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
 
 
 def write_report(data: RunData, path: Path) -> None:
-    """Write the report of a run; raises RunFolderError when it cannot be written."""
+    """Write the report of a run. Raises RunFolderError if it cannot be written."""
     page = make_page(data)
     temporary = path.with_name(path.name + ".partial")
     try:
@@ -54,7 +54,7 @@ def write_report(data: RunData, path: Path) -> None:
 
 
 def make_page(data: RunData) -> str:
-    """The whole HTML document."""
+    """Render the complete HTML document."""
     folder = files("hil.report")
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -71,10 +71,10 @@ def make_page(data: RunData) -> str:
 
 
 def sections(data: RunData) -> list[Section]:
-    """The sections whose data the run holds."""
+    """The sections for which the run has data."""
     return [section for make in SECTIONS if (section := make(data)) is not None]
 
 
 def _draw(figure: Figure) -> Markup:
-    """Both widths; the style sheet shows the one that fits."""
+    """Draw both widths; the style sheet shows the one that fits."""
     return Markup(draw_svg(figure, WIDE) + draw_svg(figure, NARROW))

@@ -1,4 +1,4 @@
-"""What would go wrong with a study, said before anything runs."""
+"""Checks of a study before anything runs."""
 
 import shutil
 from pathlib import Path
@@ -11,16 +11,16 @@ from hil.study.draw import arm_path, arm_values, drawn, put, run_count
 from hil.study.schema import ON_ARM, Study
 
 BYTES_A_ROW = 4_000
-"""Of Parquet, generously: some hundred columns."""
+"""Generous estimate of the Parquet size of one row [bytes], for about a hundred columns."""
 
 _SAMPLE_BYTES = 256
 _REPORT_BYTES = 1_500_000
 _LOOKED_AT = 32
-"""Runs whose values are put into the arm's file and checked, spread over the study."""
+"""Number of runs, spread over the study, whose values are inserted into the arm's file and checked."""
 
 
 def check_study(study: Study, out: Path) -> int:
-    """How many runs it has; raises ConfigError for a field that does not exist, a bad value, or too little disk."""
+    """Number of runs. Raises ConfigError for an unknown field, an invalid value, or insufficient disk space."""
     runs = run_count(study)
     if study.study.task in ON_ARM:
         step = max(1, runs // _LOOKED_AT)
@@ -42,7 +42,7 @@ def check_study(study: Study, out: Path) -> int:
 
 
 def arm_toml(study: Study, run: int) -> str:
-    """The arm's file with the values of this run; raises ConfigError for a key that leads nowhere."""
+    """The arm's file with the values of this run. Raises ConfigError for a key that does not exist."""
     if study.study.config is None:
         return ""
     values = arm_values(study)
@@ -58,7 +58,7 @@ def arm_toml(study: Study, run: int) -> str:
 
 
 def checked_arm(study: Study, run: int) -> Config:
-    """The arm's configuration of this run; raises ConfigError, which names the run and its values."""
+    """The arm's configuration of this run. Raises ConfigError, whose message names the run and its values."""
     try:
         return parse_config(arm_toml(study, run), arm_path(study))
     except ConfigError as error:
@@ -86,7 +86,7 @@ def _folder_bytes(config: Config) -> int:
 
 
 def _existing(path: Path) -> Path:
-    """The nearest folder above that is there."""
+    """The nearest existing parent folder."""
     for place in (path.absolute(), *path.absolute().parents):
         if place.exists():
             return place

@@ -1,4 +1,4 @@
-"""The workers: this machine's cores, a running Dask scheduler by its address, or a Slurm queue."""
+"""The workers of a study: local cores, a running Dask scheduler, or a Slurm queue."""
 
 import logging
 import os
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "HIL_THREADS"), "1"
 )
-"""A worker is one process with one thread: of BLAS, of numba, and of ours."""
+"""Environment that limits each worker process to one thread in BLAS, numba and hil."""
 
 _DASK: dict[str, Any] = {
     "distributed.worker.daemon": False,
@@ -34,15 +34,15 @@ _DASK: dict[str, Any] = {
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
-"""Of workers on one run, before it is given up: a machine that reboots is no fault of the run, memory that is never
-enough is."""
+"""Number of worker losses during one run before the run has failed: a machine may reboot several times, but a run that
+needs too much memory never ends."""
 
 
 @contextmanager
 def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> Iterator["Client"]:
-    """A connected Dask client. scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
+    """Connect to a Dask cluster; scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
 
-    Raises MissingExtra without Dask, ConfigError where no scheduler answers, no worker is there, or a worker runs other
+    Raises MissingExtra without Dask, and ConfigError if no scheduler answers, there is no worker, or a worker has other
     versions.
     """
     try:
@@ -74,7 +74,7 @@ def _silence() -> None:
 
 @contextmanager
 def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator[Any]:
-    """What a client connects to; what was started here is closed again."""
+    """Start or find a cluster; yields what a client connects to, and closes what was started here."""
     memory = f"{engine.worker_memory_gib:g}GiB"
     if scheduler is None:
         with _local(count, memory) as cluster:
@@ -139,7 +139,7 @@ def _package_versions() -> dict[str, str]:
 
 
 def _check_versions(client: "Client", scheduler: str | None) -> None:
-    """Other versions make other numbers, so they are refused by name."""
+    """Refuse workers with other package versions, which would give different numbers."""
     try:
         client.wait_for_workers(1, timeout=600 if scheduler == "slurm" else 60)
     except TimeoutError as error:

@@ -1,4 +1,4 @@
-"""A study from its file to its rows: specifications out to the workers, rows back into the dataset."""
+"""Run a study: send specifications to the workers and write the returned rows to the dataset."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ DEFAULT_COLUMNS["estimate"] = (*DEFAULT_COLUMNS["identify"], "recording", "confi
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """How far it is. failed: runs that ended in an error, of those done. dashboard: the engine's own page."""
+    """Progress of a study; failed: number of runs that ended in an error; dashboard: URL of Dask's dashboard."""
 
     done: int
     runs: int
@@ -70,7 +70,7 @@ def run_study(
 
 
 def specifications(study: Study, out: Path, numbers: list[int]) -> Iterator[Spec]:
-    """What each run is given, made as it is needed."""
+    """Yield the specification of each run, created on demand."""
     columns = tuple(study.keep.columns or DEFAULT_COLUMNS[study.study.task])
     found = recordings(study) if study.study.task == "estimate" else []
     for run in numbers:
@@ -93,7 +93,7 @@ def specifications(study: Study, out: Path, numbers: list[int]) -> Iterator[Spec
 def _work_through(
     client: "Client", study: Study, out: Path, numbers: list[int], dataset: Dataset, runs: int, watch: Watch
 ) -> None:
-    """Keep every worker supplied, and write rows as they come; what has come is written whatever ends this."""
+    """Write the rows as they arrive; rows received are written even after an error."""
     specs = ((spec.run, spec) for spec in specifications(study, out, numbers))
     rows: list[Row] = []
     done, failed, began, written = runs - len(numbers), _failed(dataset), time.monotonic(), time.monotonic()

@@ -1,4 +1,4 @@
-"""One run of a study, done by a worker: from its specification to one flat row. Whatever goes wrong is a row too."""
+"""One run of a study, done by a worker: turns a specification into one flat row, even if the run fails."""
 
 import ctypes
 import io
@@ -24,7 +24,7 @@ Cell = bool | int | float | str | None
 Row = dict[str, Cell]
 
 TIMINGS = ("seconds", "cpu_seconds", "worker")
-"""Columns that differ from machine to machine; all others are the same whoever works."""
+"""Columns that depend on the machine; all others are the same on every worker."""
 
 
 _STATE = "XDG_STATE_HOME"
@@ -35,7 +35,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 @dataclass(frozen=True)
 class Spec:
-    """What a worker needs for one run.
+    """Specification of one run.
 
     toml: the arm's file with this run's values in it, or "". versions: what the worker must have. seconds: processor
     time after which the run has failed. recording: the run folder to estimate, or None. keep_in: where the run folder
@@ -63,7 +63,7 @@ class OutOfTime(Exception):
 
 
 def work(spec: Spec) -> Row:
-    """Do the run; its row. Nothing is raised but what stops the process (KeyboardInterrupt, SystemExit)."""
+    """Do one run and return its row. Raises only KeyboardInterrupt and SystemExit."""
     with _ONE_AT_A_TIME:
         row = _row_of(spec)
         began, used = time.perf_counter(), time.process_time()
@@ -130,7 +130,7 @@ def _at_most(seconds: float) -> Iterator[None]:
 
 
 def flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Cell]]:
-    """Names with dots and plain values of nested dictionaries; lists by number, nothing longer than a few entries."""
+    """Flatten nested dictionaries and short lists to (dotted name, plain value) pairs."""
     if isinstance(value, Mapping):
         for key, entry in value.items():
             yield from flat(entry, f"{prefix}.{key}" if prefix else str(key))
@@ -143,7 +143,7 @@ def flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Cell]]:
 
 
 _MOST_ENTRIES = 8
-"""A longer list (a covariance, a spectrum) is no figure of a row."""
+"""Longest list that is flattened; longer ones (a covariance, a spectrum) are left out."""
 
 
 def _kept(name: str, columns: tuple[str, ...]) -> bool:

@@ -1,4 +1,4 @@
-"""The adapter's latency timer, on a sysfs made of files."""
+"""The adapter's latency timer, with a sysfs made of ordinary files."""
 
 import os
 from pathlib import Path

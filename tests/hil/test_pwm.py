@@ -1,4 +1,4 @@
-"""Arms driven by voltage: what their configuration says, and what is played."""
+"""Voltage-driven arms: their configuration and experiment."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -68,7 +68,7 @@ def test_a_dry_run_knows_what_turning_motors_generate(arm_file: ArmFile, tmp_pat
     foreseen = predict(config, plan, prior_ensemble(config, 48))
     seen = run_on(config, Amplitude(plan, plan.segments[0].peak_torque, foreseen), tmp_path)
     assert seen is not None and is_within(config, seen, foreseen.quantile)
-    # Without back-EMF the elbow would be foreseen to turn several times as fast.
+    # Without back-EMF, the predicted speed of the elbow would be several times higher.
     assert (foreseen.median[2] < 2.0 * seen[2]).all()
     assert quantities_of(config)[3] == ("voltage", "V") and foreseen.limits[3].tolist() == [8.0, 8.0]
 
@@ -113,7 +113,7 @@ def test_an_arm_driven_by_voltage_is_identified(arm_file: ArmFile, tmp_path: Pat
         ("rate = 400.0 ", "rate = 200.0 "),
         ("period = 2.0 ", "period = 6.0 "),
         ("band = [0.5, 6.0]", "band = [0.17, 6.0]"),
-        # Back-EMF damps so strongly that the arm creeps into its periodic motion.
+        # Back-EMF damps so strongly that the arm approaches its periodic motion slowly.
         ("[experiment]\n", "[experiment]\nheld_out = false\nmax_settling_periods = 8\n"),
     ):
         assert old in text

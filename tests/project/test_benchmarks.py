@@ -1,4 +1,4 @@
-"""The scripts behind the printed figures still start: each one's --help imports all that it measures."""
+"""All benchmark scripts start: their --help imports everything they use."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""A CSV file with named columns as a recording in SI units."""
+"""Reader for a CSV file with named columns; gives a recording in SI units."""
 
 import csv
 from pathlib import Path
@@ -15,8 +15,10 @@ Values = NDArray[np.float64]
 
 
 def read_csv(path: Path, columns: Columns) -> Recording:
-    """The recording in `path`; raises CsvError for columns that are missing and fields that are not numbers, and
-    RecordingError for data that cannot be a recording in these units. An empty field or `nan` is a missing value.
+    """Read the recording in `path`. An empty field or `nan` is a missing value.
+
+    Raises CsvError for missing columns and fields that are not numbers, and RecordingError for data that cannot be a
+    recording in these units.
     """
     read = _read(path)
     time = _column(path, read, columns.time) * TIME_UNITS[columns.time_unit]
@@ -39,7 +41,7 @@ def _torque(path: Path, read: dict[str, Values], columns: Columns) -> Values:
 def _read(path: Path) -> dict[str, Values]:
     try:
         if path.stat().st_size > MOST_CSV_BYTES:
-            raise CsvError(f"{path}: is larger than {MOST_CSV_BYTES // 2**20} MB, the most that is read. Split it.")
+            raise CsvError(f"{path}: is larger than {MOST_CSV_BYTES // 2**20} MB, the maximum. Split it.")
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file)
             header = [name.strip() for name in next(reader, [])]
@@ -60,7 +62,7 @@ def _read(path: Path) -> dict[str, Values]:
             try:
                 numbers[k, i] = float(field) if field.strip() else np.nan
             except ValueError:
-                # Only a column that is used needs numbers: a remark beside them is no fault.
+                # Unused columns may hold text; only used columns are checked for numbers.
                 numbers[k, i] = np.inf
     return dict(zip(header, numbers.T, strict=True))
 
@@ -76,7 +78,7 @@ def _column(path: Path, read: dict[str, Values], name: str) -> Values:
 
 
 def _steps(position: Values) -> Values:
-    """The encoder's step (joints,) as the smallest difference that recurs; a millionth of the swing if none does."""
+    """Encoder step of each joint (joints,) [rad]: the smallest recurring difference, or a millionth of the swing."""
     steps = []
     for row in position:
         finite = row[np.isfinite(row)]

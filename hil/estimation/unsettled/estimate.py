@@ -1,4 +1,4 @@
-"""Estimates from recordings that hold no settled period: CSV files, and runs that were cut short."""
+"""Estimates from recordings without a settled period: CSV files, and runs that were cut short."""
 
 import logging
 import time
@@ -29,12 +29,12 @@ from hil.runs.run_folder import RunFolder
 
 log = logging.getLogger(__name__)
 
-START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
+START_CUTOFF = 8.0  # Hz, filter of the inverse dynamics that give the initial guess
 START_WIDTH = 0.05  # rad/s
 
 
 def estimate_csv(paths: Sequence[Path], config_path: Path) -> ShootingResult:
-    """The result of one or more CSV files of the same arm, recorded apart. Raises HilError, EstimationError."""
+    """Estimate from one or more CSV files of the same arm. Raises HilError, EstimationError."""
     config = load_csv_config(config_path)
     columns = config.columns
     recordings = [read_csv(path, columns) for path in paths]
@@ -51,7 +51,7 @@ def estimate_csv(paths: Sequence[Path], config_path: Path) -> ShootingResult:
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
-    """The result of all samples of a run whose motion never became periodic, or that was stopped before it did."""
+    """Estimate from all samples of a run that never became periodic or was stopped before it did."""
     config, facts = run.load_config(), run.load_facts()
     only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
@@ -86,7 +86,7 @@ def _estimate(
         )
         estimate = choice.estimate
     else:
-        # The encoders' zeros are each recording's own here.
+        # Encoder zeros are estimated for each recording instead.
         model = wanted_model(wanted, recordings[0].joints).without("zeros")
         estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     result = make_shooting_result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3))
@@ -100,7 +100,10 @@ def _estimate(
 def make_shooting_result(
     estimate: ShootingEstimate, recordings: Sequence[Recording], shown_path: str, seconds: float
 ) -> ShootingResult:
-    """The result of multiple shooting. shown_path: the configuration's path. seconds: how long the estimation took."""
+    """Build the result of multiple shooting.
+
+    shown_path: the configuration's path, as shown to the user. seconds: duration of the estimation [s].
+    """
     base = len(estimate.model.base_names)
     entries = [
         (name, Quantity(float(value), float(std), unit))
@@ -113,8 +116,7 @@ def make_shooting_result(
     )
     return ShootingResult(
         method=f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
-        f"initial states; {estimate.model.description}; standard errors robust "
-        "against model error",
+        f"initial states; {estimate.model.description}; standard errors robust against model error",
         config=shown_path,
         joints=estimate.model.joints,
         parameters=dict(entries[:base]),

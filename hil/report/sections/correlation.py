@@ -1,4 +1,4 @@
-"""Which parameters the data hardly separate."""
+"""Section on parameters that the data hardly separate."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ STRONG = 0.9
 
 
 def correlation(data: RunData) -> Section | None:
-    """Present if the result has parameters."""
+    """The section; None if the result has no parameters."""
     names = data.result.covariance.names
     if not names:
         return None

@@ -1,4 +1,4 @@
-"""The seed paper's method: what its print says, what is right, and how much lies between."""
+"""The seed paper's method: the printed version, the corrected one, and the difference between them."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def test_a_period_too_short_for_the_lines_is_refused() -> None:
 
 
 def test_undamped_poles_are_imaginary_so_that_nothing_settles() -> None:
-    """The paper's "exponentially": the poles of its own arm have no real part (docs/paper.md)."""
+    """The paper claims exponential convergence, but the poles of its own arm have no real part (docs/paper.md)."""
     arm = PaperArm()
     squared = np.linalg.eigvals(-np.linalg.inv(arm.mass_matrix()) @ arm.stiffness())
     assert np.all(squared.real < 0.0) and np.abs(squared.imag).max() < 1e-12

@@ -1,4 +1,4 @@
-"""Reversed columns are found and named on a real arm's recording; a recording as it should be raises no suspicion."""
+"""Reversed columns are found and named; a recording with correct signs raises no suspicion."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from tests.support.paths import CONFIGS, DATA
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    """Both joints driven, four and ten rad/s."""
+    """Return a recording with both joints excited, at four and ten rad/s."""
     columns = load_csv_config(CONFIGS / "recordings" / "dfki_double_pendulum.toml").columns
     return read_csv(DATA / "dfki_double_pendulum" / "c1_sinusoids_143601.csv", columns)
 

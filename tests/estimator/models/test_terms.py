@@ -1,4 +1,4 @@
-"""The registry of terms: what fits, results, reports, exports and the configuration take from it."""
+"""The registry of terms, as used by fits, results, reports, exports and the configuration."""
 
 from typing import get_args
 

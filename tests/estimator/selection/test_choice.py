@@ -1,4 +1,4 @@
-"""Friction chosen by what it predicts, robustness, intervals and verdict, on arms that the estimator did not write."""
+"""Friction model selection by prediction, robustness, intervals and verdict, on independently simulated arms."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +35,7 @@ def test_the_plain_model_is_kept_where_nothing_more_is_true(
     choice = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay")
     assert choice.estimate.model == Model(2, "coulomb", "delay")
     assert choice.gained == 1.0 and choice.cost == pytest.approx(1.0)
-    # A start that leads nowhere is counted, so it was taken, and costs the result nothing.
+    # An initial guess that fails is counted, which shows that it was used, and does not affect the result.
     astray = {name: 0.1 * value for name, value in base_parameters(ideal_arm).items()}
     again = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay", starts=[astray])
     first, second = again.trials[0].estimate, choice.trials[0].estimate
@@ -79,7 +79,7 @@ def test_a_wild_reading_costs_nothing(ideal_arm: Arm, ideal_period: SettledPerio
     position[0, wild] += 1.0
     spiked = replace(ideal_period, position=position)
     left_out = np.flatnonzero(~without_spikes(spiked).valid[0])
-    # Two steps away from a wild reading the median itself is off by a sample's motion.
+    # Two samples from an outlier, the median itself is off by the motion of one sample.
     assert set(wild) <= set(left_out) and left_out.size <= 3 * wild.size
     estimate = identify(spiked, Model(2))
     assert worst(estimate.parameters, ideal_arm) < 0.002

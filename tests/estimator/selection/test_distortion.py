@@ -1,4 +1,4 @@
-"""Odd and even distortion where nothing was driven, and what a model leaves of it."""
+"""Odd and even distortion on unexcited lines, and the part of it that a model does not explain."""
 
 from collections.abc import Callable
 

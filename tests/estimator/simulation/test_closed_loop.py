@@ -1,4 +1,4 @@
-"""The closed loop's simulation against the open one's, and excitation by design against plain."""
+"""The closed-loop simulation compared with the open-loop one, and designed compared with plain excitation."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Forward sensitivities against differences of the simulation itself, every parameter at once."""
+"""Forward sensitivities compared with finite differences of the simulation, for all parameters at once."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_derivatives_are_those_of_the_simulation(bristles: dict[str, float]) -> 
     values = {**ARM, **START, **bristles}
     start = np.array(list(START.values())).reshape(2, 2)
     motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=Physics.of(ARM).lags)
-    # With bristles no step over the velocity has a width, without them they have no stiffness.
+    # With bristles there is no width of the Coulomb step; without them there is no stiffness.
     absent = "coulomb_width" if bristles else "presliding"
     causes = tuple(cause for cause in CAUSES if not cause.startswith(absent))
     motion = sensitive(Physics.of(values))(Physics.of(values), start, causes, 1.0 / (RATE * STEPS))

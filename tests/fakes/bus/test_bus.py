@@ -1,4 +1,4 @@
-"""The wire: when bytes are where, who answers whom, groups, broadcasts, noise and collisions. Two servos at 1 Mbaud."""
+"""The wire: timing of bytes, who replies, groups, broadcasts, noise and collisions. Two servos at 1 MBd."""
 
 from collections.abc import Callable
 from typing import Any
@@ -162,13 +162,13 @@ def test_goal_and_state_in_one_write(bench: Any) -> None:
     start = bench.clock.now()
     bench.bus.write(goals + sync_read(126, 10, 1, 2))
     raw = bench.bus.read(42, 1.0)
-    assert bench.clock.now() - start == pytest.approx(78 * BYTE_S, abs=1e-12)  # as counted in the field
+    assert bench.clock.now() - start == pytest.approx(78 * BYTE_S, abs=1e-12)  # as observed on a real bus
     first, second = Framer().feed(raw)
     assert [int.from_bytes(p.data[:2], "little", signed=True) for p in (first, second)] == [100, -100]
 
 
 def test_fast_sync_read_is_the_manuals_packet() -> None:
-    """The example of page protocol2: three XC330-T288 in the order 3, 7, 4 at positions 166, 2079 and 1023."""
+    """The example on page protocol2: three XC330-T288 in the order 3, 7, 4 at positions 166, 2079 and 1023."""
 
     class Still:
         joints = 3

@@ -1,7 +1,7 @@
-"""The servo's control table against a reference as plain as it can be: a dictionary and the manual's rules.
+"""The servo's control table compared with a minimal reference: a dictionary and the manual's rules.
 
-hypothesis makes up sequences of reads, writes, registered writes, torque, reboots and resets, and looks for one after
-which the two differ.
+hypothesis generates sequences of reads, writes, registered writes, torque, reboots and resets, and searches for one
+after which the two differ.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ from hil.fakes.servo.servo import BOOT_S, Servo
 from tests.fakes.conftest import FreeInertia
 
 GOALS = {"Goal PWM": "PWM Limit", "Goal Current": "Current Limit", "Goal Velocity": "Velocity Limit"}
-# What time, joint or bus change: not the table's affair. ID and Baud Rate: the machine would lose its servo.
+# Left out: registers that time, joint or bus change; ID and Baud Rate, after which the servo would not respond.
 LEFT_OUT = ("Present", "Realtime", "Moving Status", "Moving", "ID", "Baud Rate", "Velocity Traj", "Position Traj")
 LEFT_OUT += (
     "Indirect",

@@ -1,4 +1,4 @@
-"""Warmth, overload, the supply, the servo's own clock, the current sensor's noise."""
+"""Heating, overload, the supply, the servo's own clock, the current sensor's noise."""
 
 import statistics
 from collections.abc import Callable
@@ -41,7 +41,7 @@ def test_a_current_held_too_long_is_an_overload(make_bench: Make) -> None:
     bench.arm(goal_ticks=250)
     bench.wait(0.9)
     bench.write(1, 102, 50, 2)
-    bench.wait(0.5)  # it forgets as fast as it counts
+    bench.wait(0.5)  # the timer runs down as fast as it runs up
     bench.write(1, 102, 250, 2)
     bench.wait(0.5)
     assert bench.servo().torque_enabled

@@ -1,4 +1,4 @@
-"""Operating modes: does a move look right, do gains, limits and profiles do what they say."""
+"""Operating modes: whether a move is realistic, and whether gains, limits and profiles have the documented effect."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +19,7 @@ RPM = 0.229 * math.tau / 60  # rad/s per tick of velocity
 
 
 class Shaft:
-    """A motor that turns an inertia with some friction, ideal current loop."""
+    """A motor with an ideal current loop that turns an inertia with some friction."""
 
     joints = 1
 
@@ -40,7 +40,7 @@ class Shaft:
 
 
 class Rig:
-    """One servo on a shaft; writes registers by name, watches it over time."""
+    """One servo on a shaft; writes registers by name and simulates it over time."""
 
     def __init__(self, mode: int, model: str = "XM430-W350", **registers: int) -> None:
         self.clock = VirtualClock()

@@ -1,4 +1,4 @@
-"""Dry runs: what they foresee, what they allow, and the command around them."""
+"""Dry runs: their predictions, the torque they allow, and the command."""
 
 import json
 from collections.abc import Callable
@@ -45,7 +45,7 @@ def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known
 
 
 def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_file: Callable[..., Path]) -> None:
-    path = arm_file()  # the hanging one's place
+    path = arm_file()  # overwritten by the horizontal arm
     text = (CONFIGS / "fake_horizontal.toml").read_text(encoding="utf-8")
     for old, new in (KNOWN, ("period = 10.0 ", "held_out = false\nperiod = 4.0 "), ("[0.30, 0.18]", "[0.15, 0.09]")):
         assert old in text, old

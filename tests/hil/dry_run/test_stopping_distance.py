@@ -1,6 +1,4 @@
-"""How far an arm goes beyond its limits when it is stopped, against the fake arm's plant, which is another program than
-the prediction.
-"""
+"""Predicted overshoot of a stopped arm, compared with the independent plant of the fake arm."""
 
 from functools import cache
 from itertools import product
@@ -35,7 +33,7 @@ def close_config(*changes: tuple[str, str]) -> Config:
 
 @cache
 def fake_itself() -> Ensemble:
-    """The one arm that the fake is, by the model's parameters."""
+    """An ensemble with only the fake arm, described by the model's parameters."""
     arm = close_config().fake.arm  # type: ignore[union-attr]
     assert arm is not None
     known = base_parameters(arm) | {"lag": arm.drives[0].current_lag}
@@ -57,7 +55,7 @@ def plant_of(config: Config, pose: np.ndarray, speed: np.ndarray) -> TwoLink:
 
 
 def seen_beyond(config: Config, plant: TwoLink, current: np.ndarray) -> np.ndarray:
-    """Ways beyond the limits when torque is cut two samples after a limit was passed under `current` [A]."""
+    """Overshoot when torque is cut two samples after a limit was exceeded under `current` [A]."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     beyond = np.zeros(2)
     for sample in range(round(LONGEST_S * config.experiment.rate)):
@@ -109,7 +107,7 @@ def test_the_ways_of_stopping_in_their_order() -> None:
 
 
 def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
-    """The motion beyond it will not be played; the guard stops the arm."""
+    """Motion beyond a limit is never played, because the guard stops the arm there."""
     config = close_config()
     harder = scaled(config, make_plan(config), np.array([2.1, 1.4]))
     moved = respond(

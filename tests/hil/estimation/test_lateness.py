@@ -1,4 +1,4 @@
-"""A computer that is late costs nothing as long as it says how late it was."""
+"""Recorded lateness of the computer has no effect on the estimate."""
 
 from collections.abc import Callable
 from pathlib import Path

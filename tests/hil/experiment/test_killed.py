@@ -1,4 +1,4 @@
-"""SIGKILL in the middle of an experiment: only the servos' own watchdogs are left. benchmarks/kills.py does fifty."""
+"""SIGKILL during an experiment: only the servos' own watchdogs remain. benchmarks/kills.py repeats it fifty times."""
 
 from pathlib import Path
 

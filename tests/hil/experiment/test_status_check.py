@@ -1,4 +1,4 @@
-"""What servos tell of themselves: each thing that can be wrong, and what is nothing out of the ordinary."""
+"""Status registers of the servos: every fault is detected, and normal values are accepted."""
 
 from collections.abc import Callable
 
@@ -50,7 +50,7 @@ def test_a_goal_may_get_lost_once_but_not_twice_in_a_row(arm: Arm) -> None:
 
 
 def readings(check: StatusCheck, clock: Callable[[float], float], until: float) -> tuple[float, str] | None:
-    """Every 35 ms; when it is seen that replies are not of now."""
+    """Readings every 35 ms; returns when stale replies are detected, and the message."""
     for index in range(int(until / 0.035)):
         now = 0.035 * index
         wrong = check.look_at_clock(0, clock(now), now)

@@ -1,4 +1,4 @@
-"""What a run teaches of the arm, moved or not; gains for arms without a stable rest; when to give up."""
+"""Belief updates from runs with and without motion, stabiliser gains, and when the search gives up."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def config() -> Config:
 
 
 def commands(config: Config, peak: tuple[float, float]) -> np.ndarray:
-    """Ramp and one period of a pilot (joints, samples) [N m]."""
+    """Torque of the ramp and one period of a pilot (joints, samples) [N m]."""
     pilot = with_torque(pilot_config(config), np.array(peak))
     segment = make_plan(pilot).segments[0]
     constants = np.array([joint.torque_per_goal for joint in config.joints])
@@ -100,4 +100,4 @@ def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tm
     ) as error:
         identify_in_steps(held, RunFolder.create(tmp_path / "run", held), path, lambda _: None, said.append)
     assert "current limits allow" in str(error.value) and "stronger servo" in str(error.value)
-    assert any("did not move: friction exceeds this torque" in line for line in said)
+    assert any("did not move: friction is larger than this torque" in line for line in said)

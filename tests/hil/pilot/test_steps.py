@@ -1,4 +1,4 @@
-"""Pilot, then full, from joint limits and link lengths only; and arms that need a stabiliser."""
+"""Pilot and full run from joint limits and link lengths only, and arms that need a stabiliser."""
 
 from io import StringIO
 from pathlib import Path
@@ -32,7 +32,7 @@ def in_steps(tmp_path_factory: pytest.TempPathFactory) -> tuple[SettledResult, P
 
 
 def used_range(result: SettledResult) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Share of each joint's position limits that the full run used (joints,)."""
+    """Fraction of each joint's position range that the full run used (joints,)."""
     low, high = np.array(result.steps[-1].seen)[:2] if result.steps else np.zeros((2, 2))
     limits = [joint.position_limit for joint in load_config(CONFIGS / "first_time.toml").joints]
     return np.asarray((high - low) / np.ptp(limits, axis=1))

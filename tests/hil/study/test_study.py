@@ -1,4 +1,4 @@
-"""A study from its file to its rows, on real workers: the same numbers whatever their number, failures as rows."""
+"""Complete studies on real workers: the results do not depend on their number, and failures become rows."""
 
 from pathlib import Path
 
@@ -93,7 +93,7 @@ def test_the_command_makes_rows_and_a_page(
     study_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # A run whose arm passes its limits fails: a row, and not the end of the study.
+    # A run whose arm exceeds its limits becomes a failed row and does not end the study.
     text = STUDY.replace('"safety.max_missing" = [5, 5, 5, 1]', '"joints.0.velocity_limit" = [15.0, 0.5]')
     study_file.write_text(text.replace("runs = 4", "runs = 2"), encoding="utf-8")
     assert hil("study", study_file, "--out", "out", "--workers", "1") == 0
