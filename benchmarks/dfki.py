@@ -13,8 +13,8 @@ half a second near the upright pose multiplies that by ten. Hence two comparison
 reader of the file would; for `swing_up_zeroed`, the two zeros of each half of a swing-up are fitted to the other half
 with fixed parameters, and the better of the two results counts for IDIM-LS.
 
---floor asks what stands between these predictions and none at all, and for that alone looks at what is predicted: zeros
-from the very swing-up, parameters fitted to the swing-ups, and to all recordings together.
+--floor estimates how much of the error is unavoidable, using the predicted data themselves: encoder zeros
+fitted to each swing-up, and parameters fitted to the swing-ups or to all recordings together.
 """
 
 import argparse

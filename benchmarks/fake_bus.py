@@ -33,7 +33,7 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.plants.two_link import TwoLink
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
@@ -119,7 +119,8 @@ def cycle_us(servos: int, cycles: int = 4000, repeats: int = 5) -> float:
     """One control cycle of the bus with this many servos and a trivial plant; median over the repeats [us]."""
     clock = VirtualClock()
     members = [
-        Servo(load_model("XM430-W350"), number, registers={"Operating Mode": 0}) for number in range(1, servos + 1)
+        EmulatedServo(load_model("XM430-W350"), number, registers={"Operating Mode": 0})
+        for number in range(1, servos + 1)
     ]
     bus = FakeBus(members, Free(servos), clock)
     ids = range(1, servos + 1)

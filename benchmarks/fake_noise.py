@@ -17,7 +17,7 @@ from hil.drivers.packet import BROADCAST_ID, Framer, Instruction, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 ASK_EVERY = 10
 PAUSE_S = 3.0  # longer than a reboot or the longest reply at the lowest baud rate
@@ -40,7 +40,9 @@ class NoiseRun:
     def __init__(self, seed: int) -> None:
         self.random = Random(seed)
         self.clock = VirtualClock()
-        self.servos = [Servo(load_model(name), number) for number, name in ((1, "XM430-W350"), (2, "XL330-M288"))]
+        self.servos = [
+            EmulatedServo(load_model(name), number) for number, name in ((1, "XM430-W350"), (2, "XL330-M288"))
+        ]
         self.bus = FakeBus(self.servos, Still(), self.clock)
         self.sent = self.asked = self.answered = 0
 

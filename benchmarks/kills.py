@@ -5,11 +5,11 @@
 105 ms after each kill, the servos are read over the same terminal: each Bus Watchdog must have tripped and each Goal
 Current must be 0. The 5 ms allow for this computer's scheduling; an earlier read would restart the watchdog.
 
-Every kill meets an arm of its own that hangs at rest: dry friction may hold one that was killed in mid-motion so far
-from its rest pose that the next experiment rightly refuses to start. A kill tells nothing where the experiment had
-ended by itself (a busy computer kept it from its deadlines) or where the question came later than 120 ms after it; it
-is then repeated, and the campaign fails when that happens again and again. Where it is permitted, the fake has
-real-time priority: real servos do not wait for this computer's other programs.
+Each kill uses a new arm that hangs at rest, because friction may hold an arm that was killed in motion so far from
+its rest pose that the next experiment refuses to start. A kill does not count if the experiment had already ended by
+itself (a busy computer missed its deadlines) or if the servos answered later than 120 ms after it. It is then
+repeated, and the campaign fails if that happens too often. The fake arm gets real-time priority if permitted: real
+servos do not wait for this computer's other programs.
 """
 
 import argparse

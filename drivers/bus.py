@@ -190,7 +190,7 @@ class ServoBus:
             if number != servo.table.number:
                 found = model_names().get(number, f"model number {number}")
                 raise WrongModel(
-                    f"{joint.title}: a {found} answers at ID {joint.id}, where the configuration has a "
+                    f"{joint.title}: a {found} answers at ID {joint.id}, but the configuration has a "
                     f"{joint.servo.name}. Correct `model` or `id` in the configuration, or change the servo's ID."
                 )
             firmware = servo.read("Firmware Version")
@@ -345,7 +345,7 @@ class ServoBus:
             error = self._servos[drive].hardware_error()
             cause = describe_error(error)
         except DriverError as problem:
-            return fault_text(drive, f"unknown, it could not be read ({problem})")
+            return fault_text(drive, f"unknown; it could not be read ({problem})")
         return fault_text(drive, cause) if alone or error else ""
 
     @contextmanager

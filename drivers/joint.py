@@ -52,12 +52,12 @@ class Joint:
 
     @property
     def position_unit(self) -> float:
-        """rad of joint angle per tick, with the joint's sign."""
+        """Joint angle per tick [rad], with the joint's sign."""
         return self.direction * self.servo.position_unit
 
     @property
     def velocity_unit(self) -> float:
-        """rad/s of joint velocity per tick, with the joint's sign."""
+        """Joint velocity per tick [rad/s], with the joint's sign."""
         return self.direction * VELOCITY_UNIT
 
     def drive_unit(self, supply_voltage: float) -> float:

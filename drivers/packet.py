@@ -108,7 +108,7 @@ def stuff(payload: bytes) -> bytes:
 
 
 def unstuff(payload: bytes) -> bytes:
-    """Undo `stuff`."""
+    """Return the payload without the bytes inserted by `stuff`."""
     return payload.replace(_STUFFED + b"\xfd", _STUFFED)
 
 

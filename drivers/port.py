@@ -245,7 +245,7 @@ def _advice(error: BaseException) -> str:
     if "Permission denied" in text:
         return "Add yourself to the port's group (`sudo usermod -aG dialout $USER`), then log out and in again."
     if "exclusively lock" in text:
-        return "Another program has it open: close that one first."
+        return "Another program has it open; close that program first."
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."
     return ""

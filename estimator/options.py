@@ -94,7 +94,7 @@ class LikelihoodOptions:
     """
 
     ftol: float = 1e-5
-    """Tolerance at the end; the remaining gain is worth a tenth of a standard error over all parameters together."""
+    """Final tolerance; the remaining gain corresponds to a tenth of a standard error, over all parameters together."""
     ftol_refine: float = 3e-4
     """Tolerance while candidate minima are compared."""
     ftol_start: float = 3e-3
@@ -235,4 +235,4 @@ class SelectionOptions:
     It is lenient because the test only finds the ripple's period roughly; a fit that includes the ripple explains more.
     """
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
-    """Significance levels, tried in turn until the motion is explained as well."""
+    """Significance levels for removing terms, tried in turn until the reduced model explains the motion as well."""

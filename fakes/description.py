@@ -19,7 +19,7 @@ from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_chain, ma
 from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.toml_errors import describe
 
 
@@ -52,7 +52,7 @@ class FakeServo(BaseModel):
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
     senses_supply: Annotated[
         bool | None,
-        Field(description="whether Present Current is the supply's instead of the motor's; by default as in its model"),
+        Field(description="whether Present Current is the supply current, not the motor's; default: as its model"),
     ] = None
     encoder: Annotated[Encoder, Field(description="errors of Present Position; none by default")] = PERFECT
     clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="clock error; positive: fast [ppm]")] = 0.0
@@ -218,7 +218,7 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     Raises PlantError if a custom plant is described and cannot be created.
     """
     servos = [
-        Servo(
+        EmulatedServo(
             load_model(servo.model, servo.firmware),
             servo.id,
             zero_ticks=servo.zero_ticks,

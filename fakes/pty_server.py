@@ -39,7 +39,7 @@ class LinkError(OSError):
     """The path of the symbolic link cannot be used. The message gives the reason and the remedy."""
 
 
-class Clock:
+class ServerClock:
     """The machine's monotonic clock minus the time lost. Only the server itself waits on it."""
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class PtyServer:
 
     def __init__(self, description: FakeArm, link: Path | None = None) -> None:
         self.lock = Lock()
-        self._clock = Clock()
+        self._clock = ServerClock()
         self.bus: FakeBus = make_bus(description, self._clock)
         self.path = ""
         self._link = link

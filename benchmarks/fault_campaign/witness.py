@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.fakes.bus.bus import FakeBus
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
@@ -30,7 +30,7 @@ class Witness:
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant
-        self._servos: tuple[Servo, ...] = bus._servos
+        self._servos: tuple[EmulatedServo, ...] = bus._servos
         self._next = bus.time + STEP_S
         self._rows: list[list[tuple[Any, ...]]] = []
         self.joints = bus.plant.joints
@@ -69,7 +69,7 @@ class Witness:
         return np.array(self._rows, dtype=RECORD).reshape(-1, self.joints)
 
 
-def _told(servo: Servo) -> tuple[bool, bool, int]:
+def _told(servo: EmulatedServo) -> tuple[bool, bool, int]:
     """Whether the servo drives its motor, whether torque is on, and the goal in its mode [ticks]."""
     memory = servo.memory
     torque = memory.get("Torque Enable") == 1

@@ -84,7 +84,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     drive_mode = servo.read("Drive Mode")
     if drive_mode & ~TIME_BASED_PROFILE:
         raise WrongSetting(
-            f"{joint.title}: Drive Mode is {drive_mode}, it must be 0 (no reverse, no torque on by goal "
+            f"{joint.title}: Drive Mode is {drive_mode} but must be 0 (no reverse, no torque on by goal "
             "update). Set it with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
         )
     secondary = servo.read("Secondary(Shadow) ID")

@@ -156,7 +156,7 @@ class MassEstimate:
     std: tuple[float, float]
     """Standard errors from the residual [kg]."""
     viscous: float
-    """Friction estimated together with them, second order only [N m s/rad]."""
+    """Viscous friction estimated along with the masses, only for the second order [N m s/rad]."""
 
 
 def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm, order: Order) -> MassEstimate:

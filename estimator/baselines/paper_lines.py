@@ -33,7 +33,7 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     coupling = length gravity_2 / gravity is the fourth equation. Raises ModelError without gravity or length.
     """
     if gravity <= 0.0:
-        raise ModelError("the paper's method linearises about the hanging pose: without gravity there is none")
+        raise ModelError("the paper's method linearises about the hanging pose, which requires gravity")
     lines = lines_of(period.filled())
     count = cut_off(lines) + 1
     Q = lines[:, 1:count]

@@ -52,7 +52,7 @@ class Chain:
             raise ModelError("the joints' axes must have length 1")
         turned = self.rotation @ np.swapaxes(self.rotation, 1, 2)
         if np.abs(turned - np.eye(3)).max() > 1e-6 or np.any(np.linalg.det(self.rotation) < 0.0):
-            raise ModelError("rotation must hold proper rotation matrices")
+            raise ModelError("rotation must contain proper rotation matrices")
 
     @property
     def joints(self) -> int:

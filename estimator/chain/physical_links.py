@@ -24,7 +24,7 @@ _UPPER = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 @dataclass(frozen=True)
 class PhysicalLinks:
-    """Physically consistent links."""
+    """Physically consistent parameters of the links and rotors, and how well they match the base parameters."""
 
     links: Array
     """Link parameters in the order of LINK_TERMS (joints, 10) [SI]."""

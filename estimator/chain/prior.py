@@ -25,7 +25,7 @@ class Prior:
 
     @classmethod
     def of(cls, base: BaseParameters, links: Array, armature: Array | None = None) -> "Prior":
-        """Return the prior from the links' described parameters (joints, 10) and armatures, if known (joints,)."""
+        """Create the prior from described link parameters (joints, 10) and, if known, armatures (joints,)."""
         joints = base.chain.joints
         rotor = np.full(joints, 0.5 * ARMATURE) if armature is None else armature
         every = np.column_stack((links, rotor)).reshape(-1)

@@ -61,7 +61,7 @@ def smoothed(physics: Physics) -> Physics:
 
 
 @dataclass(frozen=True)
-class Problem:
+class DesignProblem:
     """Objective and constraints of the design."""
 
     physics: Physics
@@ -176,7 +176,7 @@ class Problem:
 
 
 @one_blas_thread
-def design_optimal(plain: Multisine, problem: Problem, seed: int) -> Design:
+def design_optimal(plain: Multisine, problem: DesignProblem, seed: int) -> Design:
     """Improve `plain`, keeping its lines and period, with respect to the standard errors that `problem` defines.
 
     The same seed gives the same wave.

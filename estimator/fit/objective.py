@@ -9,7 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise, step_limits
 from hil.estimator.fit.normal_equations import normal_equations
-from hil.estimator.fit.reparametrisation import Coordinates, Prior
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.models.parameters import Physics
@@ -31,7 +31,7 @@ class Objective:
     """Scale of the initial state (2 joints,) [rad, rad/s]."""
     weights: tuple[Array, ...]
     """Inverse standard deviation of each sample (joints, samples) [1/rad] for each run; 0 for missing samples."""
-    prior: Prior
+    prior: CoordinatePrior
     """Prior of the parameters."""
     minimiser: MinimiserOptions
     max_relative_decrease: float

@@ -107,7 +107,7 @@ class Coordinates:
 
 
 @dataclass(frozen=True)
-class Prior:
+class CoordinatePrior:
     """Prior knowledge of the parameters: independent normal distributions of their coordinates."""
 
     centre: Array
@@ -116,7 +116,7 @@ class Prior:
     """Inverse variances (parameters,), 0 without prior knowledge."""
 
     @classmethod
-    def of(cls, names: tuple[str, ...], scales: Array, sizes: "Sizes") -> "Prior":
+    def of(cls, names: tuple[str, ...], scales: Array, sizes: "Sizes") -> "CoordinatePrior":
         """Return the prior declared by `Term.spread`, for coordinates with these scales."""
         terms = [term_of(name) for name in names]
         spread = np.array([np.inf if term.spread is None else sizes.of(term.spread) for term in terms])

@@ -36,7 +36,7 @@ class SimulatedRun:
 
     @classmethod
     def of(cls, period: SettledPeriod, integration: IntegrationOptions) -> "SimulatedRun":
-        """Return the run of this period."""
+        """Create a run from a settled period."""
         steps = steps_per_sample(period.rate, integration.max_step)
         samples = (period.torque, period.filled(), period.rate, period.command_to_sample)
         return cls(*samples, steps, integration.max_substeps)

@@ -31,7 +31,7 @@ class StabilisedRun:
 
     @classmethod
     def of(cls, period: SettledPeriod, stabiliser: Stabilised, integration: IntegrationOptions) -> "StabilisedRun":
-        """Return the run of this period, in which `stabiliser` applied part of the torque."""
+        """Create a run from a settled period in which `stabiliser` applied part of the torque."""
         run = SimulatedRun.of(period, integration)
         # The springs' ends are held between samples, so they are set to where the arm is in mid-interval: an error of
         # half a sample would cause a torque proportional to velocity.

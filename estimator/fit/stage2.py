@@ -16,7 +16,7 @@ from hil.estimator.fit.covariance import by_parameters, correlation_time, robust
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
-from hil.estimator.fit.reparametrisation import Coordinates, Prior, Sizes, scales_of
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Sizes, scales_of
 from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
@@ -132,7 +132,7 @@ def _objective(
     runs = tuple(_simulated(period, options) for period in periods)
     coordinates = Coordinates(model.names, scales, options.coordinates)
     steps = options.minimiser, options.max_relative_decrease
-    prior = Prior.of(model.names, scales, sizes)
+    prior = CoordinatePrior.of(model.names, scales, sizes)
     return Objective(runs, coordinates, state_scale, weights, prior, *steps), np.concatenate(states)
 
 

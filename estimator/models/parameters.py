@@ -12,7 +12,7 @@ from hil.estimator.models.terms import TERMS, constants, term_of
 CONSTANTS = constants()
 """Names of the constants, in the order in which the compiled simulation takes them."""
 ABSENT = {name: term_of(name).absent for name in CONSTANTS}
-"""Values that disable a term that the model lacks; without a second joint, that joint is a free wheel without torque.
+"""Values that disable a term that the model lacks; a one-joint arm gets a second joint that moves freely.
 """
 ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
 """Terms of the encoder errors that are periodic over a turn."""

@@ -23,7 +23,7 @@ EXCITED = 1e-4  # fraction of the strongest line's power; the rounding of a comm
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Lines of one kind."""
+    """A group of Fourier lines, such as all excited or all even ones."""
 
     lines: int
     """Number of lines."""

@@ -150,7 +150,7 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     """Return the response on lines that were left unexcited, and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        return ("experiment.detection = true would show whether this is odd (friction) or even (offsets, direction).",)
+        return ("experiment.detection = true would tell odd causes (friction) from even ones (offsets, direction).",)
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 
@@ -207,8 +207,8 @@ def _alike(validation: Validation) -> tuple[str, ...]:
     if abs(correlation) < ALIKE or both <= WELL_KNOWN:
         return ()
     return (
-        f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more lines, or with "
-        "more torque.",
+        f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more lines or "
+        "use more torque.",
     )
 
 

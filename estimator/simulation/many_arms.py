@@ -34,7 +34,7 @@ class Commands:
 
 
 @dataclass(frozen=True)
-class Settling:
+class SettlingRule:
     """Rule for how many periods are played.
 
     within: two successive periods that differ by at most this fraction of the motion's RMS count as settled.
@@ -70,7 +70,7 @@ class ManyArms:
         return ManyArms(self.physics[first:last], self.scale[first:last], self.pose[first:last], self.feedback)
 
     def peaks(
-        self, multisines: Sequence[Commands], rate: float, settling: Settling
+        self, multisines: Sequence[Commands], rate: float, settling: SettlingRule
     ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the extreme values of every arm, and when it settled.
 

@@ -53,7 +53,7 @@ def sensitive(physics: Physics) -> "type[Sensitive]":
 
 
 class PreslidingSensitive(Sensitive):
-    """`Sensitive` for an arm with bristles, which start deflected as in sliding joints."""
+    """A simulation with derivatives for presliding friction, starting with bristles deflected as in sliding joints."""
 
     def __init__(
         self,

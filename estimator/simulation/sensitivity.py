@@ -312,7 +312,7 @@ def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any
 
 
 def follow(rows: Any, numbers: Any, Z: Any, before: int, count: int) -> None:
-    """Propagate the state's derivatives Z through the step at `before`."""
+    """Propagate the state's derivatives Z through the previous step, whose rows and scalars are at index `before`."""
     # This tells the compiler that `before` is 0 or 1, so that no index can be negative (counting from the end).
     before &= 1
     w, v = 2 * before * STAGE, before * NUMBERS

@@ -26,7 +26,7 @@ from hil.fakes.bus.sync_reads import Reply
 from hil.fakes.bus.wire import Wire
 from hil.fakes.plants.plant import Plant
 from hil.fakes.servo.present import PRESENT_END, PRESENT_START
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 GAP_S = 1.5e-3
 """Pause between two bytes of a packet after which a servo discards the incomplete packet [s]."""
@@ -47,7 +47,7 @@ class FakeBus:
 
     def __init__(
         self,
-        servos: Sequence[Servo],
+        servos: Sequence[EmulatedServo],
         plant: Plant,
         clock: Clock,
         *,
@@ -101,7 +101,7 @@ class FakeBus:
             self._wire.change_baud(baud, self.clock.now())
 
     @property
-    def servos(self) -> dict[int, Servo]:
+    def servos(self) -> dict[int, EmulatedServo]:
         """The servos by current ID, in their state at the clock's current time."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
@@ -269,7 +269,7 @@ class FakeBus:
         self._now = until
 
     def _servo_changed(self) -> None:
-        """Update routing and ticking after a servo has changed its ID or whether it needs ticks."""
+        """Update routing and ticking after a servo has changed its ID or its need for ticks."""
         self._instructions.route()
         self._ticks_wanted()
 
@@ -298,7 +298,7 @@ class FakeBus:
             end(fault, self._servos, self._joints.of, self.plant)
 
     def _other_master_speaks(self, servo_id: int) -> None:
-        """Another master reads a servo's Present Position; the host receives both request and reply."""
+        """Simulate another master that reads a Present Position; the host receives both request and reply."""
         request = encode(servo_id, Instruction.READ, b"\x84\x00\x04\x00")
         asked_by = self._wire.put(request, self._now)
         self._instructions.receive(Packet(servo_id, Instruction.READ, request[8:-2]), asked_by)
@@ -336,7 +336,7 @@ class FakeBus:
         if joined:
             wire.put(joined, now)
 
-    def measure(self, servo: Servo, address: int, length: int) -> None:
+    def measure(self, servo: EmulatedServo, address: int, length: int) -> None:
         """Update the registers in this address range with the state of the servo's joint."""
         end_address = address + length
         if (address < PRESENT_END and end_address > PRESENT_START) or servo.memory.is_indirect(address, length):
@@ -351,7 +351,7 @@ class FakeBus:
             return plant.position, plant.velocity, plant.current
         return self._joints.states()
 
-    def is_moving(self, servo: Servo) -> bool:
+    def is_moving(self, servo: EmulatedServo) -> bool:
         """Return whether the servo's register Moving is 1."""
         return servo.present.moves(self.plant.velocity[self._joints.of[self._index[servo]]])
 
@@ -360,7 +360,7 @@ class FakeBus:
         """Whether an active fault makes servos refuse commands."""
         return bool(self.faults.on_answers)
 
-    def fault_error(self, servo: Servo, now: float) -> int:
+    def fault_error(self, servo: EmulatedServo, now: float) -> int:
         """Return the ERR byte that an active fault makes this servo answer with; 0 without a fault."""
         return self.faults.error(servo.id, now - self._origin)
 

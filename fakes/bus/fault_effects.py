@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 from hil.drivers.packet import HardwareError
 from hil.fakes.bus.faults import Fault, FaultKind, Faults
 from hil.fakes.plants.plant import CanJam, Plant, PlantError
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 if TYPE_CHECKING:
     from hil.fakes.bus.wire import Wire
 
 
-def begin(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant, now: float) -> None:
+def begin(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], plant: Plant, now: float) -> None:
     """Apply a fault to servos and joints; do nothing for kinds that only affect packets.
 
     joints: for each servo, the index of the joint it moves. now: bus time [s].
@@ -38,7 +38,7 @@ def begin(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: P
                 servo.present.jump_ticks += round(fault.size)
 
 
-def end(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant) -> None:
+def end(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], plant: Plant) -> None:
     """Undo a fault if its effect is temporary: a heated servo stays hot, and an error stays until a reboot."""
     for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):

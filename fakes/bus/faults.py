@@ -104,7 +104,9 @@ class Fault(BaseModel):
     ] = 0.0
     duration: Annotated[float, Field(gt=0, description="duration [s]; unlimited by default")] = math.inf
     servo: Annotated[int | None, Field(ge=0, le=252, description="bus ID of the servo; all servos by default")] = None
-    probability: Annotated[float, Field(ge=0, le=1, description="of affecting a packet, or of happening at all")] = 1.0
+    probability: Annotated[
+        float, Field(ge=0, le=1, description="probability of affecting a packet or of happening")
+    ] = 1.0
     amount: Annotated[
         float | None,
         Field(allow_inf_nan=False, description="size; its meaning and default depend on the kind"),

@@ -34,7 +34,7 @@ class Move(BaseModel):
     to: Annotated[float | None, Field(allow_inf_nan=False, description="joint angle at the end [rad]")] = None
     ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
     at: Annotated[float, Field(ge=0, allow_inf_nan=False, description="delay before it starts [s]")] = 0.0
-    duration: Annotated[float, Field(gt=0, allow_inf_nan=False, description="how long it takes [s]")] = 1.0
+    duration: Annotated[float, Field(gt=0, allow_inf_nan=False, description="duration of the movement [s]")] = 1.0
     hold: Annotated[float, Field(ge=0, description="how long the joint is held afterwards [s]")] = math.inf
 
     @model_validator(mode="after")

@@ -28,7 +28,7 @@ from hil.drivers.packet import (
 )
 from hil.fakes.bus.sync_reads import SPAN, Reply, StateReads
 from hil.fakes.servo.backup import RESET_ALL
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 Part = tuple[int, int, int]
 """What a group read requests from one servo: ID, address, length."""
@@ -47,7 +47,7 @@ class Line(Protocol):
         """
         ...
 
-    def measure(self, servo: Servo, address: int, length: int) -> None:
+    def measure(self, servo: EmulatedServo, address: int, length: int) -> None:
         """Update the registers in this address range with the state of the servo's joint."""
         ...
 
@@ -55,14 +55,14 @@ class Line(Protocol):
         """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
         ...
 
-    def is_moving(self, servo: Servo) -> bool: ...
+    def is_moving(self, servo: EmulatedServo) -> bool: ...
 
     @property
     def servos_refuse(self) -> bool:
         """Whether an active fault makes servos refuse commands."""
         ...
 
-    def fault_error(self, servo: Servo, now: float) -> int:
+    def fault_error(self, servo: EmulatedServo, now: float) -> int:
         """Return the ERR byte that an active fault makes this servo answer with.
 
         If its error number (without the Alert bit) is not 0, the servo does not execute the instruction.
@@ -75,12 +75,12 @@ class Line(Protocol):
 class Instructions:
     """The servos on a line as receivers of packets. `route` must be called whenever an ID has changed."""
 
-    def __init__(self, servos: Sequence[Servo], line: Line) -> None:
+    def __init__(self, servos: Sequence[EmulatedServo], line: Line) -> None:
         self._servos = tuple(servos)
         self._line = line
-        self._by_id: dict[int, tuple[Servo, ...]] = {}
-        self._shadows: dict[int, tuple[Servo, ...]] = {}
-        self._writers: dict[int, tuple[Servo, ...]] = {}
+        self._by_id: dict[int, tuple[EmulatedServo, ...]] = {}
+        self._shadows: dict[int, tuple[EmulatedServo, ...]] = {}
+        self._writers: dict[int, tuple[EmulatedServo, ...]] = {}
         self._state_reads = StateReads(self._servos, line)
         self._broadcast: dict[int, Callable[[bytes, float], None]] = {
             Instruction.PING: self._broadcast_ping,
@@ -142,7 +142,7 @@ class Instructions:
         self._address(packet.id, lambda servo: self._execute(servo, instruction, body, now), now, least_level)
 
     def _address(
-        self, servo_id: int, act: Callable[[Servo], tuple[int, bytes]], now: float, least_level: int = 2
+        self, servo_id: int, act: Callable[[EmulatedServo], tuple[int, bytes]], now: float, least_level: int = 2
     ) -> None:
         """Let the servo with this ID act, and reply if its Status Return Level is at least `least_level`."""
         answers = []
@@ -160,7 +160,7 @@ class Instructions:
             self._line.count_collision()
 
     def _execute(
-        self, servo: Servo, instruction: int, body: bytes, now: float, *, shadow: bool = False
+        self, servo: EmulatedServo, instruction: int, body: bytes, now: float, *, shadow: bool = False
     ) -> tuple[int, bytes]:
         fault = self._line.fault_error(servo, now) if self._line.servos_refuse else 0
         if fault & ~ALERT:
@@ -168,7 +168,7 @@ class Instructions:
         error, data = servo.execute(instruction, body, now, self._line.is_moving(servo), shadow=shadow)
         return error | fault, data
 
-    def _read(self, servo: Servo, address: int, length: int, now: float) -> tuple[int, bytes]:
+    def _read(self, servo: EmulatedServo, address: int, length: int, now: float) -> tuple[int, bytes]:
         fault = self._line.fault_error(servo, now) if self._line.servos_refuse else 0
         if fault & ~ALERT:
             return fault, b""
@@ -176,7 +176,7 @@ class Instructions:
         error, data = servo.read(address, length)
         return error | fault, data
 
-    def _write(self, servo: Servo, addressed: int, address: int, data: bytes, now: float) -> None:
+    def _write(self, servo: EmulatedServo, addressed: int, address: int, data: bytes, now: float) -> None:
         """Apply one servo's part of a group write."""
         if self._line.servos_refuse and self._line.fault_error(servo, now) & ~ALERT:
             return
@@ -274,14 +274,14 @@ class Instructions:
             sent = len(whole)
         self._line.send(replies, now)
 
-    def _answering(self, servo_id: int, now: float) -> Servo | None:
+    def _answering(self, servo_id: int, now: float) -> EmulatedServo | None:
         """Return the servo that answers a group read at this ID; None if there is none or more than one."""
         servos = self._by_id.get(servo_id, ())
         if len(servos) != 1 or servos[0].heard_at != now or servos[0].status_return_level == 0:
             return None
         return servos[0]
 
-    def _listening(self, now: float) -> list[Servo]:
+    def _listening(self, now: float) -> list[EmulatedServo]:
         return [servo for servo in self._servos if servo.hears(now, self._line.baud)]
 
 

@@ -8,7 +8,7 @@ the current loop's lag.
 from collections.abc import Sequence
 
 from hil.fakes.plants.plant import Plant
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 States = tuple[Sequence[float], Sequence[float], Sequence[float]]
 """Positions [rad], velocities [rad/s] and motor currents [A], one value per servo."""
@@ -17,7 +17,7 @@ States = tuple[Sequence[float], Sequence[float], Sequence[float]]
 class Joints:
     """Maps between servos and the plant's joints. `of` is the joint index of each servo."""
 
-    def __init__(self, servos: Sequence[Servo], plant: Plant, of: Sequence[int] | None = None) -> None:
+    def __init__(self, servos: Sequence[EmulatedServo], plant: Plant, of: Sequence[int] | None = None) -> None:
         self.of = tuple(range(len(servos)) if of is None else of)
         if len(self.of) != len(servos) or set(self.of) != set(range(plant.joints)):
             raise ValueError(f"{len(servos)} servos for a plant of {plant.joints} joints: each joint needs a servo")
@@ -26,7 +26,7 @@ class Joints:
         self.one_each = self.of == tuple(range(plant.joints))
         """Whether servo i moves joint i, the usual case."""
 
-    def of_joint(self, joint: int) -> list[Servo]:
+    def of_joint(self, joint: int) -> list[EmulatedServo]:
         """Return the servos that move a joint."""
         return [servo for servo, moved in zip(self._servos, self.of, strict=True) if moved == joint]
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 
 class Supply(BaseModel):
@@ -16,7 +16,7 @@ class Supply(BaseModel):
     resistance_ohm: Annotated[float, Field(ge=0, le=100, description="resistance of supply and cable [ohm]")]
     brownout_v: Annotated[float, Field(ge=0, le=100, description="voltage below which a servo reboots [V]")] = 0.0
 
-    def load(self, servos: Sequence[Servo], current: Sequence[float], now: float) -> None:
+    def load(self, servos: Sequence[EmulatedServo], current: Sequence[float], now: float) -> None:
         """Set every servo's supply voltage under these motor currents [A]. now: bus time [s].
 
         A servo draws its motor current times the duty cycle of its bridge from the supply.

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 from hil.drivers.packet import ALERT, BROADCAST_ID, HEADER, Instruction, crc, encode_status
 from hil.fakes.servo.present import STATE_END, STATE_START
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 Reply = tuple[int, float, bytes]
 """One servo's reply: its ID, its delay [s], and the bytes."""
@@ -29,7 +29,7 @@ _STUFFED = b"\xff\xff\xfd"
 _ALERT = {0: b"\0", ALERT: bytes((ALERT,))}
 
 
-class Joints(Protocol):
+class JointStates(Protocol):
     """Source of the joints' states."""
 
     def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
@@ -38,7 +38,7 @@ class Joints(Protocol):
 
 
 class _Part(NamedTuple):
-    servo: Servo
+    servo: EmulatedServo
     place: int
     """Index among all servos."""
     front: bytes
@@ -49,7 +49,7 @@ class _Part(NamedTuple):
 class StateReads:
     """Cache of the requests received, each with its servos. `forget` must be called whenever an ID has changed."""
 
-    def __init__(self, servos: Sequence[Servo], joints: Joints) -> None:
+    def __init__(self, servos: Sequence[EmulatedServo], joints: JointStates) -> None:
         self._servos = tuple(servos)
         self._joints = joints
         self._prepared: dict[bytes, tuple[_Part, ...]] = {}
@@ -58,7 +58,7 @@ class StateReads:
         """Clear the cache, since the servos' IDs have changed."""
         self._prepared.clear()
 
-    def sync_read(self, body: bytes, by_id: Mapping[int, Sequence[Servo]], now: float) -> list[Reply] | None:
+    def sync_read(self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]], now: float) -> list[Reply] | None:
         """Return the replies to a Sync Read; None if it needs the general path."""
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
@@ -75,7 +75,9 @@ class StateReads:
             replies.append((servo.id, servo.return_delay_s, reply))
         return replies or None
 
-    def fast_sync_read(self, body: bytes, by_id: Mapping[int, Sequence[Servo]], now: float) -> list[Reply] | None:
+    def fast_sync_read(
+        self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]], now: float
+    ) -> list[Reply] | None:
         """Return the parts of the reply to a Fast Sync Read; None if it needs the general path."""
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
@@ -93,7 +95,7 @@ class StateReads:
             sent = len(whole)
         return replies or None
 
-    def _parts(self, body: bytes, by_id: Mapping[int, Sequence[Servo]]) -> tuple[_Part, ...]:
+    def _parts(self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]]) -> tuple[_Part, ...]:
         parts = self._prepared.get(body)
         if parts is None:
             if len(self._prepared) >= MOST_PREPARED:
@@ -101,7 +103,7 @@ class StateReads:
             parts = self._prepared[body] = self._prepare(body[len(SPAN) :], by_id)
         return parts
 
-    def _prepare(self, ids: bytes, by_id: Mapping[int, Sequence[Servo]]) -> tuple[_Part, ...]:
+    def _prepare(self, ids: bytes, by_id: Mapping[int, Sequence[EmulatedServo]]) -> tuple[_Part, ...]:
         """Return the parts of a request; empty if it needs the general path.
 
         That is the case if a servo is absent, if two have the same ID, or if a model is not fully known.

@@ -93,7 +93,7 @@ class Wire:
         return end
 
     def echo(self, data: bytes, start: float) -> None:
-        """Return the host's data to it, sent from time `start` through an adapter that echoes."""
+        """Echo the host's own data back to it; they are sent from time `start`."""
         self._arriving.append(Arriving(data, start + self.byte_s + self._latency_s, self.byte_s))
         self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
 
@@ -102,7 +102,7 @@ class Wire:
         self.reply_by = max(self.reply_by, until)
 
     def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
-        """Return up to `size` bytes that have arrived by `deadline`, and when the last one arrived, at least `now`."""
+        """Return up to `size` bytes that have arrived by `deadline`, and when the last one arrived (at least `now`)."""
         arriving = self._arriving
         if arriving and len(arriving[0].data) == size:  # the usual case: the reply to one write, in one read
             segment = arriving[0]

@@ -120,7 +120,7 @@ class Arm(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    gravity: NotNegative = Field(9.81, description="0 for an arm in a horizontal plane [m/s^2]")
+    gravity: NotNegative = Field(9.81, description="acceleration of gravity; 0 for a horizontal arm [m/s^2]")
     tilt: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)] = Field(
         0.0, description="inclination of the arm's plane from the vertical; pi/2 is horizontal [rad]"
     )

@@ -1,6 +1,6 @@
 """Factory Reset and Control Table Backup: their effect on a control table.
 
-Source: ROBOTIS e-Manual, protocol2. It is unsure what exactly a backup contains. Here it is every writable register
+Source: ROBOTIS e-Manual, protocol2. It is uncertain what exactly a backup contains. Here it is every writable register
 except ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
 """
 

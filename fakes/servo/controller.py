@@ -3,14 +3,14 @@
 Source: the block diagrams and gain units of the ROBOTIS e-Manual (pages x/<model>, Velocity PI Gain, Position PID
 Gain): the units are 1/128 for P gains, 1/65536 for I gains, 1/16 for the D gain, 1/4 and 1 for the feedforward gains.
 The period of the control loop (1 ms here), the exact signal that the D gain multiplies and the filters in between are
-unsure, so a move is realistic but does not match the firmware to the tick.
+uncertain, so a move is realistic but does not match the firmware to the tick.
 """
 
 import math
 from dataclasses import dataclass
 
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import VELOCITY_UNIT_RPM, Model
+from hil.fakes.servo.registers import VELOCITY_UNIT_RPM, EmulatedModel
 from hil.fakes.servo.trajectory import ACCELERATION_PER_MS, VELOCITY_TICKS_PER_MS, Trajectory, profile
 
 CURRENT_MODE = 0
@@ -25,7 +25,7 @@ FULL_PWM = 885
 """Goal PWM at which the whole supply voltage is applied to the motor."""
 
 IN_POSITION_TICKS = 20
-"""Distance from the goal below which Moving Status reports in-position. Unsure."""
+"""Distance from the goal below which Moving Status reports in-position. Uncertain."""
 
 _TIME_BASED = 0x04  # bit of Drive Mode
 
@@ -103,7 +103,7 @@ class Controller:
         self._integral = self._error_before = 0.0
         self._goal_before = None
 
-    def motor_current(self, model: Model, supply_v: float, position_ticks: float, velocity: float) -> float:
+    def motor_current(self, model: EmulatedModel, supply_v: float, position_ticks: float, velocity: float) -> float:
         """Run one millisecond of control; return the motor current [A], limited by the supply voltage.
 
         velocity: velocity of the output shaft in the servo's sense of rotation [rad/s].
@@ -139,7 +139,7 @@ class Controller:
         return self._position_control(goals, position_ticks, abs(goals.pwm))
 
     def _moving_status(self, position_ticks: float) -> int:
-        """Return the register Moving Status. The firmware's threshold for a following error is unsure."""
+        """Return the register Moving Status. The firmware's threshold for a following error is uncertain."""
         goals = self.goals
         if goals is None or goals.mode not in POSITION_MODES:
             return 0

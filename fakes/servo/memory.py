@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 
 from hil.drivers.packet import StatusError
-from hil.fakes.servo.registers import Model, Register
+from hil.fakes.servo.registers import EmulatedModel, Register
 
 
 class Memory:
     """Registers as bytes. `hil.fakes.servo.servo` decides what may be written when, and the consequences."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: EmulatedModel) -> None:
         self.registers = model.registers
         self.data = bytearray(max(r.address + r.size for r in model.registers.values()))
         self._starting_at = {register.address: register for register in model.registers.values()}

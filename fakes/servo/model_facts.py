@@ -6,10 +6,10 @@ the sister models. Protocol Type only accepts 2, because a fake servo does not s
 3 (Torque On by Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
-tens of percent, which is enough to make a position move look right. The XC330-T288's stall current is unsure.
+tens of percent, which is enough to make a position move look right. The XC330-T288's stall current is uncertain.
 
 A model without facts of its own uses those of a sister model, named in `STANDS_FOR`: its factory values and ranges are
-unsure.
+uncertain.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """What the control table does not say about one register. `limits` None: the full range of its bytes."""
+    """Properties of a register that its control table does not contain. `limits` None: the full range of its bytes."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None
@@ -235,7 +235,7 @@ STANDS_FOR: Mapping[str, str] = {
     "XC430-W150": "XL430-W250",
     "XC430-W240": "XL430-W250",
 }
-"""Models without facts of their own, and the sister model whose factory values and ranges they use. Unsure."""
+"""Models without facts of their own, and the sister model whose factory values and ranges they assume."""
 
 _STRENGTH = (0, 1023)
 

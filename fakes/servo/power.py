@@ -5,13 +5,13 @@ from abc import ABC, abstractmethod
 from hil.drivers.packet import HardwareError
 from hil.fakes.servo.health import Health
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import Model
+from hil.fakes.servo.registers import EmulatedModel
 
 
 class Powered(ABC):
     """A servo's supply and temperature. Limit violations stay in Hardware Error Status until a reboot."""
 
-    def __init__(self, model: Model, memory: Memory, health: Health, input_voltage_v: float) -> None:
+    def __init__(self, model: EmulatedModel, memory: Memory, health: Health, input_voltage_v: float) -> None:
         self.model = model
         self.memory = memory
         self.health = health

@@ -9,7 +9,7 @@ from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE
 from hil.fakes.servo.encoder import Reading
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
+from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, EmulatedModel
 
 PRESENT_START = 120
 PRESENT_END = 147
@@ -41,7 +41,7 @@ class Present:
     def __init__(
         self,
         memory: Memory,
-        model: Model,
+        model: EmulatedModel,
         zero_ticks: int,
         direction: int,
         clock_rate: float,
@@ -97,7 +97,7 @@ class Present:
     def clear(self, body: bytes, moving: bool, position: float) -> int:
         """Execute the instruction Clear (reset the turns); return the error number.
 
-        Errors other than Result Fail are unsure.
+        Errors other than Result Fail are uncertain.
         """
         if len(body) != len(_CLEAR_TURNS):
             return StatusError.DATA_LENGTH

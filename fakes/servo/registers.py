@@ -52,8 +52,8 @@ class Register:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
-    """One servo model: its control table by name, and what the table does not say."""
+class EmulatedModel:
+    """One servo model: its control table, and properties that the table does not contain."""
 
     name: str
     number: int
@@ -88,7 +88,7 @@ def all_model_names() -> tuple[str, ...]:
 DEFAULT_FIRMWARE = 48
 
 
-def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> Model:
+def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> EmulatedModel:
     """Return the control table of one model, e.g. "XM430-W350", with this firmware.
 
     Raises KeyError if no table describes the model; see `all_model_names`.
@@ -97,7 +97,7 @@ def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> Model:
 
 
 @cache
-def _load_model(name: str, older: bool) -> Model:
+def _load_model(name: str, older: bool) -> EmulatedModel:
     if name not in model_names().values():
         raise KeyError(name)
     facts = FACTS.get(STANDS_FOR.get(name, name))
@@ -106,7 +106,7 @@ def _load_model(name: str, older: bool) -> Model:
     return _x_series(name, facts, (facts.older_indirect or facts.indirect) if older else facts.indirect)
 
 
-def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int], ...]) -> Model:
+def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int], ...]) -> EmulatedModel:
     table = {**X_SERIES, **facts.differs}
     addresses = load_control_table(name)
     registers = [
@@ -117,7 +117,7 @@ def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int]
     known = {register.name for register in registers}
     registers += [_register(*added, False, table[added[0]]) for added in _ADDED if added[0] not in known]
     registers += _indirect_registers(indirect)
-    return Model(
+    return EmulatedModel(
         name=name,
         number=addresses.number,
         current_unit_a=facts.current_unit_a,
@@ -145,7 +145,7 @@ def _indirect_registers(blocks: tuple[tuple[int, int, int], ...]) -> Iterator[Re
             yield _register(f"Indirect Data {number}", data, 1, False, RegisterFacts())
 
 
-def _unknown(name: str) -> Model:
+def _unknown(name: str) -> EmulatedModel:
     """Return a model for which only addresses and sizes are known."""
     addresses = load_control_table(name)
     torque = addresses.registers.get("Torque Enable")
@@ -163,7 +163,7 @@ def _unknown(name: str) -> Model:
             writable=not entry.name.startswith(_NOT_WRITABLE),
         )
         registers[entry.name] = _register(entry.name, entry.address, entry.size, entry.signed, facts, ram)
-    return Model(
+    return EmulatedModel(
         name=name,
         number=addresses.number,
         current_unit_a=0.0,

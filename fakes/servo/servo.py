@@ -35,13 +35,13 @@ from hil.fakes.servo.health import Health, Overload, Thermal
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.power import Powered
 from hil.fakes.servo.present import Present
-from hil.fakes.servo.registers import BAUD_RATES, Model, Register
+from hil.fakes.servo.registers import BAUD_RATES, EmulatedModel, Register
 from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, WATCHDOG_TRIPPED, refusal
 
 BOOT_S = 0.25
 """Time after Reboot during which a servo does not respond [s].
 
-Unsure: the manual gives no figure; clients in use wait 0.3 to 1 s.
+Uncertain: the manual gives no figure; clients in use wait 0.3 to 1 s.
 """
 
 WATCHDOG_UNIT_S = 0.020
@@ -56,7 +56,7 @@ _TORQUE_ON_AT_BOOT = 0x01
 _RESTORE_AT_BOOT = 0x02
 
 
-class Servo(Powered):
+class EmulatedServo(Powered):
     """A servo on its own: its registers, the rules for accessing them, and the resulting motor command.
 
     Times are in seconds on the bus's clock. `hil.fakes.description.FakeServo` documents the arguments.
@@ -64,7 +64,7 @@ class Servo(Powered):
 
     def __init__(
         self,
-        model: Model,
+        model: EmulatedModel,
         servo_id: int,
         *,
         zero_ticks: int = 0,

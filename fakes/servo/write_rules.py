@@ -3,7 +3,7 @@
 from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import TICKS_PER_TURN, Model, Register
+from hil.fakes.servo.registers import TICKS_PER_TURN, EmulatedModel, Register
 
 GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 
@@ -24,7 +24,7 @@ WATCHDOG_TRIPPED = 0xFF
 _MULTI_TURN_LIMIT_TICKS = 256 * TICKS_PER_TURN
 
 
-def refusal(memory: Memory, model: Model, register: Register, value: int, shadow: bool = False) -> int:
+def refusal(memory: Memory, model: EmulatedModel, register: Register, value: int, shadow: bool = False) -> int:
     """Return the error number with which writing this value to this register is refused; 0 if it is permitted.
 
     shadow: the write was addressed to the Secondary ID, which cannot write to the EEPROM.

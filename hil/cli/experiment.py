@@ -52,7 +52,7 @@ def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False,
         recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
         print(strict_json.dumps(recorded))
         return
-    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nEstimate from it: hil estimate {run.path}")
+    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nTo estimate from it: hil estimate {run.path}")
 
 
 def estimate(

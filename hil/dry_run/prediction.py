@@ -18,7 +18,7 @@ from hil.drivers.servo_model import Mode
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.rollout import commands_of, simulate_experiment
 from hil.estimator.simulation.closed_loop import Feedback
-from hil.estimator.simulation.many_arms import LOWEST, TORQUE, Commands, ManyArms, Settling
+from hil.estimator.simulation.many_arms import LOWEST, TORQUE, Commands, ManyArms, SettlingRule
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import feedback_of
 
@@ -145,11 +145,11 @@ def predict(
     feedback = feedback_of(config)
     arms = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback)
     if briefly:
-        each = [_peaks(arms, [command], plan.rate, Settling(0.0, 0, 1), executor)[0] for command in commands]
+        each = [_peaks(arms, [command], plan.rate, SettlingRule(0.0, 0, 1), executor)[0] for command in commands]
         peaks = _extreme(np.stack(each))
         settled_after = np.zeros(ensemble.size, dtype=np.int64)
     else:
-        settling = Settling(plan.settle_within, plan.max_settling_periods, plan.periods)
+        settling = SettlingRule(plan.settle_within, plan.max_settling_periods, plan.periods)
         peaks, settled_after = _peaks(arms, commands, plan.rate, settling, executor)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
     constant = np.array([joint.torque_per_goal for joint in config.joints])
@@ -164,7 +164,7 @@ def predict(
 
 
 def _peaks(
-    arms: ManyArms, commands: Sequence[Commands], rate: float, settling: Settling, executor: Executor | None
+    arms: ManyArms, commands: Sequence[Commands], rate: float, settling: SettlingRule, executor: Executor | None
 ) -> tuple[Array, NDArray[np.int64]]:
     """`ManyArms.peaks`, by the executor where there is one: each arm is simulated for itself."""
     if executor is None:

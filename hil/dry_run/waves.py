@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.dry_run.amplitude import with_peaks
 from hil.estimator.excitation.multisine import Multisine
-from hil.estimator.excitation.optimal_design import Limits, Problem, design_optimal, smoothed
+from hil.estimator.excitation.optimal_design import DesignProblem, Limits, design_optimal, smoothed
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.many_arms import ManyArms
 from hil.plan.plan import Plan, Segment, period_current
@@ -34,7 +34,7 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     return replace(plan, segments=tuple(segments))
 
 
-def _evenness(problem: Problem, wave: Multisine) -> float:
+def _evenness(problem: DesignProblem, wave: Multisine) -> float:
     """Covered range relative to the largest one possible within the limits, for the worse joint; 1 is ideal."""
     ones = np.ones((1, wave.joints))
     arms = ManyArms([problem.physics], ones, problem.pose[None], problem.feedback)
@@ -79,13 +79,13 @@ def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
     return replace(plan, segments=(_with_wave(config, first, wave), *plan.segments[1:]))
 
 
-def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> Problem:
+def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> DesignProblem:
     """Arm and limits in the form that the estimator's experiment design takes."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     velocity = np.array([joint.velocity_limit for joint in config.joints])
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])
     limits = Limits(low, high, velocity, _torque_limits(config))
-    return Problem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
+    return DesignProblem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
 
 
 def _plain_segment(config: Config, seed: int) -> Segment:

@@ -45,7 +45,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
     ratio = extra[RATIO]
     found = (
         f"Relative to {first.name}, {second.name} gives {ratio.value:.5g} +- {ratio.std:.1g} times the torque that "
-        f"its torque constant implies. Every value scales with {first.name}'s alone"
+        f"its torque constant implies. Every value scales only with the torque constant of {first.name}"
     )
     if not first.torque_per_goal_std:
         return f"{found}."

@@ -304,7 +304,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     ticks = servo.read("Present Position")
     index = [joint.id in each.ids for each in config.joints].index(True)
     if joint.id != config.joints[index].id:
-        return Level.OK, "pose", f"the first servo's counts (ID {config.joints[index].id})", ""
+        return Level.OK, "pose", f"determined by the first servo (ID {config.joints[index].id})", ""
     angle = joint.within_turn(ticks).angle(ticks)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)

@@ -9,7 +9,7 @@ from hil.drivers.packet import Framer, Instruction, Packet, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 # A busy machine is no failure; the fixtures used with @given only build benches, so they may be shared.
 settings.register_profile("no deadline", deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -47,12 +47,12 @@ class FreeInertia:
 class Bench:
     """A host on a bus of fake servos with IDs 1, 2, ..."""
 
-    def __init__(self, *servos: Servo, adapter_latency_us: float = 0.0) -> None:
+    def __init__(self, *servos: EmulatedServo, adapter_latency_us: float = 0.0) -> None:
         self.clock = VirtualClock()
         self.plant = FreeInertia(len(servos))
         self.bus = FakeBus(servos, self.plant, self.clock, adapter_latency_us=adapter_latency_us)
 
-    def servo(self, servo_id: int = 1) -> Servo:
+    def servo(self, servo_id: int = 1) -> EmulatedServo:
         return self.bus.servos[servo_id]
 
     def exchange(self, raw: bytes, timeout_s: float = 0.01) -> list[Packet]:
@@ -98,7 +98,7 @@ def make_bench() -> Callable[..., Bench]:
 
     def make(*settings: dict[str, object], adapter_latency_us: float = 0.0) -> Bench:
         servos = [
-            Servo(**({"model": XM430, "servo_id": number} | chosen))  # type: ignore[arg-type]
+            EmulatedServo(**({"model": XM430, "servo_id": number} | chosen))  # type: ignore[arg-type]
             for number, chosen in enumerate(settings or ({}, {}), start=1)
         ]
         return Bench(*servos, adapter_latency_us=adapter_latency_us)

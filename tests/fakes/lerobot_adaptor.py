@@ -15,7 +15,7 @@ from hil.drivers.packet import Packet
 from hil.fakes.bus.faults import Fault
 from hil.fakes.description import FakeArm
 from hil.fakes.pty_server import PtyServer
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 MODELS = {1: "XL430-W250", 2: "XM540-W270", 3: "XL330-M077"}
 """The servos of LeRobot's tests, by ID."""
@@ -187,7 +187,7 @@ class MockMotors:
             servo.memory.data[address : address + length] = (value % (1 << 8 * length)).to_bytes(length, "little")
             servo._derive()
 
-    def _stand(self, servo: Servo, ticks: int) -> None:
+    def _stand(self, servo: EmulatedServo, ticks: int) -> None:
         joint = list(self._bus._servos).index(servo)
         plant: Any = self._bus.plant
         plant = getattr(plant, "_plant", plant)

@@ -126,7 +126,7 @@ def test_mean_torque_is_the_integral_of_what_was_held_or_drawn() -> None:
     ("change", "error", "said"),
     [
         (lambda r: {"time": r.time[::-1]}, RecordingError, "it must increase"),
-        (lambda r: {"time": 1000.0 * r.time}, RecordingError, "is time in seconds"),
+        (lambda r: {"time": 1000.0 * r.time}, RecordingError, "Is time in seconds"),
         (lambda r: {"time": r.time + 3.0 * (r.time > 1.0)}, RecordingError, "split the recording there"),
         (lambda r: {"time": np.where(r.time > 1.0, np.nan, r.time)}, RecordingError, "time of sample"),
         (lambda r: {"position": 4096.0 * r.position}, RecordingError, "are these degrees or encoder"),

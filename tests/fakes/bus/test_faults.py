@@ -24,7 +24,7 @@ from hil.fakes.description import DescriptionError, load_fake
 from hil.fakes.plants.plant import PlantError
 from hil.fakes.protocol_fake import open_fake
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import BOOT_S, Servo
+from hil.fakes.servo.servo import BOOT_S, EmulatedServo
 from tests.support.paths import CONFIGS
 
 CONFIG = CONFIGS / "fake_two_link.toml"
@@ -120,7 +120,7 @@ def test_lost_and_corrupted_instructions(bench: Any) -> None:
 
 def test_probability_and_seed() -> None:
     def struck(seed: int) -> list[bool]:
-        bus = FakeBus([Servo(load_model("XM430-W350"), 1)], _Still(), VirtualClock(), seed=seed)
+        bus = FakeBus([EmulatedServo(load_model("XM430-W350"), 1)], _Still(), VirtualClock(), seed=seed)
         bus.faults.add(Fault(kind="lost_reply", probability=0.3))
         lost = []
         for _ in range(300):

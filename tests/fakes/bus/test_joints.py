@@ -8,7 +8,7 @@ from hil.drivers.packet import Instruction, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, FakeArm, make_bus
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from tests.fakes.conftest import XM430, Bench, FreeInertia
 
 PAIR = ({"joint": 1}, {"joint": 1, "direction": -1}, {})
@@ -19,7 +19,7 @@ def pair(**second: Any) -> Bench:
     bench = Bench.__new__(Bench)
     bench.clock = VirtualClock()
     bench.plant = FreeInertia(2)
-    servos = [Servo(XM430, 1), Servo(XM430, 2, direction=-1, **second), Servo(XM430, 3)]
+    servos = [EmulatedServo(XM430, 1), EmulatedServo(XM430, 2, direction=-1, **second), EmulatedServo(XM430, 3)]
     bench.bus = FakeBus(servos, bench.plant, bench.clock, joints=(0, 0, 1))
     return bench
 

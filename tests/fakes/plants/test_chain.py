@@ -30,7 +30,7 @@ def arm(drives: Sequence[Drive], **more: object) -> ChainArm:
 
 
 def test_its_equations_are_the_estimators() -> None:
-    """Compare Kane's equations with centres of mass with spatial vectors and composites in the base frame."""
+    """The plant's equations (Kane's, centres of mass) match the estimator's (spatial vectors in the base frame)."""
     scale = (1.0, 1.2, 0.8, 1.1, 0.9, 1.3)
     described = arm([drive()] * 6, mass_scale=scale, centre_shift=(0.01,) * 6, base=(0.3, -0.2, 0.1))
     plant = SpatialChain(described)

@@ -14,7 +14,7 @@ from hil.drivers.packet import Framer, Instruction, Packet, StatusError, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import Register, load_model
-from hil.fakes.servo.servo import BOOT_S, Servo
+from hil.fakes.servo.servo import BOOT_S, EmulatedServo
 from tests.fakes.conftest import FreeInertia
 
 GOALS = {"Goal PWM": "PWM Limit", "Goal Current": "Current Limit", "Goal Velocity": "Velocity Limit"}
@@ -97,7 +97,7 @@ class ControlTable(RuleBasedStateMachine):
     def switch_on(self, name: str) -> None:
         self.reference = Reference(name)
         self.clock = VirtualClock()
-        self.servo = Servo(self.reference.model, 1)
+        self.servo = EmulatedServo(self.reference.model, 1)
         self.bus = FakeBus([self.servo], FreeInertia(1, 0.0), self.clock)
         self.known = [r for r in self.reference.model.registers.values() if not r.name.startswith(LEFT_OUT)]
 

@@ -10,7 +10,7 @@ from hil.drivers.packet import encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.fakes.servo.trajectory import Trajectory, profile
 
 Make = Callable[..., Any]
@@ -46,7 +46,7 @@ class Rig:
         self.clock = VirtualClock()
         self.shaft = Shaft()
         named = {key.replace("_", " "): value for key, value in registers.items()}
-        self.servo = Servo(load_model(model), 1, zero_ticks=2048, registers={"Operating Mode": mode, **named})
+        self.servo = EmulatedServo(load_model(model), 1, zero_ticks=2048, registers={"Operating Mode": mode, **named})
         self.bus = FakeBus([self.servo], self.shaft, self.clock)
 
     def write(self, name: str, value: int) -> None:
@@ -214,7 +214,7 @@ def test_torque_off_lets_go_at_once() -> None:
 def test_current_mode_is_limited_by_the_supply_if_asked() -> None:
     current = []
     for limited in (False, True):
-        servo = Servo(load_model("XM430-W350"), 1, registers={"Operating Mode": 0}, voltage_limited=limited)
+        servo = EmulatedServo(load_model("XM430-W350"), 1, registers={"Operating Mode": 0}, voltage_limited=limited)
         shaft = Shaft()
         clock = VirtualClock()
         bus = FakeBus([servo], shaft, clock)

@@ -18,7 +18,7 @@ from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, 
 from hil.errors import HilError
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.servo_session import SETTINGS_NAME, servo_session
@@ -41,7 +41,7 @@ class Bench:
     prepare: Callable[[Any], None] = lambda port: None
 
     @property
-    def servos(self) -> dict[int, Servo]:
+    def servos(self) -> dict[int, EmulatedServo]:
         return dict(self.port.bus.servos)
 
     def changed(self) -> list[str]:
@@ -64,7 +64,7 @@ class Bench:
             self.eeprom[servo_id] = []
             self._count(servo, self.eeprom[servo_id])
 
-    def _count(self, servo: Servo, written: list[str]) -> None:
+    def _count(self, servo: EmulatedServo, written: list[str]) -> None:
         store = servo.memory.store
 
         def counting(register: Any, value: int) -> None:
