@@ -140,8 +140,10 @@ class LikelihoodOptions:
     """Maximum relative decrease of a Coulomb width per iteration with fine steps, where the cost is nearly quadratic.
     """
     max_relative_decrease_coarse: float = 0.5
-    """The same with coarse steps, far from the minimum, where the cost is far from quadratic."""
+    """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
+    same_motion: float = 0.02
+    """Relative difference of two sums of squares, in coarse and in fine steps, up to which coarse ones may lead on."""
     same_cost: float = 1.0
     """Minima whose sums of squares differ by less than this count as the same."""
     close_cost: float = 25.0

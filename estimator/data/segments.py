@@ -31,7 +31,7 @@ class RecordingSegment:
     index: Indices
     """Grid points around each of its samples (samples, 4), counted from `first`."""
     weight: Array
-    """Weights of these for cubic interpolation (samples, 4)."""
+    """Weights of the grid points in `index` for cubic interpolation (samples, 4)."""
     position: Array
     """Measured positions (joints, samples) [rad]."""
     state: Array

@@ -18,7 +18,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.fit.objective import Run
-from hil.estimator.fit.reparametrisation import Sizes
+from hil.estimator.fit.reparametrisation import Lever, Sizes
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.identify import Estimate
@@ -67,9 +67,22 @@ class Linearised:
     samples: int
     """Number of valid samples over all joints; it equals the sum of squares, which is weighted by the residual."""
     colour: float
-    """Factor by which the residual's correlation increases chance decreases; 1 is white."""
+    """Factor by which the residual's correlation raises the decrease expected by chance; 1 for white residuals."""
     precision: Array
     """Inverse prior variances of the parameters (parameters,), 0 without a prior."""
+    lever: Lever | None = None
+    """Prior on coupling and gravity_2 together."""
+
+    @cached_property
+    def expected(self) -> Array:
+        """Normal equations of the priors of all causes (causes, causes)."""
+        expected = np.zeros_like(self.normal)
+        count = len(self.names)
+        expected[:count, :count] = np.diag(self.precision)
+        if self.lever is not None:
+            _, slope = self.lever.residual(self.value)
+            expected[:count, :count] += np.outer(slope, slope)
+        return expected
 
     @cached_property
     def states(self) -> list[int]:
@@ -88,8 +101,8 @@ class Linearised:
         at = [*self.places(names), *self.states]
         normal, gradient = self.normal[np.ix_(at, at)], self.gradient[at]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        prior = np.concatenate((self.precision[at[: len(names)]], np.zeros(len(self.states)))) * self.colour
-        inverse = np.linalg.pinv((normal + np.diag(prior)) / np.outer(scale, scale), rcond=1e-11, hermitian=True)
+        prior = self.expected[np.ix_(at, at)] * self.colour
+        inverse = np.linalg.pinv((normal + prior) / np.outer(scale, scale), rcond=1e-11, hermitian=True)
         step = -(inverse @ (gradient / scale)) / scale
         return float(-gradient @ step), step[: len(names)]
 
@@ -127,6 +140,7 @@ def linearised(
         int(np.isfinite(estimate.residual).sum()),
         colour(estimate.residual * weight),
         1.0 / spread**2,
+        Lever.of(estimate.model, estimate.parameters.get("gravity_2", 0.0), sizes),
     )
 
 
@@ -181,7 +195,8 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     own = normal[np.ix_(fitted, fitted)]
     across = normal[np.ix_(fitted, extra)]
     prior = about.precision[extra] / scale[extra] ** 2
-    inverse = np.linalg.pinv(own, rcond=1e-11, hermitian=True)
+    expected = about.expected[np.ix_(fitted, fitted)] / np.outer(scale[fitted], scale[fitted]) * about.colour
+    inverse = np.linalg.pinv(own + expected, rcond=1e-11, hermitian=True)
     follow = -inverse @ across
     told = (normal[np.ix_(extra, extra)] + across.T @ follow) / about.colour
     open_ = np.linalg.inv(0.5 * (told + told.T) + np.diag(prior) + 1e-12 * np.eye(len(extra)))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
+from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
@@ -30,9 +31,12 @@ from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
 from hil.plan.stabiliser import Stabiliser
 from hil.runs.recording import Phase, Recorder, missed
+from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
+_AGAIN_S = 2.2 * MOST_PATIENCE_S
+"""From one sample to the next there is time for two exchanges, however long both take."""
 
 
 class Progress(NamedTuple):
@@ -74,7 +78,8 @@ class Stream:
         self._config = config
         self._safety = config.safety
         planned = _largest_goals(plan)
-        self._guard = Guard(config, planned)
+        self._left_by_a_run = has_moved()
+        self._guard = Guard(config, planned, left_by_a_run=self._left_by_a_run)
         self._model: ModelWatch | ChainWatch = (
             ModelWatch(config, planned, arms)
             if isinstance(arms, Ensemble) or not config.is_chain
@@ -87,6 +92,8 @@ class Stream:
         self._watch = watch
         self._note = note
         self._interval = 1 / plan.rate
+        # A lost reply is asked for again where the next sample is far away.
+        self._asks_again = self._interval > _AGAIN_S
         self._ticks = FixedRate(bus.port.clock, plan.rate)
         self._index = 0
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
@@ -129,6 +136,12 @@ class Stream:
         self._note("rest")
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
+        window = rest_window(self._plan.rate)
+        # The stabiliser may have to bring it back first from where the run before was stopped.
+        for _ in range(0, self._plan.end_samples if self._left_by_a_run else 0, window):
+            if not moving:
+                break
+            moving = self._moving(self._play(self._silence(window), Phase.REST))
         if moving:
             raise ExperimentError(
                 f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
@@ -207,6 +220,9 @@ class Stream:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
             self._goal = self._guard.clamp(wanted)
             state = self._bus.exchange(self._goal)
+            if self._asks_again and any(state.missing):
+                self._guard.look(state)
+                state = self._bus.exchange(self._goal)
             self._sent_at = state.time_before_write
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
@@ -224,6 +240,8 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        if state.status is not None and self._guard.wants_status:
+            self._bus.read_status_next()
         self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)

@@ -83,7 +83,7 @@ class Plan:
         """Largest possible number of samples."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played + self.end_samples + self.brake_samples + self.lower_samples
+        return self.rest_samples + played + 2 * self.end_samples + self.brake_samples + self.lower_samples
 
     @property
     def expected(self) -> int:

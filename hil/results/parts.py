@@ -304,7 +304,7 @@ class StabiliserShare:
 
     @property
     def share(self) -> PerJoint:
-        """RMS of the stabiliser relative to that of the total torque, per joint; above 1 if it opposes the excitation."""
+        """RMS of the stabiliser relative to that of the total torque, per joint; may exceed 1."""
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:
