@@ -157,7 +157,7 @@ def _split(arms: ChainArms, arm: int) -> tuple[Array, Array]:
     return np.ascontiguousarray(table[:, :-1]), np.ascontiguousarray(table[:, -1])
 
 
-def _roll_loop(
+def _roll_loop(  # noqa: PLR0912
     chain: Any,
     link: Any,
     armature: Any,

@@ -26,8 +26,9 @@ HARDLY = 0.05  # rad: an arm that ends so near its rest pose lies
 
 @dataclass(frozen=True)
 class Fall:
-    """The hardest fall: from which moment [s] of the path, what meets what (None: nothing within FALL_S), after how long
-    [s], how far down [m] and how fast [m/s]; beyond: how far a joint gets past its limits in any fall (joints,) [rad].
+    """The hardest fall: from which moment [s] of the path, what meets what (None: nothing within FALL_S), after how
+    long [s], how far down [m] and how fast [m/s]; beyond: how far joints get past their limits in any fall (joints,)
+    [rad].
     """
 
     moment: float

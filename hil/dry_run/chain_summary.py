@@ -16,7 +16,8 @@ from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction, quantities_o
 
 @dataclass(frozen=True)
 class ChainDryRun:
-    """share: of the designed path, 1 where [joint_path] gives it. config: with path and stabiliser as they would be played.
+    """share: of the designed path, 1 where [joint_path] gives it. config: with path and stabiliser as they would be
+    played.
 
     shapes_guessed: links without readable geometry; as_built: pairs of which parts are taken to touch as built.
     """
@@ -148,15 +149,15 @@ def _lines(run: ChainDryRun) -> list[str]:
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
         f"Least clearance: {run.foreseen}.",
-        f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated arms then "
-        f"lie in the rest pose; least clearance on the way: {lowering.nearest}.",
-        f"Without commands (cable out, program killed, a servo lost) it falls; the hardest fall, from {fall.moment:.1f} s "
-        f"into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, at {fall.speed:.1f} m/s.",
+        f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated arms "
+        f"then lie in the rest pose; least clearance on the way: {lowering.nearest}.",
+        f"Without commands (cable out, program killed, a servo lost) it falls; hardest from {fall.moment:.1f} "
+        f"s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, at {fall.speed:.1f} m/s.",
     ]
     if run.shapes_guessed:
         lines.append(
-            f"No collision geometry could be read of {', '.join(run.shapes_guessed)}: capsules from joint to joint stand "
-            "for it (for a base, nothing)."
+            f"No collision geometry could be read of {', '.join(run.shapes_guessed)}: capsules from joint to joint "
+            "stand for it (for a base, nothing)."
         )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)

@@ -70,7 +70,7 @@ def make_chain_plan(config: Config) -> Plan:
 
 
 def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str, int], Path]) -> Plan:
-    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where they take too much torque."""
+    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where one takes too much."""
 
     def segment(config: Config, role: str, seed: int) -> PathSegment:
         return path_segment(config, thought, role, path(config, role, seed))
@@ -123,7 +123,7 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
 
 
 def check_clearance(config: Config, plan: Plan) -> None:
-    """Raise ConfigError where the wanted motion itself comes too near anything; a dry run says whether real arms would."""
+    """Raise ConfigError where the wanted motion itself comes too near anything; of real arms a dry run tells."""
     space = Space.of(config)
     for segment in plan.segments:
         assert isinstance(segment, PathSegment)
