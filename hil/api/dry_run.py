@@ -1,5 +1,6 @@
 """`hil.dry_run`: simulate the experiment on arms like the one on the bench. Nothing moves."""
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from html import escape
 from os import PathLike
@@ -88,6 +89,7 @@ def dry_run(
     result: str | PathLike[str] | None = None,
     arms: int = ARMS,
     servos: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Rehearsal:
     """Simulate the experiment on arms consistent with what is known of this one: `hil dry-run` as a function.
@@ -97,6 +99,8 @@ def dry_run(
         result: run folder or result.json of an earlier identification, used instead of [arm.prior].
         arms: number of arms to simulate.
         servos: also read the servos' limits and measure bus timing, with torque off.
+        executor: of concurrent.futures, or `hil.study.engine.executor`; it simulates the arms. The result is the same
+            with and without it.
         on_progress: called with a `Progress` when the simulation begins.
 
     Raises:
@@ -108,4 +112,4 @@ def dry_run(
     checked, shown = loaded(config)
     on_progress(Progress("simulation", "Simulating"))
     former = None if result is None else Path(result)
-    return Rehearsal(shown, checked, simulate(checked, former, arms, servos))
+    return Rehearsal(shown, checked, simulate(checked, former, arms, servos, executor))

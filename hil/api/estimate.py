@@ -1,6 +1,7 @@
 """`hil.estimate`: estimate parameters from a recording, without touching an arm."""
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from os import PathLike
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def estimate(
     *,
     config: PathLikeStr | None = None,
     all_samples: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Identification | Estimation:
     """Estimate an arm's parameters from a recording: `hil estimate` as a function.
@@ -30,6 +32,8 @@ def estimate(
         recording: a run folder or a `Run`, whose result.json is rewritten; or one or more CSV files of one arm.
         config: for CSV files, the TOML file whose [columns] table describes them.
         all_samples: use every sample of the run, by multiple shooting; no settled period is needed.
+        executor: of concurrent.futures, or `hil.study.engine.executor`; with `friction = "auto"` it begins fits that
+            may be needed, for shorter waiting and more work in all. The result is the same with and without it.
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:
@@ -60,7 +64,7 @@ def estimate(
         return estimation(estimate_unsettled(run), run.path)
     on_progress(Progress("estimation", "Estimating"))
     try:
-        result = estimate_run(run)
+        result = estimate_run(run, executor)
     except RecordingCutShort as error:
         error.add_note(f"To estimate without a settled period: hil estimate {run.path} --all-samples")
         raise
