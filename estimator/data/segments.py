@@ -58,10 +58,10 @@ class Grid:
     """(steps + 1,) [s]."""
 
     @classmethod
-    def of(cls, recording: Recording) -> "Grid":
-        """From the first sample to the last, in steps of at most LONGEST_STEP."""
+    def of(cls, recording: Recording, longest: float = LONGEST_STEP) -> "Grid":
+        """From the first sample to the last, in steps of at most `longest` [s]."""
         span = float(recording.time[-1] - recording.time[0])
-        count = int(np.ceil(span / LONGEST_STEP))
+        count = int(np.ceil(span / longest - 1e-9))
         step = span / count
         return cls(float(recording.time[0]), step, recording.time[0] + step * np.arange(count + 1))
 
@@ -69,15 +69,19 @@ class Grid:
 def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[RecordingSegment]:
     """Cut a recording into equal pieces of about `length` [s]; `number` says which recording it is.
 
-    Raises RecordingError when no piece holds FEWEST samples.
+    A piece in which the recording has a gap is left out. Raises RecordingError when no piece holds FEWEST samples.
     """
     steps = len(grid.edges) - 1
     pieces = max(1, round(steps * grid.step / length))
     edges = np.round(np.linspace(0, steps, pieces + 1)).astype(np.int64)
     place = (recording.time - grid.start) / grid.step
+    gaps = np.diff(recording.time) > recording.longest_interval
+    before, after = place[:-1][gaps], place[1:][gaps]
     segments = []
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         inside = (place >= first - 1e-6) & (place < last) if last < steps else (place >= first - 1e-6)
+        if np.any((before < last) & (after > first)):
+            continue
         if inside.sum() < FEWEST or not np.isfinite(recording.position[:, inside]).any(axis=1).all():
             continue
         index, weight = _cubic(place[inside] - first, last - first)
