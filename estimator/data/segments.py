@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 
@@ -36,6 +36,8 @@ class RecordingSegment:
     """Measured (joints, samples) [rad]."""
     state: Array
     """Angles and velocities at its start by a local fit (2, joints) [rad, rad/s]."""
+    samples: slice
+    """Which of the recording's samples are its own."""
 
     def at_samples(self, grid: Array) -> Array:
         """Values (joints, grid points, ...) interpolated at the times of the samples (joints, samples, ...)."""
@@ -87,13 +89,20 @@ def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Re
         index, weight = _cubic(place[inside] - first, last - first)
         state = _state_at(recording, grid.start + grid.step * first)
         segments.append(
-            RecordingSegment(number, first, last - first, index, weight, recording.position[:, inside], state)
+            RecordingSegment(
+                number, first, last - first, index, weight, recording.position[:, inside], state, _slice(inside)
+            )
         )
     if not segments:
         raise RecordingError(
             f"no piece of {length:g} s holds {FEWEST} samples: record faster, or choose longer segments"
         )
     return segments
+
+
+def _slice(inside: Mask) -> slice:
+    at = np.flatnonzero(inside)
+    return slice(int(at[0]), int(at[-1]) + 1)
 
 
 def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:

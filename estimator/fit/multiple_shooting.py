@@ -36,6 +36,7 @@ from hil.estimator.simulation.presliding_sensitivity import sensitive
 
 DEFAULTS = ShootingOptions()
 ALL = slice(None)
+MOST_WEIGHT = 1e9
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,13 @@ class Shooting:
         grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step)
         return segment.at_samples(np.concatenate((grid, end[:1].T), axis=1))
 
+    def position_by_values(
+        self, segment: RecordingSegment, values: Mapping[str, float], offsets: Array, own: Array
+    ) -> Array:
+        """The same by parameters [SI], the `offsets` of the zeros and the segment's own coordinates."""
+        state = own.reshape(2, -1) * self.state_scale
+        return self.position(segment, self._with_zeros(values, segment, offsets), state)
+
     def residual(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> Array:
         """Simulated minus measured positions of one segment in units of their noise (rows,)."""
         segment = self.segments[number]
@@ -210,7 +218,8 @@ class Shooting:
         if not precision.any():
             return Expected.nothing(shared.size)
         rows = [self.residual(coordinates, number, shared, each) for number, each in enumerate(own)]
-        weight = max(1.0, float(np.mean(np.concatenate(rows) ** 2)))
+        with np.errstate(over="ignore"):  # a motion that diverges
+            weight = min(max(1.0, float(np.mean(np.concatenate(rows) ** 2))), MOST_WEIGHT)
         return Expected(centre, weight * precision, weight)
 
     def start(self) -> Array:

@@ -194,7 +194,8 @@ def minimise_segmented(
 
 
 def _cost(rows: Sequence[Array]) -> float:
-    return float(sum(np.sum(np.square(row)) for row in rows))
+    with np.errstate(over="ignore"):  # a motion that diverges costs infinitely much
+        return float(sum(np.sum(np.square(row)) for row in rows))
 
 
 def _residuals(residual: Residual, shared: Array, own: Array, threads: ThreadPoolExecutor) -> list[Array]:

@@ -111,6 +111,17 @@ def held_out_errors(
     return np.asarray(whole), float(np.median(np.sqrt(np.mean(relative, axis=1))))
 
 
+def predicted_positions(recordings: Sequence[Recording], estimate: ShootingEstimate) -> tuple[Array, ...]:
+    """Positions (joints, samples) [rad] of each recording, segment by segment from its estimated state; NaN between."""
+    problem = _posed(recordings, estimate)
+    offsets = estimate.zeros.reshape(-1) / ShootingOptions().angle_scale
+    predicted = tuple(np.full(each.position.shape, np.nan) for each in recordings)
+    for segment, own in zip(problem.segments, estimate.own, strict=True):
+        found = problem.position_by_values(segment, estimate.parameters, offsets, own)
+        predicted[segment.recording][:, segment.samples] = found
+    return predicted
+
+
 def _posed(recordings: Sequence[Recording], estimate: ShootingEstimate, of: slice | None = None) -> Shooting:
     chosen = estimate.fitted if of is None else of
     return Shooting(

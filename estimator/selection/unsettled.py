@@ -97,6 +97,15 @@ def choose_by_shooting(
     return search.judged(plain, best)
 
 
+def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, start: Array) -> Array | None:
+    """Error of the estimate's model, fitted to every other segment, on the others (joints,); None for one segment."""
+    length, zeros = estimate.segment_length, bool(estimate.zeros.size)
+    if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
+        return None
+    search = _Search(recordings, start, length, zeros, DEFAULTS, None)
+    return search.trial(estimate, estimate.model).held_out
+
+
 class _Search:
     """Fits of one set of recordings, each from where another ended."""
 
@@ -175,10 +184,10 @@ class _Search:
 
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
         """The choice, after all segments were fitted: the plainer one if it predicts the held-out ones much better."""
-        plainest, chosen = self.trial(plain, plain.model), self.trial(best, best.model)
-        self.trial(plain, Model(plain.model.joints, "coulomb", plain.model.drive))  # to say what was gained
+        simple = Model(plain.model.joints, "coulomb", plain.model.drive)
+        plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)
         if plainest.score < self._options.overrule_ratio * chosen.score:
-            best, chosen = plain, plainest
+            best, chosen = self.fit(simple, plain) or best, plainest
         if not np.isfinite(chosen.score):
             raise ConvergenceError("no friction model could be fitted to half of the segments: record longer")
         return SegmentChoice(tuple(self._trials.values()), chosen, best)

@@ -133,12 +133,12 @@ def _taking_over(config: Config) -> Config:
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
     """The folder `out`, or a new one in runs/ named after time and arm. Raises RunFolderError."""
-    path = _unused(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
+    path = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
     log.info("run folder %s", path)
     return RunFolder.create(path, config)
 
 
-def _unused(path: Path) -> Path:
+def unused_path(path: Path) -> Path:
     """`path`, or `path` with a number appended: a program may start two runs within a second."""
     number = 2
     tried = path

@@ -18,7 +18,7 @@ truth        only on a fake arm: the base parameters it was built with
 physical     masses, centres and inertias, where [known] says something
 stabiliser   what it gave of the torque, where there was one
 steps        with a pilot: what was predicted of each step, and what was seen
-zeros, recordings   only of recordings made elsewhere
+zeros, recordings, notes   only of recordings made elsewhere; notes: what was guessed, put right or averaged
 """
 
 from collections.abc import Mapping
@@ -129,6 +129,7 @@ class ShootingResult(Result):
     fit: ShootingFit
     zeros: tuple[Zeros, ...] | None = None
     recordings: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
 
 
 def result_from_json(value: Mapping[str, Any]) -> Result:
