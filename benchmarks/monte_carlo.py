@@ -1,12 +1,12 @@
-"""Errors of many identifications against the Cramer-Rao bound, and how often the error bars cover the truth.
+"""Errors of many identifications relative to the Cramer-Rao bound, and coverage of the confidence intervals.
 
     python benchmarks/monte_carlo.py [--json] [--seeds N]
 
 The ideal fake arm (smooth Coulomb and viscous friction, written in masses and lengths, not in the estimator's
 equations), one settled period of 10 s at 400 Hz, 0.80 and 0.42 N m. Each seed draws new errors of position:
-normal ones of half an encoder step, then rounding to steps whose zero lies anywhere. The bound is that of white
-errors with the variance of both. WAVES multisines take turns. `rounding_only` is the same without the normal
-errors: what a good encoder gives, whose rounding is not white where a joint is slow.
+normal errors of half an encoder step, then rounding to steps with a random zero. The bound assumes white errors with
+the variance of both. The seeds cycle through WAVES multisines. `rounding_only` is the same without the normal errors,
+as for a good encoder, whose rounding errors are not white where a joint moves slowly.
 """
 
 import argparse
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from machine import machine
-from recorded_arm import Recorded, record, servo_arm, wave
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.simulated_run import SimulatedRun
@@ -24,6 +23,7 @@ from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.fakes.plants.arm import base_parameters
+from tests.support.recorded_arm import Recorded, record, servo_arm, wave
 
 WAVES = 10
 NOISE = 0.5  # encoder steps
@@ -32,7 +32,7 @@ MODEL = Model(2, "coulomb", "delay")
 
 
 def bound(recorded: Recorded, truth: dict[str, float], variance: float) -> np.ndarray:
-    """Standard deviation (parameters,) that no unbiased estimate from these positions can beat."""
+    """Cramer-Rao bound: smallest standard deviation (parameters,) of an unbiased estimate from these positions."""
     period = recorded.period(recorded.position)
     names = MODEL.names
     run = SimulatedRun.of(period)

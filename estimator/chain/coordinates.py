@@ -1,6 +1,6 @@
-"""Unconstrained coordinates of a chain's parameters: positive ones are exponentials, base parameters and offsets plain.
+"""Unconstrained coordinates of a chain's parameters: logarithms of positive ones, linear for the others.
 
-A base parameter is a sum that may have either sign; the fit must keep the mass matrix positive definite.
+A base parameter is a sum that may have either sign, so the fit itself must keep the mass matrix positive definite.
 """
 
 from collections.abc import Mapping
@@ -22,64 +22,66 @@ POSITIVE = {
     "torque_scale": 1e-3,
     "lag": 1e-5,
 }
-"""Kinds of positive parameters and the least that each starts with [its unit]."""
+"""Kinds of positive parameters and the minimum initial value of each [its unit]."""
 SMALL = {"offset": 0.01, "zero": 0.02, "delay": 1e-3}
-"""Scales of the others that are no base parameters [their unit]."""
+"""Scales of the other parameters that are not base parameters [their unit]."""
 SHAPES = {
     "coulomb_width": (0.01, 2.5),
     "stribeck_rise": (0.3, 1.0),
     "stribeck_velocity": (0.15, 0.7),
     "load": (0.03, 1.5),
 }
-"""Shape of friction near standstill: what is likely [its unit] and the standard deviation of its logarithm. A joint
-that is never slow says nothing of it, and without that would let it go anywhere."""
-RESHAPING = 1.0  # of their logarithms, in one step
-NARROWING, WIDENING = 0.8, 2.0  # of a width, in one step
-LONGEST = 2.0  # of any coordinate, in one step
-NEAREST = 1e-3  # of the floor: what a width always stays above it
+"""Prior on the shape of friction near standstill: typical value [its unit] and standard deviation of its logarithm.
+
+A joint that is never slow provides no information on these parameters; without a prior they would drift arbitrarily.
+"""
+RESHAPING = 1.0  # maximum change of a shape's logarithm per step
+NARROWING, WIDENING = 0.8, 2.0  # maximum relative decrease and increase of a width per step
+LONGEST = 2.0  # maximum change of any coordinate per step
+NEAREST = 1e-3  # minimum distance of a width from its floor, as a fraction of the floor
 
 
 @dataclass(frozen=True)
 class ChainCoordinates:
-    """The map between parameters and coordinates of about the size of 1."""
+    """The map between parameters and coordinates of order 1."""
 
     names: tuple[str, ...]
     scales: Array
-    """Of base parameters, in their place; ignored for others (parameters,)."""
+    """Scales of the base parameters, at their indices; ignored for others (parameters,)."""
     width_floor: float
-    """What every Coulomb step's width stays above [rad/s]."""
+    """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
 
     def values(self, x: Array) -> Array:
-        """Parameters (parameters,) at the coordinates `x`."""
+        """Return the parameters (parameters,) at the coordinates `x`."""
         positive = np.exp(np.where(self._positive, x, 0.0)) + self._floors
         value: Array = np.where(self._positive, positive, x * self._scales)
         return value
 
     def coordinates(self, value: Array) -> Array:
-        """Coordinates of `value` (parameters,), moved into the physical range."""
+        """Return the coordinates of `value` (parameters,), moved into the physical range."""
         above = np.maximum(value - self._floors, np.maximum(self._least, NEAREST * self._floors))
         x: Array = np.where(self._positive, np.log(np.where(self._positive, above, 1.0)), value / self._scales)
         return x
 
     def slopes(self, x: Array) -> Array:
-        """Derivative of each parameter by its coordinate (parameters,)."""
+        """Return the derivative of each parameter by its coordinate (parameters,)."""
         slope: Array = np.where(self._positive, self.values(x) - self._floors, self._scales)
         return slope
 
     def limit(self, x: Array, least: Array, most: Array) -> None:
-        """Lower in place what coordinates may change by in one step from `x`."""
+        """Set, in place, the bounds on the change of each coordinate in one step from `x`."""
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], RESHAPING, LONGEST)
         least[:count], most[:count] = -bound, bound
         widths = np.flatnonzero(self._floors)
-        share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
+        share = 1.0 + self.width_floor * np.exp(-x[widths])  # width relative to its distance from the floor
         least[widths], most[widths] = np.maximum(-1.0, -NARROWING * share), WIDENING * share
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Where `step` leads from `x`, both with coordinates of something else at their end.
+        """Return the point reached by `step` from `x`; both may be followed by coordinates of something else.
 
-        The motion follows a width and not its logarithm: by the exponential of the step it would never arrive at its
-        floor.
+        A step changes a width linearly rather than its logarithm, since the motion depends linearly on it; exponential
+        steps would never reach its floor.
         """
         y: Array = x + step
         widths = np.flatnonzero(self._floors)
@@ -88,7 +90,7 @@ class ChainCoordinates:
 
     @cached_property
     def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the shapes of friction, their likely coordinates and the standard deviations of these."""
+        """Indices of the friction-shape parameters, their typical coordinates and the standard deviations of these."""
         index = np.array([i for i, kind in enumerate(self._kinds) if kind in SHAPES], dtype=np.int64)
         pairs = np.array([SHAPES[self._kinds[i]] for i in index]).reshape(-1, 2)
         return index, np.log(pairs[:, 0]), pairs[:, 1]
@@ -116,6 +118,6 @@ class ChainCoordinates:
 
 
 def kind_of(name: str) -> str:
-    """A parameter's name without its joint's number."""
+    """Return a parameter's name without the joint number."""
     kind, _, number = name.rpartition("_")
     return kind if number.isdigit() else name

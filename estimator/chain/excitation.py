@@ -1,8 +1,8 @@
-"""A path that excites a chain: finite Fourier series of the joint angles (Swevers, Ganseman, Tukel, De Schutter, Van
-Brussel, IEEE Transactions on Robotics and Automation 13 (1997) 730).
+"""Excitation of a chain by paths that are finite Fourier series of the joint angles.
 
-Played as the torque that a rough model of the arm needs for it, with a spring and a damper in software around it. Of
-several paths with random phases, the one that determines the base parameters best overall is chosen.
+Swevers, Ganseman, Tukel, De Schutter, Van Brussel, IEEE Transactions on Robotics and Automation 13 (1997) 730. A path
+is played as the torque that a rough model of the arm needs for it, plus a software spring and damper. Among several
+paths with random phases, the one that best determines the base parameters as a whole is chosen.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from hil.estimator.chain.prior import Prior
 from hil.estimator.errors import ExcitationError
 
 CANDIDATES = 24
-LOOKED_AT = 200  # samples of each candidate
-NOISE = 0.02  # of a joint's torque: what a candidate's regression is thought to leave
+LOOKED_AT = 200  # samples of each candidate that are evaluated
+NOISE = 0.02  # assumed residual of a candidate's regression, as a fraction of each joint's torque
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,12 @@ def design_path(
     speed: Array,
     seed: int,
 ) -> Path:
-    """A path about `centre` (joints,) [rad] with harmonics up to `highest` [Hz], each joint within `swing` (joints,)
-    [rad] of it and no faster than `speed` (joints,) [rad/s]. Raises ExcitationError."""
+    """Design a path with harmonics up to `highest` [Hz], in which each joint stays within limits.
+
+    The joints stay within `swing` (joints,) [rad] of `centre` (joints,) [rad] and below `speed` (joints,) [rad/s].
+    rate: samples per second; period [s]; prior: rough parameters, whose uncertainty weights the information. Raises
+    ExcitationError.
+    """
     count = int(np.floor(highest * period + 1e-9))
     if count < 2 or highest > rate / 8 or min(swing.min(), speed.min()) <= 0.0:
         raise ExcitationError(
@@ -66,7 +70,7 @@ def _candidate(
 
 
 def _certainty(base: BaseParameters, prior: Prior, path: Path) -> float:
-    """Logarithm of the determinant of the information about the base parameters, in units of the prior's."""
+    """Return the log determinant of the information about the base parameters, relative to that of the prior."""
     some = slice(0, None, max(1, path.position.shape[1] // LOOKED_AT))
     Y = base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
     level = np.sqrt(np.mean((Y @ prior.value) ** 2, axis=1)) + 1e-9

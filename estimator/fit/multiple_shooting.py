@@ -1,10 +1,10 @@
 """Multiple shooting: maximum likelihood on any recording, cut into segments with unknown initial states.
 
-Open-loop simulation accumulates errors: on a long recording, model error or the chaos of a tumbling arm
-swamps the parameters' influence. On a segment of a second it does not. Bock, "Recent advances in parameter
-identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems
-(1983). The segments are not joined: noise that a rigid arm does not have, such as play and flexing, may
-move the state between them.
+Open-loop simulation accumulates errors: on a long recording, model errors or the chaos of a tumbling arm mask the
+parameters' influence. On a segment of a second they do not. Bock, "Recent advances in parameter identification
+techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems (1983). The segments are
+not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the state between
+them.
 
 Short segments come first, since they converge from a poor initial guess, and only some of them, since a neighbourhood
 is all that is wanted; longer ones then refine the result, first with long steps of integration. A segment whose
@@ -25,7 +25,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.data.segments import Grid, RecordingSegment, cut, grid_torque, grid_torque_slopes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import by_parameters
-from hil.estimator.fit.reparametrisation import Coordinates, Prior, Sizes, scales_of
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Sizes, scales_of
 from hil.estimator.fit.segmented_least_squares import Expected, Segmented, minimise_segmented
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
@@ -48,18 +48,18 @@ class ShootingEstimate:
     """`model.names`."""
     units: tuple[str, ...]
     value: Array
-    """(parameters,) [SI]."""
+    """Values (parameters,) [SI]."""
     covariance: Array
-    """(parameters, parameters), robust against model error: see `Segmented.covariance`."""
+    """Covariance (parameters, parameters), robust to model errors: see `Segmented.covariance`."""
     zeros: Array
-    """True minus measured angle of each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
+    """True minus measured angle for each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
     zeros_std: Array
-    """Their standard errors, shaped alike."""
+    """Standard errors of `zeros`, with the same shape."""
     residual_rms: Array
-    """Measured minus simulated position (joints,) [rad]."""
+    """RMS of measured minus simulated position (joints,) [rad]."""
     segments: int
     segment_length: float
-    """[s]."""
+    """Nominal length of a segment [s]."""
     iterations: int
     residual_over_noise: Array
     """RMS in units of the noise (joints,)."""
@@ -81,7 +81,7 @@ class ShootingEstimate:
 
 
 class Shooting:
-    """The residuals of all segments by coordinates."""
+    """The residuals of all segments as a function of coordinates."""
 
     def __init__(
         self,
@@ -116,12 +116,12 @@ class Shooting:
         self._driven: dict[tuple[float, float], list[tuple[Array, Array]]] = {}
 
     def coordinates(self, inertia: float) -> Coordinates:
-        """The parameters' coordinates; `inertia` [kg m^2] of the arm as a scale."""
+        """Return the parameters' coordinates; `inertia` [kg m^2]: typical inertia of the arm."""
         scales = scales_of(self._model.names, Sizes(*self._scales, inertia))
         return Coordinates(self._model.names, scales, self._options.coordinates)
 
     def position(self, segment: RecordingSegment, physics: Physics, state: Array) -> Array:
-        """Simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
+        """Return the simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
         torque = self._torque(segment, physics)[0]
         step = self._grids[segment.recording].step
         grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step)
@@ -135,7 +135,7 @@ class Shooting:
         return self.position(segment, self._with_zeros(values, segment, offsets), state)
 
     def residual(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> Array:
-        """Simulated minus measured positions of one segment in units of their noise (rows,)."""
+        """Return simulated minus measured positions of one segment, in units of their noise (rows,)."""
         segment = self.segments[number]
         position = self.position(
             segment, self._physics(coordinates, segment, shared), own.reshape(2, -1) * self.state_scale
@@ -167,7 +167,7 @@ class Shooting:
             (*names, *zeros, *state),
             self._grids[segment.recording].step,
         )
-        # The state after the last step is the sample before one more, of whatever torque.
+        # One step is appended so that the state after the last step is returned; its torque is irrelevant.
         torque, slopes = (
             np.pad(each, ((0, 0),) * (each.ndim - 1) + ((0, 1),)) for each in self._torque(segment, physics)
         )
@@ -186,7 +186,7 @@ class Shooting:
         return self._rows(number, segment.at_samples(grid)), columns.reshape(-1, columns.shape[2])
 
     def errors(self, coordinates: Coordinates, found: Segmented) -> Array:
-        """RMS of simulated minus measured position, segment by segment (segments, joints) [rad]."""
+        """Return the RMS of simulated minus measured position of each segment (segments, joints) [rad]."""
         rms = np.empty_like(self._trust)
         for number, (segment, own) in enumerate(zip(self.segments, found.own, strict=True)):
             rows = self.residual(coordinates, number, found.shared, own).reshape(self._model.joints, -1)
@@ -200,7 +200,7 @@ class Shooting:
         return np.asarray(np.sqrt(mean) / self.noise[:, 0])
 
     def downweight(self, errors: Array) -> None:
-        """Downweight the segments whose `errors`, as the method of this name gives them, are larger than usual."""
+        """Downweight the segments whose `errors` (segments, joints) [rad] are larger than usual."""
         usual = np.median(errors, axis=0)
         self._trust = np.minimum(1.0, usual / np.maximum(errors, 1e-12))
 
@@ -212,7 +212,7 @@ class Shooting:
         """What is usual of small terms, held against what the model leaves at these coordinates."""
         count = len(coordinates.names)
         inertia = float(coordinates.scales[coordinates.names.index("inertia_1")])
-        prior = Prior.of(coordinates.names, coordinates.scales, Sizes(*self._scales, inertia))
+        prior = CoordinatePrior.of(coordinates.names, coordinates.scales, Sizes(*self._scales, inertia))
         centre, precision = np.zeros(shared.size), np.zeros(shared.size)
         centre[:count], precision[:count] = prior.centre, prior.precision
         if not precision.any():
@@ -223,7 +223,7 @@ class Shooting:
         return Expected(centre, weight * precision, weight)
 
     def start(self) -> Array:
-        """Each segment's own coordinates as its measured positions suggest (segments, 2 joints)."""
+        """Return initial guesses of each segment's own coordinates from its measured positions (segments, 2 joints)."""
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
     def _zeros_of(self, segment: RecordingSegment) -> slice:
@@ -243,7 +243,7 @@ class Shooting:
         return Physics.of({**values, **{f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)}})
 
     def _noise(self, number: int) -> Array:
-        """Assumed standard deviation of a segment's samples (joints, 1) [rad]."""
+        """Return the assumed standard deviation of a segment's samples (joints, 1) [rad]."""
         noise: Array = self.noise / self._trust[number][:, None]
         return noise
 
@@ -253,7 +253,7 @@ class Shooting:
         return np.asarray((difference / self._noise(number)).reshape(-1))
 
     def _torque(self, segment: RecordingSegment, physics: Physics) -> tuple[Array, Array]:
-        """Motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
+        """Return the motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
         key = (physics.delay, physics.lag)
         driven = self._driven.get(key)
         if driven is None:
@@ -279,7 +279,7 @@ def estimate_by_shooting(
     near: ShootingEstimate | None = None,
     options: ShootingOptions = DEFAULTS,
 ) -> ShootingEstimate:
-    """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
+    """Estimate parameters by maximum likelihood over all `recordings`, cut into segments.
 
     `start`: base parameters (base parameters,) [SI], for instance of `hil.estimator.baselines.idim`. The same
     recordings give the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one
@@ -379,14 +379,14 @@ def _estimate(
 
 
 def _samples(segment: RecordingSegment) -> Array:
-    """Samples that hold a position (joints,)."""
+    """Return the number of valid samples (joints,)."""
     return np.asarray(np.isfinite(segment.position).sum(axis=1), dtype=np.float64)
 
 
 def _initial_guesses(
     problem: Shooting, coordinates: Coordinates, model: Model, base: Array, options: ShootingOptions
 ) -> Iterator[Array]:
-    """Initial shared coordinates: `base`, completed by guesses for friction."""
+    """Yield initial shared coordinates: `base`, completed by guesses for friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), options.initial_width)
     for joint in range(1, model.joints + 1):

@@ -1,8 +1,8 @@
-"""Nonlinear least squares with unknowns shared by all segments and unknowns of each segment alone.
+"""Nonlinear least squares with unknowns shared by all segments and unknowns of each segment.
 
-A segment's own unknowns touch only its own residuals, so the normal equations have an arrow's shape: each
-segment's block is eliminated by itself (Schur complement), and its columns of the Jacobian are taken for all
-segments at once. Hundreds of initial states cost as much as four.
+A segment's own unknowns only affect its own residuals, so the normal equations have an arrowhead structure: each
+segment's block is eliminated by itself (Schur complement), and the corresponding columns of the Jacobian are computed
+for all segments at once. Hundreds of initial states cost as much as four.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,15 +18,15 @@ from hil.estimator.options import SegmentedMinimiserOptions
 from hil.estimator.threads import thread_count
 
 Residual = Callable[[int, Array, Array], Array]
-"""Residuals (rows,) of one segment at shared coordinates (shared,) and its own (own,)."""
+"""Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
-"""The same residuals and their derivatives by shared coordinates, then by its own (rows, shared + own)."""
+"""Returns the same residuals, and their derivatives by shared, then own coordinates (rows, shared + own)."""
 
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3
-MIN_EIGENVALUE = 1e-12  # of the largest: below, a direction leaves no trace
-MIN_PART = 1e-4  # of a coordinate in such a direction, squared: less is rounding
+MIN_EIGENVALUE = 1e-12  # relative to the largest; directions below have no effect on the residual
+MIN_PART = 1e-4  # squared component of a coordinate in such a direction; anything smaller is rounding error
 
 
 @dataclass(frozen=True)
@@ -56,31 +56,30 @@ class Segmented:
     """Minimum of the sum of squares."""
 
     shared: Array
-    """(shared,)."""
+    """Shared coordinates (shared,)."""
     own: Array
-    """(segments, own)."""
+    """Own coordinates (segments, own)."""
     cost: float
     """Sum of squares."""
     information: Array
-    """Of the shared coordinates, the segments' own eliminated (shared, shared)."""
+    """Information about the shared coordinates, with the segments' own eliminated (shared, shared)."""
     scores: Array
-    """Each segment's gradient by the shared coordinates, its own eliminated (segments, shared)."""
+    """Gradient of each segment by the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
     expected: Expected | None = None
     """What of `information` was expected, not measured."""
 
     def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
-        """Sandwich covariance of the shared coordinates (shared, shared), segments taken as independent.
+        """Return the sandwich covariance of the shared coordinates (shared, shared), taking segments as independent.
 
-        If `groups` (segments,) says which recording each is from, all is as much more uncertain as the recordings
-        disagree more than their segments would make them: a repeated motion repeats the model's error. The last `own`
-        coordinates belong to one recording each.
+        It is valid if residuals within a segment are correlated, as model errors are: Liang and Zeger, "Longitudinal
+        data analysis using generalized linear models", Biometrika 73 (1986) 13. With fewer than MIN_SEGMENTS times as
+        many segments as coordinates, correlations cannot be estimated; then a single factor scales the covariance for
+        white noise. Infinite for coordinates that can change, alone or together, without affecting the residual.
 
-        It holds when the residuals of a segment hang together, as model error makes them: Liang and Zeger,
-        "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13. Fewer than
-        MIN_SEGMENTS times as many segments as coordinates cannot tell what correlates with what: they tell
-        one factor by which all is more uncertain than white noise would make it. Infinite for a coordinate that can
-        change, alone or with others, and leave no trace.
+        groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
+        because a repeated motion repeats the model error, the whole covariance is increased accordingly.
+        own: number of coordinates, at the end, that belong to one recording each.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
@@ -104,13 +103,15 @@ class Segmented:
 
 
 def _size(scores: Array, bread: Array) -> float:
-    """Sum of the squares of scores (scores, shared) in units of what white noise would make of them."""
+    """Return the sum of squares of scores (scores, shared) relative to that expected for white noise."""
     return float(np.einsum("si,ij,sj->", scores, bread, scores))
 
 
 def _inverse(matrix: Array) -> tuple[Array, Array]:
-    """Of a matrix that is positive semidefinite but for rounding, without the directions that are not seen at all;
-    and which coordinates have part in those."""
+    """Return the pseudo-inverse of a positive semidefinite matrix, and which coordinates it leaves undetermined.
+
+    Directions without effect on the residual are left out; a coordinate with a component in one is undetermined.
+    """
     size, direction = np.linalg.eigh(matrix)
     seen = size > MIN_EIGENVALUE * size[-1]
     inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
@@ -120,21 +121,21 @@ def _inverse(matrix: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Normal equations, a block for each segment."""
+    """Normal equations, one block per segment."""
 
     shared: Array
-    """(segments, shared, shared)."""
+    """J'J of the shared coordinates (segments, shared, shared)."""
     mixed: Array
-    """(segments, shared, own)."""
+    """J'J between shared and own coordinates (segments, shared, own)."""
     own: Array
-    """(segments, own, own)."""
+    """J'J of the own coordinates (segments, own, own)."""
     shared_gradient: Array
-    """(segments, shared)."""
+    """J'r of the shared coordinates (segments, shared)."""
     own_gradient: Array
-    """(segments, own)."""
+    """J'r of the own coordinates (segments, own)."""
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array, Array]:
-        """Information and scores with the segments' own eliminated, and what recovers their own steps."""
+        """Return information and scores with own coordinates eliminated, and the terms that recover those."""
         eye = np.eye(self.own.shape[1])
         scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14
         damped = self.own + damping * self.own * eye + scale * eye
@@ -167,7 +168,7 @@ def minimise_segmented(
         rows = _residuals(residual, shared, own, threads)
         cost = _cost(rows) + prior.cost(shared)
         if not np.isfinite(cost):
-            raise ConvergenceError("the initial guess gives no finite motion: check the units of torque and time")
+            raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):
             blocks = _blocks(derivative, shared, own, threads)

@@ -43,15 +43,15 @@ class SegmentTrial:
 
     model: Model
     held_out: Array | None
-    """RMS error over the motion's RMS (joints,); None where the fit found no end."""
+    """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Of the usual segment, the median, all joints together: where an arm turns over, one can be off by any amount."""
+    """Median of the segments' relative errors over all joints: a segment in which the arm turns over can be far off."""
     seconds: float
 
 
 @dataclass(frozen=True)
 class SegmentChoice:
-    """The models tried, in order, the one chosen, and its fit to all segments."""
+    """The models tried, in order, the chosen one, and its fit to all segments."""
 
     trials: tuple[SegmentTrial, ...]
     chosen: SegmentTrial
@@ -82,8 +82,8 @@ def choose_by_shooting(
     """
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(
-            f"no recording holds two segments of {length:g} s, one to fit and one to check: set model.friction to one "
-            "of the models, record longer, or choose shorter segments"
+            f"no recording has two segments of {length:g} s, one to fit and one to check: set model.friction to a "
+            "specific model, record longer, or choose shorter segments"
         )
     joints = recordings[0].joints
     unknown: tuple[Option, ...] = ("torque_scale",) if joints == 2 else ()

@@ -1,5 +1,6 @@
-"""`hil.dry_run`: the experiment simulated on arms like the one on the bench. Nothing moves."""
+"""`hil.dry_run`: simulate the experiment on arms like the one on the bench. Nothing moves."""
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from html import escape
 from os import PathLike
@@ -20,7 +21,10 @@ __all__ = ["Rehearsal", "dry_run"]
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Rehearsal:
-    """What a dry run predicts. file: the configuration's, as the caller wrote it. found: everything it computed."""
+    """The outcome of a dry run.
+
+    file: the configuration file, as the caller gave it. found: the complete results of the simulation.
+    """
 
     file: Path
     config: Config
@@ -28,12 +32,12 @@ class Rehearsal:
 
     @property
     def is_safe(self) -> bool:
-        """Whether the experiment as configured may be run; without a configured torque, the largest safe one is."""
+        """Whether the configured torque is safe; if none is configured, whether a safe torque exists."""
         return self.found.is_safe(self.config)
 
     @property
     def stop_chance(self) -> float:
-        """Chance that the guard would have to stop the arm, from 0 to 1."""
+        """Probability that the guard would have to stop the arm, from 0 to 1."""
         return float(self.prediction.stop_chance)
 
     @property
@@ -47,11 +51,11 @@ class Rehearsal:
         return self.found.largest.prediction if self.found.asked is None else self.found.asked
 
     def to_json(self) -> dict[str, Any]:
-        """What `hil dry-run --json` prints."""
+        """The object that `hil dry-run --json` prints."""
         return dry_run_json(self.config, self.found)
 
     def plot(self) -> Any:
-        """The simulated arms over time against the position limits, as a matplotlib figure. Raises MissingExtra."""
+        """Plot the simulated motions against the position limits as a matplotlib figure. Raises MissingExtra."""
         from hil.dry_run.plot import plot
 
         return plot(self.config, self.prediction)
@@ -85,24 +89,27 @@ def dry_run(
     result: str | PathLike[str] | None = None,
     arms: int = ARMS,
     servos: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Rehearsal:
-    """Simulate the experiment on arms that could be this one: `hil dry-run` as a function.
+    """Simulate the experiment on arms consistent with what is known of this one: `hil dry-run` as a function.
 
     Args:
         config: TOML file of the arm, the name of a bundled one, or a loaded configuration.
         result: run folder or result.json of an earlier identification, used instead of [arm.prior].
-        arms: how many to simulate.
+        arms: number of arms to simulate.
         servos: also read the servos' limits and measure bus timing, with torque off.
+        executor: of concurrent.futures, or `hil.study.engine.executor`; it simulates the arms. The result is the same
+            with and without it.
         on_progress: called with a `Progress` when the simulation begins.
 
     Raises:
         ConfigError: the configuration is wrong.
         ResultError: `result` holds no result.
         NoSafeTorque: no torque keeps all simulated arms within their limits.
-        hil.drivers.errors.DriverError: with `servos`, if they do not answer.
+        hil.drivers.errors.DriverError: `servos` is true and the servos do not answer.
     """
     checked, shown = loaded(config)
     on_progress(Progress("simulation", "Simulating"))
     former = None if result is None else Path(result)
-    return Rehearsal(shown, checked, simulate(checked, former, arms, servos))
+    return Rehearsal(shown, checked, simulate(checked, former, arms, servos, executor))

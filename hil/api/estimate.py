@@ -1,6 +1,7 @@
-"""`hil.estimate`: from a recording to a result, without touching an arm."""
+"""`hil.estimate`: estimate parameters from a recording, without touching an arm."""
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from datetime import datetime
 from os import PathLike
@@ -29,6 +30,7 @@ def estimate(
     config: PathLikeStr | None = None,
     out: PathLikeStr | None = None,
     all_samples: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Identification | Estimation:
     """Estimate an arm's parameters from a recording: `hil estimate` as a function.
@@ -41,6 +43,8 @@ def estimate(
         out: for recordings of other tools, the folder of the result, which must be new or empty; runs/TIME-NAME unless
             given.
         all_samples: of a run, use every sample by multiple shooting; no settled period is needed.
+        executor: of concurrent.futures, or `hil.study.engine.executor`; with `friction = "auto"` it begins fits that
+            may be needed, for shorter waiting and more work in all. The result is the same with and without it.
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:
@@ -72,7 +76,7 @@ def estimate(
         return estimation(estimate_unsettled(run), run.path)
     on_progress(Progress("estimation", "Estimating"))
     try:
-        result = estimate_run(run)
+        result = estimate_run(run, executor)
     except RecordingCutShort as error:
         error.add_note(f"To estimate without a settled period: hil estimate {run.path} --all-samples")
         raise

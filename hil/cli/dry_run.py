@@ -1,4 +1,4 @@
-"""The command `hil dry-run`: its options; `hil.dry_run.run` does the work."""
+"""The command `hil dry-run` and its options; `hil.dry_run.run` does the work."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ def dry_run(
         Path | None, typer.Option("--result", metavar="RUN", help="Earlier run whose result replaces the prior.")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="Also plot it: .png or .svg.")
+        Path | None, typer.Option("--picture", metavar="FILE", help="Also save a plot: .png or .svg.")
     ] = None,
     arms: Annotated[int, typer.Option("--arms", min=20, max=5000, help="Number of arms to simulate.")] = 128,
     servos: Annotated[
@@ -23,7 +23,7 @@ def dry_run(
     ] = False,
     json_only: Json = False,
 ) -> None:
-    """Simulate the experiment on arms like yours; exit code 1 if it might touch a limit."""
+    """Simulate the experiment on arms like yours; exit code 1 if it might exceed a limit."""
     from rich.console import Console
 
     from hil.api.dry_run import dry_run as simulate

@@ -1,6 +1,6 @@
-"""The subcommands from an arm to its parameters: identify, record, estimate.
+"""The subcommands that identify, record and estimate.
 
-The modules that do the work are imported inside the commands, so that `hil --help` answers at once.
+The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ AllSamples = Annotated[
 
 
 def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
-    """Excite the arm, take one settled period, print its parameters with error bars."""
+    """Excite the arm, record one settled period, and print its parameters with error bars."""
     from hil.api.experiment import identify as identify_arm
     from hil.cli.terminal import Terminal
 
@@ -45,7 +45,7 @@ def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = Fals
 
 
 def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
-    """Play the experiment and keep its recording, for `hil estimate`."""
+    """Play the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
     from hil.cli.terminal import Terminal
     from hil.results.json_form import to_json
@@ -56,7 +56,7 @@ def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False,
         recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
         print(strict_json.dumps(recorded))
         return
-    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nEstimate from it: hil estimate {run.path}")
+    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nTo estimate from it: hil estimate {run.path}")
 
 
 def estimate(

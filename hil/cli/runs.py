@@ -1,4 +1,4 @@
-"""The subcommands about many runs: the list of them, a name and a note for one, the difference of two.
+"""The subcommands that list runs, name and annotate a run, and compare two runs.
 
 The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
@@ -19,7 +19,7 @@ def runs(
     folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder that holds the run folders.")] = Path("runs"),
     json_only: Json = False,
 ) -> None:
-    """List the runs in a folder: arm, when, verdict, residual, name and note."""
+    """List the runs in a folder: arm, date, verdict, residual, name and note."""
     from hil.runs.collection import find_runs
 
     found = find_runs(folder)
@@ -27,7 +27,7 @@ def runs(
         print(strict_json.dumps({"runs": [run.to_json() for run in found]}))
         return
     if not found:
-        print(f"No run in {folder}. `hil identify ARM.toml` makes one.")
+        print(f"No runs in {folder}. `hil identify ARM.toml` creates one.")
         return
     from rich.console import Console
     from rich.markup import escape
@@ -69,7 +69,7 @@ def diff(
     ] = None,
     json_only: Json = False,
 ) -> None:
-    """What changed on an arm between two runs, and whether the change is significant: is the gearbox wearing?"""
+    """Compare two runs of an arm and test which parameters changed significantly, for example from gearbox wear."""
     from hil.estimation.diff import diff_runs
 
     difference = diff_runs(before, after)
@@ -82,7 +82,7 @@ def diff(
         return
     _print_difference(difference)
     if png is not None:
-        print(f"Drawn in {png}")
+        print(f"Plot: {png}")
 
 
 def _print_difference(difference: "Difference") -> None:

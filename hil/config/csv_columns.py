@@ -1,6 +1,6 @@
-"""What a recording made elsewhere needs beside its numbers: columns, units, and the arm's few facts.
+"""Description of a recording made elsewhere: its columns, their units, and a few facts about the arm.
 
-The same TOML as for an experiment will do, or a shorter one; tables that only the bus needs are ignored.
+The TOML file of an experiment can be used, or a shorter one; tables that only the bus needs are ignored.
 
     [arm]
     gravity = 9.81
@@ -8,7 +8,7 @@ The same TOML as for an experiment will do, or a shorter one; tables that only t
     friction = "stribeck"
     drive = "delay"
     [columns]
-    time = "time"                                     # seconds unless said otherwise
+    time = "time"                                     # in seconds unless time_unit is given
     position = ["pos_meas1", "pos_meas2"]             # one per joint
     torque = ["tau_meas1", "tau_meas2"]               # or current, which needs torque_constant
     position_unit = "rad"                             # rad, deg, turns
@@ -125,7 +125,7 @@ class Columns(_Table):
 
 
 class ArmFacts(BaseModel):
-    """`[arm]`, of which only gravity is used here."""
+    """`[arm]`; only gravity is used here."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 

@@ -1,7 +1,7 @@
-"""Successive periods compared as they are played, so that no burst of work is needed at the end of a period.
+"""Comparison of successive periods while they are played, which avoids a burst of work at the end of a period.
 
-The difference is that of `hil.estimator.data.periodicity.settling_difference`, summed sample by sample: at the end of a
-period only a few divisions are left. The former period lies in one buffer, which the latest one overwrites.
+The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated sample by sample: at the end
+of a period only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
 """
 
 from array import array
@@ -12,7 +12,7 @@ _EMPTY = float("nan")
 
 
 class Repetition:
-    """Positions of a period, of at most `samples`, against those of the period before it."""
+    """Compares the positions of a period of up to `samples` samples with those of the period before."""
 
     def __init__(self, samples: int, joints: int) -> None:
         self._half = 0
@@ -20,12 +20,12 @@ class Repetition:
         self.begin(samples)
 
     def begin(self, samples: int) -> None:
-        """A new period of so many samples starts."""
+        """Start a new period of `samples` samples."""
         self._half = samples // 2
         self._sums = [_Sums() for _ in self._former]
 
     def add(self, index: int, position: Sequence[float]) -> None:
-        """Sample `index` of the period: positions of all joints [rad], NaN where missing."""
+        """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
         compared = index >= self._half
         for former, sums, latest in zip(self._former, self._sums, position, strict=True):
             if not isnan(latest):
@@ -37,17 +37,19 @@ class Repetition:
 
     @property
     def moved(self) -> list[float]:
-        """From the lowest to the highest position of this period (joints,) [rad]; NaN where no reply came."""
+        """Range of each joint's positions in this period (joints,) [rad]; NaN if no reply was received."""
         return [sums.highest - sums.lowest if sums.highest >= sums.lowest else _EMPTY for sums in self._sums]
 
     @property
     def difference(self) -> float:
-        """RMS difference of the later halves over the RMS of the motion, the worst joint."""
+        """RMS difference between the second halves of the periods, relative to the RMS of the motion; the worst
+        joint's.
+        """
         return max(sums.relative for sums in self._sums)
 
 
 class _Sums:
-    """One joint's."""
+    """Running sums of one joint."""
 
     __slots__ = ("_first", "_pairs", "_seen", "_squared", "_sum", "_sum_of_squares", "highest", "lowest")
 
@@ -59,7 +61,7 @@ class _Sums:
 
     def add(self, former: float, latest: float) -> None:
         if self._seen == 0:
-            self._first = latest  # sums of small numbers keep their digits
+            self._first = latest  # subtracting it avoids cancellation
         from_first = latest - self._first
         self._seen += 1
         self._sum += from_first

@@ -1,4 +1,4 @@
-"""The page: its sections in their order, one template, one style sheet, one script, all in one file."""
+"""The report page: all sections, rendered by one template into a single self-contained file."""
 
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -80,10 +80,10 @@ def render(title: str, started: str, shown: Sequence[Section]) -> str:
 
 
 def sections(data: RunData) -> list[Section]:
-    """The sections whose data the run holds."""
+    """The sections for which the run has data."""
     return [section for make in SECTIONS if (section := make(data)) is not None]
 
 
 def _draw(figure: Figure) -> Markup:
-    """Both widths; the style sheet shows the one that fits."""
+    """Draw both widths; the style sheet shows the one that fits."""
     return Markup(draw_svg(figure, WIDE) + draw_svg(figure, NARROW))

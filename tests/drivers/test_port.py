@@ -1,4 +1,4 @@
-"""The port against a real terminal device: bounded reads, and one clear error when the other end goes away."""
+"""The port on a real terminal device: bounded reads, and one clear error when the other end disappears."""
 
 import os
 import time

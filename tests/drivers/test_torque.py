@@ -1,4 +1,4 @@
-"""Torque on and off, as the emulated servos see it."""
+"""Switching torque on and off, as seen by the emulated servos."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ def fake_bus(bus: ServoBus) -> Any:
 
 
 def written(bus: ServoBus, servo_id: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, float]]:
-    """What will be written to a servo: address, value, time [s]."""
+    """Record all later writes to a servo in the list returned: address, value, time [s]."""
     servo = servos(bus)[servo_id]
     write = servo.write
     seen: list[tuple[int, int, float]] = []
@@ -56,7 +56,7 @@ def test_goal_current_is_zero_and_the_watchdog_armed_before_torque_comes_on(
 
 
 def refusing(bus: ServoBus, servo_id: int, refused: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A servo that answers this write without an error, and does nothing."""
+    """A servo that answers a write without an error but ignores it."""
     servo = servos(bus)[servo_id]
     write = servo.write
 
@@ -89,13 +89,13 @@ def test_a_servo_that_keeps_its_torque_though_it_answers_is_named(
             refusing(bus, 2, (TORQUE, 0), monkeypatch)
         assert not servos(bus)[1].torque_enabled
         bus.port.clock.wait_until(bus.port.clock.now() + 0.11)
-        assert servos(bus)[2].watchdog_tripped, "it was left armed"
+        assert servos(bus)[2].watchdog_tripped, "the watchdog was left active"
 
 
 def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(
     fake_config: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While a silent servo is asked again and again, the packets feed the others' watchdogs."""
+    """While a silent servo is polled repeatedly, the packets feed the other servos' watchdogs."""
     with ServoBus.open(fake_config()) as bus:
         with pytest.raises(TorqueNotOff, match="'SHOULDER'"), bus.torque(watchdog=0.1):
             bus.exchange([0.3, 0.3])
@@ -111,7 +111,7 @@ def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(
 
 @pytest.fixture
 def _interrupts() -> Iterator[None]:
-    """Ctrl-C as a program without handlers of its own feels it; a test runner's workers ignore it."""
+    """Deliver Ctrl-C as to a program without its own signal handlers; a test runner's workers ignore it."""
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, former)
@@ -120,7 +120,7 @@ def _interrupts() -> Iterator[None]:
 @pytest.mark.usefixtures("_interrupts")
 @pytest.mark.parametrize("after", [0, 1, 2, 5])
 def test_an_interrupt_while_torque_is_cut_waits_until_it_is_cut(fake_config: Make, after: int) -> None:
-    """Used as a library, without handlers that would only take note of Ctrl-C."""
+    """The driver is used as a library, without signal handlers that merely set a flag."""
     with ServoBus.open(fake_config()) as bus:
         send = bus.port.write
         left = [after]

@@ -1,4 +1,4 @@
-"""The identified arm as a model: its equations against the estimator's, its speed, and files that are not right."""
+"""The identified arm as a model: agreement with the estimator's equations, speed, and damaged files."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ def test_it_has_the_estimators_equations(identified: Path) -> None:
 
 
 def full(model: ArmModel) -> ArmModel:
-    """With every term of friction."""
+    """The model with every friction term."""
     more = {"coulomb_width": 0.01, "stribeck_rise": 0.4, "stribeck_velocity": 0.15, "load": 0.05}
     terms = {f"{term}_{joint}": value for term, value in more.items() for joint in (1, 2)}
     return dataclasses.replace(model, values={**model.values, **terms})

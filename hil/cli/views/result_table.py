@@ -1,4 +1,4 @@
-"""A result as a table in the terminal: parameter, unit, value, standard error; on a fake arm the truth too."""
+"""Print a result in the terminal: parameter, unit, value, standard error and, for a fake arm, the true value."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from hil.results.result import SettledResult, ShootingResult
 
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
-    """The table, the fit and what to do next."""
+    """Print the parameter table, the quality of the fit, the verdict and the next commands."""
     console.print(_parameters(result))
     physical = [] if result.physical is None else physical_lines(result.physical)
     told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
@@ -56,7 +56,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
 
 def _parameters(result: SettledResult) -> Table:
     truth = result.truth
-    # Narrow enough for 80 columns, so that no figure is cut.
+    # Narrow enough for 80 columns, so that no number is truncated.
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.title, table.title_justify, table.title_style = (
         f"{result.joints}-joint arm, {escape(str(result.config))}",
@@ -106,8 +106,8 @@ def _choice(result: SettledResult) -> list[str]:
     tried = ", ".join(trial.model for trial in choice.tried)
     gained, cost = choice.error_divided_by, choice.standard_errors_times
     return [
-        f"Chosen of {tried}: {choice.chosen}. Compared with the first, it predicts {gained:.3g} times better and makes "
-        f"the standard errors {cost:.3g} times larger."
+        f"Model chosen from {tried}: {choice.chosen}. Compared with the first, its prediction error is {gained:.3g} "
+        f"times smaller and its standard errors are {cost:.3g} times larger."
     ]
 
 

@@ -45,7 +45,7 @@ class Estimated:
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
-    """The result of all samples of a run whose motion never became periodic, or that was stopped before it did."""
+    """Estimate from all samples of a run that never became periodic or was stopped before it did."""
     config, facts = run.load_config(), run.load_facts()
     only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
@@ -153,8 +153,7 @@ def _result(
     )
     return ShootingResult(
         method=f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
-        f"initial states; {estimate.model.description}; standard errors robust "
-        "against model error",
+        f"initial states; {estimate.model.description}; standard errors robust against model error",
         config=shown_path,
         joints=estimate.model.joints,
         parameters=dict(entries[:base]),

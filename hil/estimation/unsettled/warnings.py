@@ -1,4 +1,4 @@
-"""Warnings about an estimate from unsettled data, each with the joint and the remedy."""
+"""Warnings about an estimate from unsettled data, each with the joint and a remedy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 
 LEAST_SWING = 30.0  # encoder steps
-LOST = 0.01  # of the samples
+LOST = 0.01  # fraction of the samples
 MANY_TURNS = 2.0
-FLAT = 0.05  # of the samples at the very largest torque: a sine has fewer
-LEFT = 0.1  # residual over the motion's RMS
-WEAK, UNSEEN = 0.5, 10.0  # standard error over value
+FLAT = 0.05  # fraction of samples at the largest torque; a sine has fewer
+LEFT = 0.1  # RMS residual relative to the motion's RMS
+WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,7 @@ def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Do
         if left > LEFT:
             faults.append(
                 f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
-                "check the "
-                "units, signs and zero of position and torque; then try shorter segments."
+                "check the units, signs and zero of position and torque; then try shorter segments."
             )
     return Doubts(tuple(faults), tuple(doubts), (*warnings, *_weak(estimate)))
 
@@ -52,8 +51,8 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     columns = " and ".join(suspicion.signs.reversed_columns)
     negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
     return [
-        f"The sign of {columns} seems to be reversed: with it reversed, inverse dynamics leaves "
-        f"{100 * suspicion.residual:.2g} % of the torque unexplained, as given {100 * suspicion.residual_given:.2g} %"
+        f"The sign of {columns} seems to be reversed: with the sign changed, inverse dynamics leaves "
+        f"{100 * suspicion.residual:.2g} % of the torque unexplained instead of {100 * suspicion.residual_given:.2g} %"
         f"{negative}. Correct the sign in the file, or exchange the columns."
     ]
 
@@ -64,7 +63,7 @@ def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]
     steps = swing / max(float(each.position_step[joint]) for each in recordings)
     if steps < LEAST_SWING:
         found.append(
-            f"{name} moved by {steps:.0f} encoder steps only: rounding dominates its parameters; drive it harder."
+            f"{name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; drive it harder."
         )
     lost = 1.0 - float(np.mean(np.concatenate([np.isfinite(each.position[joint]) for each in recordings])))
     if lost > LOST:
@@ -80,7 +79,7 @@ def _turns(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
 
 
 def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
-    """A measured torque that stays at its largest value was cut off there; a command may."""
+    """Detect a measured torque that was clipped at its largest value; a commanded torque may stay constant."""
     for each in recordings:
         size = np.abs(each.torque[joint])
         at_most = float(np.mean(size > 0.9999 * size.max()))

@@ -1,4 +1,4 @@
-"""Which parameters the data hardly separate."""
+"""Section on parameters that the data hardly separate."""
 
 import numpy as np
 

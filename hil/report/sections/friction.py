@@ -1,4 +1,4 @@
-"""Friction against speed: the model's curve with its interval, and the torque that the measured motion leaves to it."""
+"""Section on friction versus speed: the model's curve with its interval, and the torque left by the measured motion."""
 
 import numpy as np
 
@@ -10,35 +10,34 @@ from hil.report.section import Picture, Section
 from hil.results.parts import Covariance
 from hil.runs.period_file import PlayedPeriod
 
-_CURVE = 401  # speeds on the curve
+_CURVE = 401  # points on the curve
 _DOTS = 700
-_DRAWS = 200  # of the parameters, for the interval
+_DRAWS = 200  # parameter draws for the interval
 
 
 def friction(data: RunData) -> Section | None:
-    """Present if the run has its settled period."""
+    """The section; None if the run has no settled period."""
     if data.fitted is None:
         return None
     speed, torque = _left_to_friction(data.model, data.fitted)
     pictures = [_curve(data, joint, name, speed[joint], torque[joint]) for joint, name in enumerate(data.names)]
     words = (
         "Dots: commanded torque minus the model's inertia and gravity torque for the measured motion. They scatter "
-        "because "
-        "the acceleration is derived from a quantised position, and near standstill because static friction takes any "
-        "value that holds the joint.",
+        "because the acceleration is derived from a quantised position, and near standstill because static "
+        "friction takes any value that holds the joint.",
     )
     return Section("friction", "Friction", words, pictures=tuple(pictures))
 
 
 def _left_to_friction(model: ArmModel, period: PlayedPeriod) -> tuple[Array, Array]:
-    """Speeds [rad/s] and torques [N m] (joints, dots), from the lines of the measured motion."""
+    """Speeds [rad/s] and friction torques [N m], both (joints, dots), from the Fourier lines of the measured motion."""
     filled = np.where(np.isfinite(period.position), period.position, period.predicted)
     lines = lines_of(filled)
     samples = filled.shape[1]
     motion = motion_of(lines, cut_off(lines), 2 * np.pi * period.rate / samples, samples)
     rigid = model.rigid_body_torque(motion.position.T, motion.velocity.T, motion.acceleration.T).T
     offset = np.array([[model.values[f"offset_{joint + 1}"]] for joint in range(len(filled))])
-    # The command is held: at the middle between two commands the mean of both is in force.
+    # Commands are held until the next one: the torque effective at a sample is the mean of two successive ones.
     scale = np.array([[model.torque_scale(joint + 1)] for joint in range(len(filled))])
     held = 0.5 * scale * (period.torque + np.roll(period.torque, 1, axis=1))
     chosen = slice(None, None, max(1, samples // _DOTS))
@@ -47,7 +46,7 @@ def _left_to_friction(model: ArmModel, period: PlayedPeriod) -> tuple[Array, Arr
 
 def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) -> Picture:
     fastest = float(np.abs(speed).max())
-    # Denser where friction bends: cubes of an even grid.
+    # Cubes of an even grid are denser near zero speed, where the curve bends.
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3
     curve = friction_curve(data.model, at)[:, joint]
     low, high = friction_interval(data.model, data.result.covariance, at, joint)

@@ -1,4 +1,4 @@
-"""Parameters with their intervals, what each is, and on a fake arm the truth."""
+"""Section with the parameters: value, interval, meaning and, for a fake arm, the true value."""
 
 import math
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ def parameters_of(result: Result) -> Section:
 def _table(
     entries: Mapping[str, Quantity], truth: Mapping[str, float], groups: Mapping[str, str], caption: str
 ) -> Table:
-    """groups: the composition of a spatial arm's base parameters, by name."""
+    """Build a table; groups: composition of a spatial arm's base parameters, by name."""
     head = ("parameter", "meaning", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
     return Table(head, tuple(_row(name, entry, truth, groups) for name, entry in entries.items()), 3, caption, 1)
 
@@ -51,7 +51,7 @@ def _row(name: str, entry: Quantity, truth: Mapping[str, float], groups: Mapping
 
 
 def _interval(value: float, std: float) -> tuple[str, str]:
-    """Value and half-width with as many decimals as the width has two digits that count."""
+    """Value and half-width of the interval, rounded to two significant digits of the half-width."""
     width = TWO_SIDED_95 * std
     if width <= 0:
         return number(value), "exact"

@@ -1,4 +1,4 @@
-"""The verdict in words: can this model be trusted, why, and what to do if not. The judgement is the result's own."""
+"""Section with the verdict stored in the result: can the model be trusted, why, and what to do if not."""
 
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.report.run_data import RunData
@@ -13,7 +13,7 @@ TITLES = {
 
 
 def verdict(data: RunData) -> Section:
-    """Always present."""
+    """The section, always present."""
     judged = data.result.verdict
     tone, title = TITLES[judged.trust]
     warnings = [f"Warning: {warning}" for warning in data.result.warnings]

@@ -1,4 +1,4 @@
-"""Reversed columns are found and named on a real arm's recording; a recording as it should be raises no suspicion."""
+"""Reversed columns are found and named; a recording with correct signs raises no suspicion."""
 
 from dataclasses import replace
 
@@ -30,7 +30,9 @@ def turned(recording: Recording, torque: tuple[int, int], position: tuple[int, i
 
 def test_right_signs_raise_no_suspicion(recording: Recording) -> None:
     assert suspect_signs([recording]) is None
-    assert suspect_signs([turned(recording, (-1, -1), (-1, -1))]) is None, "the mirrored arm is an arm"
+    assert suspect_signs([turned(recording, (-1, -1), (-1, -1))]) is None, (
+        "a mirrored arm is equivalent, so there is no evidence"
+    )
 
 
 @pytest.mark.parametrize(

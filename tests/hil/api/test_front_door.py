@@ -1,4 +1,4 @@
-"""`import hil` does what the command line does: the same files, the same numbers, the same errors."""
+"""The functions of `import hil` match the command line: same files, same numbers, same errors."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""Files that mean harm, or only look like it: code in a TOML, names that are markup, archives that burst."""
+"""Malicious or suspicious files: code in a TOML file, names that contain markup, archive bombs."""
 
 import shutil
 import zipfile

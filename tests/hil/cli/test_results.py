@@ -1,4 +1,4 @@
-"""`hil report` and `hil export` on the command line: what they print, and runs that are not what they should be."""
+"""`hil report` and `hil export` on the command line: their output, and incomplete or damaged runs."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Recordings from elsewhere, runs cut short, peers and the known mass, as a person meets them on the command line."""
+"""CSV recordings, incomplete runs, peers and calibration with a known mass, on the command line."""
 
 import json
 import re
@@ -27,7 +27,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def ratio(result: dict) -> tuple[float, float]:
-    """Length of link 1 [m] as coupling and gravity_2 say, and its standard error."""
+    """Length of link 1 [m] from coupling and gravity_2, and its standard error."""
     names = result["covariance"]["names"]
     covariance = np.array(result["covariance"]["matrix"])
     coupling, gravity = (result["parameters"][name]["value"] for name in ("coupling", "gravity_2"))
@@ -38,7 +38,7 @@ def ratio(result: dict) -> tuple[float, float]:
 
 
 def test_a_real_arm_recorded_by_others(capsys: pytest.CaptureFixture[str]) -> None:
-    """Four seconds of it: link 1 is 0.2 m long, which nothing in the file says."""
+    """Four seconds of a recording suffice to find the length of link 1, 0.2 m, which the file does not contain."""
     text = DFKI.read_text(encoding="utf-8").replace('friction = "stribeck_load"', 'friction = "coulomb"')
     Path("arm.toml").write_text(text.replace("presliding = true", "presliding = false"), encoding="utf-8")
     assert hil("estimate", RECORDINGS / "c1_sinusoids_143339.csv", "--config", "arm.toml", "--json") == 0
@@ -112,7 +112,7 @@ def test_a_csv_that_is_wrong_is_named(
         ),
         (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
         (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),
-        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "encoder steps only"),
+        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "moved by only"),
     ],
 )
 def test_data_that_is_doubtful_comes_with_a_warning(
@@ -128,7 +128,7 @@ def test_torque_of_the_wrong_sign_is_an_error_that_says_where_to_look(capsys: py
 
 
 def estimate_pendulum(spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> int:
-    """A pendulum swinging as 0.02 q'' + 0.5 cos q + 0.03 q' = tau; one column is then wrong. The exit code."""
+    """Estimate a pendulum with 0.02 q'' + 0.5 cos q + 0.03 q' = tau, one of whose columns is spoiled; the exit code."""
     time = 0.0025 * np.arange(2000)
     torque = 0.25 * np.sin(2.0 * time) + 0.2 * np.sin(7.1 * time + 1.0)
     angle, velocity = np.empty(2000), 0.0
@@ -158,7 +158,7 @@ def test_a_csv_whose_columns_are_unclear_needs_a_config_and_no_run_beside_it(
 
 
 def test_a_run_cut_short_still_tells_something(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    """Killed before the second period, a run holds no settled one; shooting needs none."""
+    """A run killed before the second period has no settled one; multiple shooting needs none."""
     assert hil("identify", arm_file(), "--out", "run", "--json") == 0
     whole = json.loads(capsys.readouterr().out)
     samples = load_samples(Path("run/samples.npy"), 2)
@@ -185,8 +185,8 @@ def test_compare_and_known_quantities_on_one_run(
     assert "centre_2" in capsys.readouterr().out
     physical = json.loads(Path("run/result.json").read_text(encoding="utf-8"))["physical"]
     assert physical["quantities"]["centre_2"]["value"] == pytest.approx(0.112, rel=0.005)
-    # A small difference of large numbers: what is promised is its error bar, which holds that zeros, the ratio of the
-    # torque constants and the like may be off although this model does without them.
+    # A small difference of large numbers. Its error bar allows for errors that this model does not include, such as
+    # encoder zeros and the ratio of the torque constants.
     inertia = physical["quantities"]["link_inertia_2"]
     assert abs(inertia["value"] - 2.9e-4) < 3.0 * inertia["std"] < 1.5e-4
     assert physical["not_told_apart"] == []
@@ -199,7 +199,7 @@ def test_compare_and_known_quantities_on_one_run(
 
 
 def test_a_known_mass_mends_a_torque_constant(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    """The TOML supposes 20 % too much at the shoulder and 10 % too little at the elbow."""
+    """The torque constant in the TOML is 20 % too high for the shoulder and 10 % too low for the elbow."""
     wrong = [("torque_constant = 1.80         #", "torque_constant = 2.16         #")]
     wrong += [("torque_constant = 1.80\ntorque_constant_std", "torque_constant = 1.62\ntorque_constant_std")]
     assert hil("identify", arm_file(*wrong), "--out", "bare", "--json") == 0

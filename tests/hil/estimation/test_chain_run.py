@@ -1,4 +1,4 @@
-"""An arm in space from its TOML to its result, model and exports, on the fake bus."""
+"""A spatial arm from its TOML file to result, model and exports, on the fake bus."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ TEXT = FOUR.read_text(encoding="utf-8")
 
 
 def short(folder: Path) -> Config:
-    """Five seconds a period, the URDF beside it."""
+    """The configuration with a period of 5 s, next to its URDF."""
     (folder / "open_manipulator_x_like.urdf").write_bytes((CONFIGS / "open_manipulator_x_like.urdf").read_bytes())
     (folder / "arm.toml").write_text(TEXT.replace("period = 10.0", "period = 5.0"), encoding="utf-8")
     return load_config(folder / "arm.toml")
@@ -104,7 +104,7 @@ def test_exports_move_as_identified_and_keep_the_urdf(run: RunFolder, result: Se
     for name in ("urdf", "mjcf"):
         engine = mujoco.MjModel.from_xml_path(str(tmp_path / f"arm.{name}"))
         engine.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        if name == "urdf":  # cannot represent rotors, and says so
+        if name == "urdf":  # cannot represent rotors and lists them instead
             found = [float(text.split(" = ")[1].split()[0]) for text in said[name] if text.startswith("armature")]
             engine.dof_armature[:] = found
         engine.dof_damping[:] = 0.0
@@ -156,7 +156,7 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
     assert [segment.role for segment in plan.segments] == ["identify", "held_out"]
     first = plan.segments[0]
     assert len(first.ramp_in) == len(first.ramp_out) == first.ramp_samples == 1200
-    # Continuous where the pieces meet.
+    # The pieces join continuously.
     joined = np.concatenate((first.ramp_in[-2:], first.period_current[:2]))
     assert np.abs(np.diff(joined, axis=0)).max() < 0.2
     joined = np.concatenate((first.period_current[-2:], first.ramp_out[:2]))

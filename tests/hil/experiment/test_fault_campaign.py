@@ -1,4 +1,4 @@
-"""Random faults over every shipped configuration and rate; benchmarks/faults.py draws thousands."""
+"""Random faults in every bundled configuration and rate; benchmarks/faults.py draws thousands."""
 
 import pytest
 
@@ -8,22 +8,22 @@ from benchmarks.faults import campaign, figures
 from hil.fakes.bus.faults import FaultKind
 
 INJECTIONS = 132
-"""Three for each configuration and rate: what a minute of processor time allows."""
+"""Three injections per configuration and rate, about a minute of processor time."""
 
 PARTS = 2
-"""Tests that share them out, so that they run side by side."""
+"""Number of tests that share the injections, so that they run in parallel."""
 
 NAMED = 0.95
 
 NOT_STABLE = "fake_inverted at 20 Hz"
 NOT_SETTLED = "fake_horizontal at 20 Hz"
-"""What cannot be played there at all: a spring in software 50 ms late, and an arm that nothing brings back."""
+"""A setting that cannot be played: a software spring delayed by 50 ms, and an arm without a stable rest pose."""
 
 FOUND_LATE = frozenset({Kind.SCALE, FaultKind.STUCK_JOINT, FaultKind.STATUS_ERROR})
-"""Faults that may keep current for longer than 100 ms, as docs/safety.md says."""
+"""Faults during which current may flow for more than 100 ms, as docs/safety.md states."""
 
 OTHERS_LATE = 0.02
-"""Of all injections: what else is found late at present. The figure is none; this may only be lowered."""
+"""Share of other injections that may be detected late at present. The target is zero; this may only be lowered."""
 
 
 @pytest.mark.parametrize("part", range(PARTS))

@@ -1,4 +1,4 @@
-"""Periods compared sample by sample, against the comparison of whole periods that the estimate makes."""
+"""The comparison of periods sample by sample gives the same result as comparing whole periods."""
 
 import math
 from itertools import pairwise

@@ -1,11 +1,12 @@
-"""Eight arms of the population, every model and stance, go the whole way by themselves."""
+"""Eight arms of the population, covering all models and orientations, are identified without help."""
 
 from pathlib import Path
 
 from benchmarks.population import figures, study
 
 SEEDS = [7, 12, 13, 15, 29, 30, 31, 34]
-"""All five models; hanging, tilted, flat and upright; one joint and two; grease that warms, noisy and bent encoders."""
+"""Seeds that cover all five models, all orientations, one and two joints, warm-up, and encoder noise and nonlinearity.
+"""
 
 
 def test_eight_arms_that_nobody_chose_their_torque_for(tmp_path: Path) -> None:
@@ -13,8 +14,8 @@ def test_eight_arms_that_nobody_chose_their_torque_for(tmp_path: Path) -> None:
     measured = figures(outcomes)
     assert measured["failures"] == {}
     assert measured["beyond_limit"] == 0
-    # Of a voltage-driven servo, what turning generates acts a control cycle and a lag late, which the model does not
-    # have: it takes some percent of the rotor's inertia away (docs/benchmarks.md).
+    # The back-EMF of a voltage-driven servo acts with a delay that the model does not include, which reduces the
+    # identified rotor inertia by a few percent (docs/benchmarks.md).
     assert [
         outcome.seed for outcome in outcomes if outcome.trust == "yes" and outcome.wrong and outcome.has_current
     ] == []
