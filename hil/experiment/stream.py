@@ -103,7 +103,7 @@ class Stream:
         self._sent_at: float | None = None
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
-        self._repetition = Repetition(longest, len(bus.joints))
+        self._repetition = Repetition(longest, len(bus.joints), self._interval)
 
     @property
     def state(self) -> State | None:
@@ -189,6 +189,13 @@ class Stream:
         for index, row in enumerate(segment.period_current):
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)
+            if (joint := repetition.unlike) is not None:
+                raise SafetyStop(
+                    f"{self._bus.joints[joint].title} does not repeat its motion: under the same torque it is at "
+                    f"{state.position[joint]:.3f} rad, far from where it was one period ago. Something pushes or holds "
+                    "it, it slips, or its encoder has failed.",
+                    Cause.UNLIKE_BEFORE,
+                )
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")
