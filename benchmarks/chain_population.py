@@ -2,9 +2,9 @@
 
     python benchmarks/chain_population.py --arms 60 [--first 0]
 
-Axes, lengths, masses, servos, rest pose and limits are drawn; the real arm's masses differ from the URDF's by 30 % and
-its centres by 5 mm. Counted: runs that finish with a result, collisions of what was recorded with itself or the floor, and
-position limits passed. A run that a dry run refuses as unsafe has not finished.
+Axes, lengths, masses, servos, rest pose and limits are drawn; the real arm's masses differ from the URDF's by 30 %
+and its centres by 5 mm. Counted: runs that finish with a result, collisions of what was recorded with
+itself or the floor, and position limits passed. A run that a dry run refuses as unsafe has not finished.
 """
 
 import argparse
@@ -90,7 +90,7 @@ def toml_of(random: np.random.Generator, joints: int, rest: Any, limits: Any, se
             for key, guess in (("viscous", prior.viscous), ("coulomb", prior.coulomb), ("armature", prior.armature))
         }
         text.append(
-            f"[[fake.chain.drives]]\nmass = 0.0\nrotor_inertia = {drawn['armature'] / 300.0**2:.4g}\ngear_ratio = 300.0\n"
+            f"[[fake.chain.drives]]\nmass = 0.0\nrotor_inertia = {drawn['armature'] / 9e4:.4g}\ngear_ratio = 300.0\n"
             f"torque_constant = {constant * (1 + 0.03 * random.standard_normal()):.4f}\ncurrent_lag = 1e-3\n"
             f"viscous = {drawn['viscous']:.4g}\ncoulomb = {drawn['coulomb']:.4g}\nstribeck_rise = 0.3\n"
             + ("" if stops[joint] is None else f"stops = [{stops[joint][0]:.4f}, {stops[joint][1]:.4f}]\n")

@@ -19,7 +19,7 @@ from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.rollout import ChainArms
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
@@ -126,6 +126,7 @@ class Stream:
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
             self._note(f"{segment.role}: ramp in")
+            self._repetition.forget()
             self._play(self._ramps[number][0], Phase.RAMP_IN)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
