@@ -15,7 +15,6 @@ import time
 
 import numpy as np
 from machine import machine
-from recorded_arm import COMMAND_TO_SAMPLE, RATE, STEP, servo_arm
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import design_multisine
@@ -26,6 +25,7 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
 from hil.fakes.plants.arm import base_parameters
+from tests.support.recorded_arm import COMMAND_TO_SAMPLE, RATE, STEP, servo_arm
 
 SIZES = (4_000, 16_000, 62_500, 250_000, 1_000_000)
 LINES = 25  # per joint

@@ -14,13 +14,13 @@ import time
 from pathlib import Path
 from statistics import median
 
-from benchmarks.short_experiment import CONFIG, short_config
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.experiment.guard import Guard
 from hil.experiment.run import run_experiment
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.short_experiment import CONFIG, short_config
 
 ROUNDS = 200
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from machine import machine
-from recorded_arm import Recorded, record, servo_arm, wave
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.simulated_run import SimulatedRun
@@ -24,6 +23,7 @@ from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.fakes.plants.arm import base_parameters
+from tests.support.recorded_arm import Recorded, record, servo_arm, wave
 
 WAVES = 10
 NOISE = 0.5  # encoder steps

@@ -1,10 +1,10 @@
 """Randomly drawn arms, identified from the file of `hil init` to the verdict without any manual help.
 
-    python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--jobs N] [--json] [--keep DIR]
+    python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 
-The distribution is described in benchmarks/population_arms.py. Each arm is identified by `hil identify` in a separate
-process, in virtual time, and judged by the true parameters of the fake arm. --quick: friction = "stribeck" instead of
-"auto", for tests.
+The distribution is described in benchmarks/population_arms.py, with --others in benchmarks/population_others.py. Each
+arm is identified by `hil identify` in a separate process, in virtual time, and judged by the true parameters of the
+fake arm. --quick: friction = "stribeck" instead of "auto", for tests.
 
 finished              share that ended with a result
 beyond_limit          arms that overshot a position limit by more than hil.dry_run.stopping_distance predicts
@@ -42,8 +42,10 @@ from hil.runs.recording import Phase, load_samples
 
 try:
     from benchmarks.population_arms import DrawnArm, draw
+    from benchmarks.population_others import draw as draw_other
 except ImportError:  # run as a script
     from population_arms import DrawnArm, draw
+    from population_others import draw as draw_other
 
 FINISHED_WITHIN_S = 900.0
 JUDGED = ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb")
@@ -91,9 +93,9 @@ class Outcome:
         )
 
 
-def run(seed: int, folder: Path, *, quick: bool = False) -> Outcome:
+def run(seed: int, folder: Path, *, quick: bool = False, others: bool = False) -> Outcome:
     """Identify the arm of this seed in a separate process, and judge the outcome."""
-    arm = draw(seed)
+    arm = draw_other(seed) if others else draw(seed)
     if quick:
         arm = replace(arm, toml=arm.toml.replace('friction = "auto"  ', 'friction = "stribeck"'))
     folder.mkdir(parents=True, exist_ok=True)
@@ -221,12 +223,16 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def study(seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False) -> list[Outcome]:
+def study(
+    seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False, others: bool = False
+) -> list[Outcome]:
     """Identify the arm of each seed; tell: called with each outcome."""
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
         folder = keep or Path(temporary)
         outcomes = []
-        for ended in as_completed([pool.submit(run, seed, folder / str(seed), quick=quick) for seed in seeds]):
+        for ended in as_completed(
+            [pool.submit(run, seed, folder / str(seed), quick=quick, others=others) for seed in seeds]
+        ):
             outcomes.append(ended.result())
             if tell:
                 tell(outcomes[-1])
@@ -246,6 +252,7 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=200)
     parser.add_argument("--seeds", type=_seeds, help="A..B, instead of --arms")
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--others", action="store_true", help="draw from benchmarks/population_others.py")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("--keep", type=Path, help="folder for files, run folders and messages")
     options = parser.parse_args()
@@ -254,7 +261,12 @@ def main() -> None:
         print(machine())
     stream = sys.stderr if options.json else sys.stdout
     outcomes = study(
-        seeds, options.jobs, options.keep, lambda each: print(each, file=stream, flush=True), quick=options.quick
+        seeds,
+        options.jobs,
+        options.keep,
+        lambda each: print(each, file=stream, flush=True),
+        quick=options.quick,
+        others=options.others,
     )
     measured = figures(outcomes)
     if options.json:

@@ -17,7 +17,6 @@ import numpy as np
 from backlash import GROUPS
 from elastic_slip import SlippingMotor
 from machine import machine
-from recorded_arm import record, servo_arm, wave
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
@@ -26,6 +25,7 @@ from hil.estimator.models.model import Model
 from hil.estimator.selection.settled import relative_error
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.motor import Motor
+from tests.support.recorded_arm import record, servo_arm, wave
 
 FRICTION = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}
 PEAK = (0.6, 0.35)  # N m

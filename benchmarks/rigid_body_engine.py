@@ -17,13 +17,13 @@ from typing import Any
 import mujoco
 import numpy as np
 from machine import machine
-from recorded_arm import BAND, COMMAND_TO_SAMPLE, CURRENT_STEP, DRIVES, LINKS, PERIOD, RATE, SERVO, STEP
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import RecordingError
 from hil.estimator.excitation.multisine import design_multisine, zippered_lines
 from hil.estimator.selection.settled import Choice, choose
 from hil.fakes.plants.arm import Arm, base_parameters
+from tests.support.recorded_arm import BAND, COMMAND_TO_SAMPLE, CURRENT_STEP, DRIVES, LINKS, PERIOD, RATE, SERVO, STEP
 
 PEAK = (0.80, 0.42)  # N m
 # s. The engine's integrator is of first order, and its error must not be blamed on the estimate: at 2e-5 s, the

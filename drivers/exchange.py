@@ -29,7 +29,7 @@ PATIENCE_SHARE = 0.5
 """Minimum reply timeout as a fraction of the time between two cycles."""
 
 MOST_PATIENCE_S = 0.02
-"""Upper limit of that minimum [s]: in a slow cycle too, a silent servo must not keep the others waiting."""
+"""Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 _NEVER = 1 << 62
 _DOUBTS = 3
@@ -123,6 +123,11 @@ class Exchange:
     def longest(self) -> float:
         """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
         return self._port.wire_time(max(self._bytes(read) for read in self._reads))
+
+    def read_status_next(self) -> None:
+        """Read the status in the next cycle instead of when its turn comes."""
+        if self._status_every < _NEVER:
+            self._until_status = min(self._until_status, 1)
 
     def cycle(self, goal_ticks: Sequence[int]) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.

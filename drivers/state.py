@@ -235,7 +235,7 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
 
 def _told(statuses: Sequence[Status | None]) -> Status | None:
-    """Return the combined status of one joint's servos: the sum of the goals, and any fault of any servo."""
+    """Return the combined status of one joint's servos: goals are summed, and a fault of any servo counts."""
     told = [status for status in statuses if status is not None]
     if len(told) < len(statuses):
         return None

@@ -52,6 +52,11 @@ class Cause(Enum):
         """Whether the measured velocity and the commanded current can still be trusted."""
         return self in {Cause.POSITION, Cause.VELOCITY, Cause.TEMPERATURE, Cause.VOLTAGE}
 
+    @property
+    def allows_lowering(self) -> bool:
+        """Whether the servos still take commands, so that an arm may be lowered, watched all the way."""
+        return self.allows_braking or self in {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER}
+
 
 class HilError(Exception):
     """Base class of hil's own errors.

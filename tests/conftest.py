@@ -12,6 +12,7 @@ from hil.config.schema import Config, load_config
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 
@@ -52,9 +53,7 @@ def arm_file(tmp_path: Path) -> Callable[..., Path]:
     def write(*changes: tuple[str, str], base: str = "fake_two_link_ideal") -> Path:
         text = (CONFIGS / f"{base}.toml").read_text(encoding="utf-8")
         short = (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
-        for old, new in (*short, *changes):
-            assert old in text, f"{old!r} is not in {base}.toml"
-            text = text.replace(old, new, 1)
+        text = replaced(text, *short, *changes)
         path = tmp_path / "arm.toml"
         path.write_text(text, encoding="utf-8")
         return path

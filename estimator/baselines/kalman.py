@@ -57,7 +57,7 @@ def fit_by_kalman(
     """Run the filter over `recording` PASSES times.
 
     start: initial base parameters (parameters,) [SI].
-    kind: which filter.
+    kind: "ekf" or "ukf".
     coulomb_width: width of the smoothed Coulomb step [rad/s].
     velocity_noise: process noise that accounts for model errors [rad/s per sqrt(s)].
     delay: delay of the torque [s].

@@ -43,7 +43,7 @@ class ChainProblem:
     softness: float
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
-    """Integration steps in place of one where a joint may be near standstill."""
+    """Number of smaller integration steps that replace one where a joint may be near standstill."""
 
     @property
     def count(self) -> int:

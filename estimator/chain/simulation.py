@@ -23,13 +23,13 @@ class ChainRun:
     torque: Array
     """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
     slopes: Array
-    """Its derivatives by delay and by lag (samples, steps, 2, joints) [N m/s]."""
+    """Derivatives of `torque` by delay and by lag (samples, steps, 2, joints) [N m/s]."""
     measured: Array
     """Measured angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
     """Length of an integration step [s]."""
     finer: int = 1
-    """Integration steps in place of one where a joint may be near standstill."""
+    """Number of smaller integration steps that replace one where a joint may be near standstill."""
 
 
 PIECE = 256  # samples whose derivatives fit into the processor's cache

@@ -48,7 +48,7 @@ class ChainOptions:
     fine_step: float = 0.85e-3
     """Fine integration step [s]."""
     finer: int = 4
-    """Integration steps in place of one near standstill."""
+    """Number of smaller integration steps that replace one near standstill."""
     width_floor: float = 1e-3
     """Lower bound of the width of every smoothed Coulomb step [rad/s], indistinguishable from stiction."""
     initial_width: float = 0.03

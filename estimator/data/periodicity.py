@@ -15,7 +15,7 @@ class Settling:
     difference: Array
     """RMS difference (periods - 1, joints) [rad]."""
     relative: Array
-    """The same relative to the RMS of the later period's motion about its mean (periods - 1, joints)."""
+    """RMS difference relative to the RMS of the later period's motion about its mean (periods - 1, joints)."""
 
 
 def period_difference(position: Array) -> Settling:

@@ -73,8 +73,8 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
     last = math.floor(band[1] * period + 1e-9)
     if last - first + 1 < joints:
         raise ExcitationError(
-            f"the band {band[0]:g} to {band[1]:g} Hz holds {max(0, last - first + 1)} harmonics of a period "
-            f"of {period:g} s and {joints} joints need one each: widen the band or lengthen the period"
+            f"the band {band[0]:g} to {band[1]:g} Hz contains {max(0, last - first + 1)} harmonics of a "
+            f"period of {period:g} s, but {joints} joints need one each: widen the band or lengthen the period"
         )
     return tuple(tuple(range(first + joint, last + 1, joints)) for joint in range(joints))
 
@@ -93,8 +93,8 @@ def detecting_lines(period: float, band: tuple[float, float], joints: int, seed:
     kept = [line for line in every if line not in silent]
     if len(kept) < joints:
         raise ExcitationError(
-            f"the band {band[0]:g} to {band[1]:g} Hz holds {len(kept)} odd harmonics of a period of {period:g} s to "
-            f"drive and {joints} joints need one each: widen the band or lengthen the period"
+            f"the band {band[0]:g} to {band[1]:g} Hz contains {len(kept)} usable odd harmonics of a "
+            f"period of {period:g} s, but {joints} joints need one each: widen the band or lengthen the period"
         )
     return tuple(tuple(kept[joint::joints]) for joint in range(joints))
 

@@ -97,7 +97,7 @@ def robust_covariance(
     samples: int,
     count: int,
     structured: float = 0.0,
-    precision: Array | None = None,
+    expected: Array | None = None,
 ) -> Array:
     """Return the covariance of the first `count` coordinates (count, count), the others being unknown as well.
 
@@ -110,28 +110,29 @@ def robust_covariance(
         samples: number of samples.
         count: number of coordinates to return.
         structured: part of the sum of squares that is due to model errors.
-        precision: precision that a prior has added to the normal equations (coordinates,); it is not inflated when the
+        expected: what a prior has added to the normal equations (coordinates, coordinates); it is not inflated when the
             measurement errors are larger than independent ones.
     """
-    prior = np.zeros(len(at.normal)) if precision is None else (1.0 - FAINT_PRIOR) * precision
+    prior = np.zeros_like(at.normal) if expected is None else (1.0 - FAINT_PRIOR) * expected
     norm = np.sqrt(np.diag(at.normal))
     seen = norm > 1e-12 * norm.max()
     lengths = np.outer(norm[seen], norm[seen])
-    measured = (at.normal - np.diag(prior))[np.ix_(seen, seen)] / lengths
+    measured = (at.normal - prior)[np.ix_(seen, seen)] / lengths
     inverse = np.asarray(np.linalg.pinv(measured, hermitian=True), dtype=np.float64)
     freedom = max(1, samples - int(seen.sum()))
     covariance = np.zeros_like(at.normal)
     found = inverse
     if scatter is not None:
-        scores = (scatter - np.diag(prior))[np.ix_(seen, seen)] / lengths
+        scores = (scatter - prior)[np.ix_(seen, seen)] / lengths
         robust = inverse @ scores @ inverse * (samples / freedom)
         found = _larger(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
         found = found + 0.5 * structured * inverse
     if prior.any():
-        expected = np.diag(np.sqrt(prior[seen]) / norm[seen])
+        size, directions = np.linalg.eigh(prior[np.ix_(seen, seen)] / lengths)
+        root = directions * np.sqrt(np.maximum(size, 0.0))
         # (found^-1 + prior)^-1 without inverting what may be nearly singular.
-        inner = np.eye(len(found)) + expected @ found @ expected
-        found = found - found @ expected @ np.linalg.solve(inner, expected @ found)
+        inner = np.eye(len(found)) + root.T @ found @ root
+        found = found - found @ root @ np.linalg.solve(inner, root.T @ found)
     covariance[np.ix_(seen, seen)] = found / lengths
     hidden = np.flatnonzero(~seen)
     covariance[hidden, hidden] = np.inf

@@ -86,7 +86,10 @@ class Search:
     def nearest(self, x: Array) -> tuple[Refined, Minimum]:
         """Return the minimum reached from the coordinates `x` alone. Raises ConvergenceError."""
         options = self.options
-        found = self.rough.minimise(x, options.ftol_start)
+        found = Minimum(x, self.fine.evaluate(x), 1)
+        # Coarse steps lead away from a minimum where they do not see the same motion: near a narrow friction step.
+        if abs(self.rough.evaluate(x).cost / found.at.cost - 1.0) < options.same_motion:
+            found = self.rough.minimise(x, options.ftol_start)
         refined = self._compare([found], options.ftol_refine)
         unexplained = refined.cost > options.explained_cost * self.samples
         ftol = options.ftol_refine if self.coarse and unexplained else options.ftol
@@ -189,7 +192,7 @@ class Search:
         return Refined(weighted, outliers, best, cost, sum(found.iterations for found in ends))
 
     def _distinct(self, tries: Sequence[Minimum]) -> list[Minimum]:
-        """Return the best, and those that only finer steps can distinguish from it."""
+        """Return the best minimum and those that only finer steps can distinguish from it."""
         distinct: list[Minimum] = []
         for each in sorted(tries, key=lambda found: found.at.cost):
             cost = each.at.cost

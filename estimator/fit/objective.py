@@ -9,7 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise, step_limits
 from hil.estimator.fit.normal_equations import normal_equations
-from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.models.parameters import Physics
@@ -42,6 +42,8 @@ class Objective:
     """Stiffness of springs that pull the simulated arm to the measured angles (joints,) [N m/rad]."""
     fixed_parameters: bool = False
     """Whether only the initial states are fitted."""
+    lever: Lever | None = None
+    """Prior on coupling and gravity_2 together."""
 
     @property
     def count(self) -> int:
@@ -90,7 +92,18 @@ class Objective:
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         normal[: self.count, : self.count] = np.diag(self.prior.precision)
         gradient[: self.count] = self.prior.precision * (x[: self.count] - self.prior.centre)
-        return Quadratic(self.prior.cost(x[: self.count]), normal, gradient)
+        cost = self.prior.cost(x[: self.count])
+        if self.lever is not None:
+            away, slope = self.lever.residual(self.coordinates.values(x[: self.count]))
+            by_coordinate = slope @ self.coordinates.slopes(x[: self.count])
+            normal[: self.count, : self.count] += np.outer(by_coordinate, by_coordinate)
+            gradient[: self.count] += away * by_coordinate
+            cost += away**2
+        return Quadratic(cost, normal, gradient)
+
+    def expected_normal(self, x: Array) -> Array:
+        """What is expected beforehand, as its share of the normal equations (parameters, parameters)."""
+        return self._expected(x).normal[: self.count, : self.count]
 
     def minimise(self, x: Array, ftol: float, damping: float | None = None, at: Quadratic | None = None) -> Minimum:
         """Minimise the sum of squares from `x`; see `hil.estimator.fit.levenberg_marquardt.minimise`."""

@@ -12,10 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.models.model import LEVER_STD, Model
 from hil.estimator.models.terms import Scale, joint_of, term_of
 from hil.estimator.options import CoordinateOptions
 
 TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a scale
+LEAST_WEIGHT = 0.02  # least gravity_2 that gives a scale, as a fraction of the RMS torque
+TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS torque per radian
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
@@ -136,6 +139,33 @@ class CoordinatePrior:
 
 
 @dataclass(frozen=True)
+class Lever:
+    """What is expected of two parameters together: coupling is `ratio` times gravity_2, whatever they are."""
+
+    coupling: int
+    gravity: int
+    """Their places among the parameters."""
+    ratio: float
+    """`Model.lever` [s^2]."""
+    std: float
+    """Of coupling less that [kg m^2]."""
+
+    @classmethod
+    def of(cls, model: Model, gravity_2: float, sizes: "Sizes") -> "Lever | None":
+        """For a model that knows it; gravity_2: about what it is [N m], as a scale."""
+        if model.lever is None or model.joints != 2:
+            return None
+        std = LEVER_STD * model.lever * max(abs(gravity_2), LEAST_WEIGHT * sizes.torque)
+        return cls(model.names.index("coupling"), model.names.index("gravity_2"), model.lever, std)
+
+    def residual(self, value: Array) -> tuple[float, Array]:
+        """How far the parameters `value` (parameters,) are from it, in standard deviations, and the slopes of that."""
+        slope = np.zeros(value.size)
+        slope[self.coupling], slope[self.gravity] = 1.0 / self.std, -self.ratio / self.std
+        return float(slope @ value), slope
+
+
+@dataclass(frozen=True)
 class Sizes:
     """Scales of an arm and its motion."""
 
@@ -156,6 +186,7 @@ class Sizes:
             "velocity": self.velocity,
             "damping": self.torque / self.velocity,
             "stiffness": self.torque / TYPICAL_BEND,
+            "cable": TYPICAL_CABLE * self.torque,
             "saturation": TYPICAL_SATURATION / self.torque**2,
         }[scale]
 

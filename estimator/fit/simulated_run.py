@@ -10,6 +10,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.models.parameters import Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
+from hil.estimator.simulation.back_emf import by_names, causes_of
 from hil.estimator.simulation.drive import motor_torque, torque_and_slopes
 from hil.estimator.simulation.encoder import by_motion, measured, measured_and_slopes
 from hil.estimator.simulation.presliding_sensitivity import sensitive
@@ -75,15 +76,15 @@ class SimulatedRun:
         """
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
-        motion = sensitive(physics)(
-            *(physics, start, (*by_motion(names), *state), 1.0 / (self.rate * self.steps), self.max_substeps),
-            tracking_stiffness,
-        )
+        moving = by_motion(names)
+        causes = (*causes_of(physics, moving), *state)
+        step = 1.0 / (self.rate * self.steps)
+        motion = sensitive(physics)(physics, start, causes, step, self.max_substeps, tracking_stiffness)
         of = self.command, self.rate, self.command_to_sample, self.steps
         torque, slopes = torque_and_slopes(*of, delay=physics.delay, lag=physics.lags)
         samples = round(horizon * samples)
         ends = self.measured if self.pulled_to is None else self.pulled_to
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
-            true = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part])
-            yield part, *measured_and_slopes(physics, names, *true)
+            true, slope = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part])
+            yield part, *measured_and_slopes(physics, names, true, by_names(physics, moving, slope))

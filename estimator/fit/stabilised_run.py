@@ -25,7 +25,7 @@ class StabilisedRun:
     """The input of a run's simulation, from its recording."""
 
     run: SimulatedRun
-    """The run without the stabiliser; the springs pull to its `pulled_to`."""
+    """The run without the stabiliser. Its `pulled_to` holds the angles to which the springs pull."""
     stiffness: Array
     """Stiffness of the stabiliser's springs (joints,) [N m/rad]."""
 

@@ -16,16 +16,18 @@ from hil.estimator.fit.covariance import by_parameters, correlation_time, robust
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
-from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Sizes, scales_of
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever, Sizes, scales_of
 from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.model import Model
-from hil.estimator.models.terms import term_of
+from hil.estimator.models.terms import FRICTIONS, term_of
 from hil.estimator.options import LikelihoodOptions
 
 DEFAULTS = LikelihoodOptions()
+HARDLY = 0.05
+"""Of its usual initial guess: what a term begins with near the minimum of a model without it."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,15 @@ def _near_values(
 ) -> Array:
     narrow = _standstill_guesses(linear, options)[0]
     unnamed = dict(zip(model.names, _guess(model, linear, {}, narrow, options).tolist(), strict=True))
-    return np.array([{**unnamed, **parameters}[name] for name in model.names])
+    # What a plainer model does without begins as next to nothing, or its minimum is left at once.
+    hardly = {name: HARDLY * value for name, value in unnamed.items() if _is_nothing_when_small(name)}
+    return np.array([{**unnamed, **hardly, **parameters}[name] for name in model.names])
+
+
+def _is_nothing_when_small(name: str) -> bool:
+    """Whether a term vanishes with its value and has one to begin with."""
+    term = term_of(name)
+    return term.range == "positive" and term.part in FRICTIONS and not term.standstill and bool(term.initial)
 
 
 def _springs(linear: LinearEstimate, options: LikelihoodOptions) -> Array:
@@ -133,7 +143,10 @@ def _objective(
     coordinates = Coordinates(model.names, scales, options.coordinates)
     steps = options.minimiser, options.max_relative_decrease
     prior = CoordinatePrior.of(model.names, scales, sizes)
-    return Objective(runs, coordinates, state_scale, weights, prior, *steps), np.concatenate(states)
+    weight = dict(zip(linear.names, linear.value.tolist(), strict=True)).get("gravity_2", 0.0)
+    lever = Lever.of(model, weight, sizes)
+    objective = Objective(runs, coordinates, state_scale, weights, prior, *steps, lever=lever)
+    return objective, np.concatenate(states)
 
 
 def _simulated(period: SettledPeriod, options: LikelihoodOptions) -> Run:
@@ -202,10 +215,10 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
         float(np.sum(_model_error(each, weight, period)))
         for each, weight, period in zip(residuals, objective.weights, periods, strict=True)
     )
-    precision = np.zeros(x.size)
-    precision[:count] = objective.prior.precision
+    expected = np.zeros((x.size, x.size))
+    expected[:count, :count] = objective.expected_normal(x)
     scatter = objective.scatter(x, window)
-    covariance = robust_covariance(minimum.at, scatter, samples, count, structured, precision)
+    covariance = robust_covariance(minimum.at, scatter, samples, count, structured, expected)
     value = objective.coordinates.values(x[:count])
     return Fit(
         value,

@@ -16,6 +16,9 @@ from hil.estimator.models.terms import (
     units_of,
 )
 
+LEVER_STD = 0.05
+"""Relative standard deviation of a link's length by a ruler, over gravity by the tilt that somebody gave."""
+
 
 @dataclass(frozen=True)
 class Model:
@@ -53,9 +56,16 @@ class Model:
     drive: Drive = "delay"
     options: Collection[Option] = frozenset()
     """Always a frozenset after construction."""
+    by_voltage: Collection[int] = frozenset()
+    """Joints, from 1, that are driven by voltage; a share back_emf of their viscous friction passes the drive's lag
+    (`hil.estimator.simulation.back_emf`). Always a frozenset after construction."""
+    lever: float | None = None
+    """Measured length of link 1 over gravity [s^2]: coupling is expected to be this times gravity_2, within
+    `LEVER_STD`. It decides only where the motion does not."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "options", frozenset(self.options))
+        object.__setattr__(self, "by_voltage", frozenset(self.by_voltage))
         base_names(self.joints)
         if self.friction not in FRICTIONS:
             raise ModelError(f"friction model {self.friction!r}: choose one of {', '.join(FRICTIONS)}")
@@ -84,7 +94,9 @@ class Model:
     def names(self) -> tuple[str, ...]:
         """Names of the base parameters, then of the other terms joint by joint, in the order of their declaration."""
         laws = FRICTIONS[: FRICTIONS.index(self.friction) + 1]
-        return (*self.base_names, *extra_names(self.joints, frozenset((*laws, *self.options, *DRIVES[self.drive]))))
+        voltage = ("voltage",) if self.by_voltage else ()
+        parts = frozenset((*laws, *self.options, *DRIVES[self.drive], *voltage))
+        return (*self.base_names, *extra_names(self.joints, parts, frozenset(self.by_voltage)))
 
     @property
     def description(self) -> str:

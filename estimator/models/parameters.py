@@ -20,9 +20,21 @@ LEAST_LAG = 1e-6  # s
 SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles deflected in that direction
 
 
+LEAST_INERTIA = 0.2
+"""Of a joint's own: what back-EMF that comes late may leave of it. Less is no arm."""
+
+
 def place_of(term: str) -> int:
-    """Return the index of a term's constant in `Physics.vector` (for a joint's term joint 1's; joint 2's follows)."""
+    """Return the index of a term's constant in `Physics.vector`.
+
+    For a term of each joint it is the index for joint 1, which is followed by joint 2.
+    """
     return CONSTANTS.index(term if TERMS[term].scope == "arm" else f"{term}_1")
+
+
+VISCOUS, GENERATED = place_of("viscous"), place_of("back_emf")
+OWN_INERTIA = CONSTANTS.index("inertia_1"), CONSTANTS.index("armature_2")
+"""Where the inertia stands that only the joint itself feels, the rotor's among it."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +42,8 @@ class Physics:
     """Physical constants of one simulation."""
 
     vector: Array
-    """Constants in the order of CONSTANTS (constants,) [SI]."""
+    """Constants in the order of CONSTANTS (constants,) [SI]; back_emf is not the share but the back-EMF itself
+    [N m s/rad]."""
     delay: float
     """Pure delay of the torque [s]."""
     lag: float
@@ -53,13 +66,25 @@ class Physics:
         vector = np.array([parameters.get(name, ABSENT[name]) for name in CONSTANTS])
         encoder = np.array([[parameters.get(f"{name}_{joint}", 0.0) for name in ENCODER] for joint in (1, 2)])
         beyond = parameters.get("lag_difference_2", 0.0)
-        return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0), encoder, beyond)
+        physics = cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0), encoder, beyond)
+        # Back-EMF is given as a share of viscous friction; see `hil.estimator.simulation.back_emf`.
+        vector[GENERATED : GENERATED + 2] *= vector[VISCOUS : VISCOUS + 2]
+        for joint in np.flatnonzero(vector[GENERATED : GENERATED + 2]):
+            place, lacking = OWN_INERTIA[joint], vector[GENERATED + joint] * physics.late[joint]
+            vector[place] = max(vector[place] - lacking, LEAST_INERTIA * vector[place])
+        return physics
 
     @property
     def lags(self) -> Array:
         """Time constants of the joints' lags (2,) [s]; the second joint's stays above 0 if there is any lag."""
         other = max(self.lag + self.lag_difference, LEAST_LAG if self.lag_difference else 0.0)
         return np.array([self.lag, other])
+
+    @property
+    def late(self) -> Array:
+        """By how much the joints' torques come late in all, delay and lag together (2,) [s]."""
+        late: Array = self.lags + max(self.delay, 0.0)
+        return late
 
     def crossing_time(self) -> float:
         """Return the shortest time in which reversed friction crosses a joint's step or bristle deflection [s]."""

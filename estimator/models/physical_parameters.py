@@ -50,7 +50,7 @@ class Quantities:
     value: dict[str, float]
     """Determined quantities by name [SI], including the known ones."""
     std: dict[str, float]
-    """Their standard errors."""
+    """Standard errors of `value` by name [SI]."""
     groups: tuple[tuple[str, ...], ...]
     """Quantities that cannot be separated; at least one more of each group must be known."""
     doubts: tuple[str, ...]

@@ -28,7 +28,7 @@ Option = Literal[
 ]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
-Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation"]
+Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation", "cable"]
 
 FRICTIONS: tuple[Friction, ...] = get_args(Friction)
 """Laws of dry friction; each includes the terms of the previous ones."""
@@ -62,7 +62,8 @@ class Term:
     part: str
     """The part of a model that includes this term.
 
-    "base" (part of the linear regression, always present), a law of FRICTIONS, one of OPTIONS, or a drive's term.
+    "base" (part of the linear regression, always present), a law of FRICTIONS, one of OPTIONS, a drive's term, or
+    "voltage" (joints driven by voltage).
     """
     scope: Scope = "joint"
     first_joint: int = 1
@@ -213,7 +214,7 @@ _DECLARED = (
         part="cable",
         range="any",
         scale="torque",
-        spread="torque",
+        spread="cable",
     ),
     *(
         Term(
@@ -239,6 +240,14 @@ _DECLARED = (
         scale=1e-3,
         simulated=False,
         spread=1.5e-3,
+    ),
+    Term(
+        "back_emf",
+        "1",
+        "share of viscous friction that the motor generates: it passes the drive's lag as the voltage does",
+        part="voltage",
+        initial=0.92,
+        log_spread=0.08,
     ),
     Term(
         "delay",
@@ -299,13 +308,19 @@ def base_names(joints: int) -> tuple[str, ...]:
     return (*RIGID_BODY[joints], *friction)
 
 
-def extra_names(joints: int, parts: frozenset[str] | None = None) -> tuple[str, ...]:
-    """Return the names of the other parameters of a model with these `parts`; by default of all parts."""
+def extra_names(
+    joints: int, parts: frozenset[str] | None = None, by_voltage: frozenset[int] | None = None
+) -> tuple[str, ...]:
+    """Return the names of the other parameters of a model with these `parts`; by default of all parts.
+
+    by_voltage: joints, from 1, that are driven by voltage; by default all.
+    """
     return tuple(
         name
         for term in _DECLARED
         if term.part != "base" and (parts is None or (term.part in parts and term.replaced_by not in parts))
         for name in _names_of(term, joints)
+        if term.part != "voltage" or by_voltage is None or joint_of(name) in by_voltage
     )
 
 

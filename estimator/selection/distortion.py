@@ -44,7 +44,7 @@ class Distortion:
     odd: LineGroup | None
     """Unexcited odd lines up to the highest excited one; None unless all excited lines are odd."""
     even: LineGroup | None
-    """Unexcited even lines, likewise."""
+    """Unexcited even lines up to the highest excited one; None unless all excited lines are odd."""
     other: LineGroup | None
     """All other lines with motion above the noise."""
 

@@ -7,7 +7,7 @@ Statistics 6 (1978) 461), with the number of samples reduced according to the re
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -44,7 +44,7 @@ class Trial:
 
     model: Model
     estimate: Estimate | None
-    """None if the fit or the prediction did not converge."""
+    """Result of the fit; None if the fit or the prediction did not converge."""
     held_out: Array | None
     """RMS error of the free prediction relative to the motion's RMS (joints,)."""
     score: float
@@ -103,6 +103,8 @@ def choose(
     drive: Drive,
     *,
     torque_scale: bool = False,
+    by_voltage: Collection[int] = (),
+    lever: float | None = None,
     starts: Sequence[Mapping[str, float]] = (),
     options: SelectionOptions = DEFAULTS,
     executor: Executor | None = None,
@@ -123,6 +125,8 @@ def choose(
             used.
         drive: drive model of all candidates.
         torque_scale: whether the ratio of the torque constants is kept in any case.
+        by_voltage: joints, from 1, that are driven by voltage.
+        lever: as of `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         options: thresholds.
         executor: of concurrent.futures; fits that may be needed are begun before it is known that they are. The choice
@@ -133,7 +137,7 @@ def choose(
     """
     search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None, executor)
     try:
-        grown = search.grow(Model(periods[0].joints, "stribeck", drive))
+        grown = search.grow(Model(periods[0].joints, "stribeck", drive, by_voltage=by_voltage, lever=lever))
         pruned = search.prune(grown)
     finally:
         search.end()
@@ -362,8 +366,15 @@ def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) ->
     Significance is judged by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
     errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.
     """
-    model, value, covariance = estimate.model, estimate.value.copy(), estimate.covariance.copy()
-    names = list(estimate.names)
+    return pruned_model(estimate.model, estimate.names, estimate.value, estimate.covariance, level, fixed)
+
+
+def pruned_model(
+    model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
+) -> Model:
+    """`model` without what its parameters (parameters,) and covariance do not tell from nothing at `level`; `fixed`
+    stays in."""
+    names, value, covariance = list(names), value.copy(), covariance.copy()
     covariance[~np.isfinite(covariance)] = 0.0
     while True:
         doubtful = []

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array, Mask
-from hil.estimator.data.fourier import cut_off, lines_of, noise_power
+from hil.estimator.data.fourier import cut_off, lines_of, motion_of, noise_power
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.identify import Estimate, predict
+from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import joint_of, kind_of
 from hil.estimator.selection.distortion import Distortion, distortion, excited_lines
 
@@ -32,7 +33,7 @@ class Levels:
     model_error: Array
     """Residual of the fit beyond rounding and scatter."""
     lines: Distortion
-    """The same per line, with odd and even lines separated if the excitation allows it."""
+    """Levels per line, with odd and even lines separated if the excitation allows it."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ class Validation:
     """The two base parameters that are hardest to separate, and their correlation."""
     relative_std: dict[str, float]
     """Relative standard error of each base parameter except offsets."""
+    torque_std: dict[str, float]
+    """Standard error of the torque that each of these contributes to the fitted motion, RMS over that of the joint's
+    torque, worst joint."""
     levels: Levels
 
     @property
@@ -83,6 +87,7 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
         float(np.linalg.cond(correlation)),
         (names[first], names[second], float(correlation[first, second])),
         _relative_std(period, estimate),
+        _torque_std(period, estimate),
         levels(period, estimate),
     )
 
@@ -101,6 +106,17 @@ def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]
         size = max(abs(float(value)), least)
         relative[name] = float(std) / size if size else np.inf
     return relative
+
+
+def _torque_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
+    """Standard error of each base parameter except offsets, as a share of the torque that moved the joints."""
+    lines = lines_of(estimate.position)
+    motion = motion_of(lines, cut_off(lines), period.fundamental, period.samples)
+    torque = np.sqrt(np.mean(period.torque**2, axis=1))
+    Y = regressor(motion.position, motion.velocity, motion.acceleration)
+    per_unit = np.sqrt(np.mean(Y**2, axis=1)) / torque[:, None]
+    named = zip(estimate.model.base_names, estimate.std.tolist(), per_unit.max(axis=0).tolist(), strict=False)
+    return {name: std * share for name, std, share in named if kind_of(name) != "offset"}
 
 
 def levels(period: SettledPeriod, estimate: Estimate) -> Levels:

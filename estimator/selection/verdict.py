@@ -23,6 +23,7 @@ EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains th
 GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to the motion's RMS
 MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
+LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
 IMPROVEMENT = {
@@ -83,7 +84,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
 
 def _trust(validation: Validation, evidence: Evidence) -> Trust:
     left = float(validation.residual_over_floor.max())
-    doubtful = max(validation.relative_std.values()) > WEAK or bool(evidence.doubts)
+    doubtful = any(_is_weak(validation, name) for name in validation.relative_std) or bool(evidence.doubts)
     if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"
@@ -92,6 +93,11 @@ def _trust(validation: Validation, evidence: Evidence) -> Trust:
     if not worst <= USABLE_PREDICTION:
         return "no"
     return "with care" if doubtful or left > MUCH_LEFT or worst > GOOD_PREDICTION else "yes"
+
+
+def _is_weak(validation: Validation, name: str) -> bool:
+    """Whether a parameter is poorly known and the arm's torque depends on it."""
+    return validation.relative_std[name] > WEAK and not validation.torque_std[name] <= LITTLE_EFFECT
 
 
 def _noise(validation: Validation) -> str:
@@ -196,6 +202,12 @@ def _weak(validation: Validation) -> tuple[str, ...]:
     if part <= WELL_KNOWN:
         return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
     improvement = IMPROVEMENT[kind_of(name)]
+    if part > WEAK and not _is_weak(validation, name):
+        share = 100 * validation.torque_std[name]
+        return (
+            f"The least well known parameter is {name}, to {100 * part:.2g} %, which hardly affects this arm: its "
+            f"standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
+        )
     if not np.isfinite(part):
         return (f"This motion provides no information on {name}. To identify it: {improvement}.",)
     return (f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}.",)

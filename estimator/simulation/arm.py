@@ -2,12 +2,14 @@
 
 The equations are those of `hil.estimator.models.regressor` with a smooth friction law:
 
-    given torque = torque_scale torque (1 - saturation (torque_scale torque)^2)
+    driving torque = torque_scale torque - generated v
+    given torque = driving torque (1 - saturation (driving torque)^2)
     motor torque = given torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
-    friction(v) = viscous v + viscous_asymmetry |v| + level(v) tanh(v / width)
+    friction(v) = (viscous - generated) v + viscous_asymmetry |v| + level(v) tanh(v / width)
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
 
-In addition to friction there is the torque cable_stiffness q. |v| is smoothed as well, to v tanh(v / width). An
+Here generated v is the back-EMF of a joint driven by voltage (`hil.estimator.simulation.back_emf`), 0 otherwise. In
+addition to friction there is the torque cable_stiffness q. |v| is smoothed as well, to v tanh(v / width). An
 asymmetry of the Coulomb level itself is the offset. With presliding, the term level(v) tanh(v / width) is replaced by
 the bristles of `hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these
 equations and this integration scheme.
@@ -38,7 +40,7 @@ VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING = map(
 LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
     place_of, ("load", "viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale")
 )
-SATURATION, CABLE = map(place_of, ("saturation", "cable_stiffness"))
+SATURATION, CABLE, GENERATED = map(place_of, ("saturation", "cable_stiffness", "back_emf"))
 
 INTEGRATION = IntegrationOptions()
 MAX_SUBSTEPS = INTEGRATION.max_substeps
@@ -108,13 +110,21 @@ def bend_at(v: float, sharp: float) -> tuple[float, float]:
 def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, float]:
     """Return the torque of a drive minus friction, and the slope of that friction."""
     viscous, cycles = p[VISCOUS + joint], p[CYCLES + joint]
-    t *= p[SCALE + joint]
+    generated = p[GENERATED + joint] * v
+    t = t * p[SCALE + joint] - generated
     t -= p[SATURATION + joint] * t * t * t
     if cycles != 0.0:
         t *= 1.0 + p[SINE + joint] * math.sin(cycles * q) + p[COSINE + joint] * math.cos(cycles * q)
     level = p[COULOMB + joint] * (1.0 + p[RISE + joint] * bump_at(v / p[FADING + joint])) + p[LOAD + joint] * abs(t)
     bend, bent = bend_at(v, 1.0 / p[WIDTH + joint])
-    left = t - p[OFFSET + joint] - p[CABLE + joint] * q - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
+    left = (
+        t
+        + generated
+        - p[OFFSET + joint]
+        - p[CABLE + joint] * q
+        - viscous * v
+        - (p[ASYMMETRY + joint] * v + level) * bend
+    )
     slope = viscous + level * bent
     return left, slope
 

@@ -25,11 +25,11 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import SLIDING, Physics, place_of
 
 # Indices of joint 1's constants in `Physics.vector`; joint 2's follow.
-VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING, SATURATION = map(
+VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING, SATURATION, GENERATED = map(
     place_of,
     (
         *("viscous", "coulomb", "offset", "stribeck_rise", "stribeck_velocity", "load", "torque_scale"),
-        *("presliding_stiffness", "presliding_damping", "saturation"),
+        *("presliding_stiffness", "presliding_damping", "saturation", "back_emf"),
     ),
 )
 
@@ -65,7 +65,7 @@ def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1:
         if stiffness > 0.0:
             v, u, t = (v1, u1, t1) if joint == 0 else (v2, u2, t2)
             rise = p[RISE + joint] * math.exp(-((u / p[FADING + joint]) ** 2))
-            t *= p[SCALE + joint]
+            t = t * p[SCALE + joint] - p[GENERATED + joint] * u
             given = t - p[SATURATION + joint] * t * t * t
             level = p[COULOMB + joint] * (1.0 + rise) + p[LOAD + joint] * abs(given)
             end = math.copysign(level, v)

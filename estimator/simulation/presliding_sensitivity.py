@@ -20,6 +20,7 @@ from hil.estimator.simulation.bristles import (
     COULOMB,
     DAMPING,
     FADING,
+    GENERATED,
     LOAD,
     OFFSET,
     RISE,
@@ -129,14 +130,15 @@ def _bend(
             v, commanded = x[1, joint], t1 if joint == 0 else t2
             coulomb, rise, fading, load = p[COULOMB + joint], p[RISE + joint], p[FADING + joint], p[LOAD + joint]
             scale, damping = p[SCALE + joint], p[DAMPING + joint]
-            t = scale * commanded
+            u = v + ahead * faster[joint]
+            per_speed = p[GENERATED + joint]
+            t = scale * commanded - per_speed * u
             cube, eased = t * t * t, 1.0 - 3.0 * p[SATURATION + joint] * t * t
             t -= p[SATURATION + joint] * cube
             loaded = load if t > 0.0 else -load
-            u = v + ahead * faster[joint]
             bump = math.exp(-((u / fading) ** 2))
             level = coulomb * (1.0 + rise * bump) + load * abs(t)
-            level_u = -2.0 * coulomb * rise * bump * u / fading**2
+            level_u = -2.0 * coulomb * rise * bump * u / fading**2 - loaded * eased * per_speed
             way = math.copysign(1.0, v)
             turns = stiffness * abs(v) * time / level
             left = math.exp(-turns)
@@ -150,6 +152,7 @@ def _bend(
             level_by[r + at[LOAD + joint]] = abs(t)
             level_by[r + at[SCALE + joint]] = loaded * commanded * eased
             level_by[r + at[SATURATION + joint]] = -loaded * cube
+            level_by[r + at[GENERATED + joint]] = -loaded * eased * u
             for cause in range(2):
                 level_by[r + at[DELAY + cause]] = loaded * scale * eased * dt[cause, joint]
             if joint == 1:

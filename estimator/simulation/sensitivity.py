@@ -34,6 +34,7 @@ from hil.estimator.simulation.arm import (
     CYCLES,
     FADING,
     GAMMA,
+    GENERATED,
     LOAD,
     MAX_SUBSTEPS,
     OFFSET,
@@ -155,8 +156,8 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     viscous, coulomb, offset, width = p[VISCOUS + joint], p[COULOMB + joint], p[OFFSET + joint], p[WIDTH + joint]
     rise, fading, load, asymmetry = p[RISE + joint], p[FADING + joint], p[LOAD + joint], p[ASYMMETRY + joint]
     ripple_sin, ripple_cos, cycles = p[SINE + joint], p[COSINE + joint], p[CYCLES + joint]
-    commanded, scale = t, p[SCALE + joint]
-    t *= scale
+    commanded, scale, per_speed = t, p[SCALE + joint], p[GENERATED + joint]
+    t = scale * t - per_speed * v
     cube, eased = t * t * t, 1.0 - 3.0 * p[SATURATION + joint] * t * t
     t -= p[SATURATION + joint] * cube
     sine, cosine, shape = 0.0, 1.0, 1.0
@@ -198,6 +199,10 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     if at[SATURATION + joint] != NOWHERE:
         lost = -cube * shape
         rows[f + at[SATURATION + joint]], rows[s + at[SATURATION + joint]] = lost * passed, lost * loaded * bent
+    # By the torque before saturation and ripple, which back-EMF is a part of.
+    driven, driven_slope = eased * shape * passed, eased * shape * loaded * bent
+    if at[GENERATED + joint] != NOWHERE:
+        rows[f + at[GENERATED + joint]], rows[s + at[GENERATED + joint]] = v - v * driven, -v * driven_slope
     if at[CABLE + joint] != NOWHERE:
         rows[f + at[CABLE + joint]] = -q
     for cause in range(2):
@@ -207,14 +212,14 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
         # `given` still holds the derivative by the joint's own lag.
         rows[f + at[LAG_DIFFERENCE]], rows[s + at[LAG_DIFFERENCE]] = given * passed, given * loaded * bent
     cable = p[CABLE + joint]
-    left[stage, joint] = motor - offset - cable * q - viscous * v - dry * bend
+    left[stage, joint] = motor - offset - cable * q - (viscous - per_speed) * v - dry * bend
     slope[stage, joint] = viscous + level * bent
     left_by = now * NUMBERS + stage * BY_STATE + 5 * joint
     slope_by = left_by + 8 - 3 * joint
     numbers[left_by] = cycles * turn * passed - cable
-    numbers[left_by + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
+    numbers[left_by + 2] = per_speed * (1.0 - driven) - viscous - dry * bent - (asymmetry + level_v) * bend
     numbers[slope_by] = cycles * turn * loaded * bent
-    numbers[slope_by + 1] = level_v * bent + level * bent_v
+    numbers[slope_by + 1] = level_v * bent + level * bent_v - per_speed * driven_slope
 
 
 def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple[float, float]:

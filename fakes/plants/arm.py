@@ -34,7 +34,7 @@ class Drive(BaseModel):
     saturation: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
         0.0, description="fraction of the torque lost at saturation_current"
     )
-    saturation_current: Positive = Field(1.0, description="current at which that fraction is lost [A]")
+    saturation_current: Positive = Field(1.0, description="current at which the fraction `saturation` is lost [A]")
     viscous: NotNegative = Field(0.0, description="viscous friction, warm [N m s/rad]")
     coulomb: NotNegative = Field(0.0, description="Coulomb friction, warm [N m]")
     cold_viscous: NotNegative = Field(
@@ -43,7 +43,7 @@ class Drive(BaseModel):
     cold_coulomb: NotNegative = Field(
         0.0, description="excess of Coulomb friction at time 0, as a fraction of the warm one"
     )
-    warm_up_time: Positive = Field(60.0, description="time constant with which that excess decays [s]")
+    warm_up_time: Positive = Field(60.0, description="time constant of the warm-up [s]")
     coulomb_width: NotNegative = Field(
         0.0,
         description="0: stiction; above 0: smooth friction, coulomb * tanh(velocity / width) [rad/s]",
@@ -51,12 +51,12 @@ class Drive(BaseModel):
     stribeck_rise: NotNegative = Field(
         0.0, description="excess of static over Coulomb friction, as a fraction of the latter"
     )
-    stribeck_velocity: Positive = Field(0.1, description="velocity at which that excess has fallen to 1/e [rad/s]")
+    stribeck_velocity: Positive = Field(0.1, description="velocity at which stribeck_rise has fallen to 1/e [rad/s]")
     load: NotNegative = Field(0.0, description="additional dry friction per motor torque [N m per N m]")
     presliding_stiffness: NotNegative = Field(
-        0.0, description="0: rigid stiction; above 0: stiffness of the contact before the joint slides [N m/rad]"
+        0.0, description="stiffness of the presliding contact; 0 for rigid stiction [N m/rad]"
     )
-    presliding_damping: NotNegative = Field(0.0, description="damping of that contact [N m s/rad]")
+    presliding_damping: NotNegative = Field(0.0, description="damping of the presliding contact [N m s/rad]")
     offset: Finite = Field(0.0, description="constant load torque [N m]")
     cable_stiffness: NotNegative = Field(
         0.0, description="stiffness of a cable that pulls the joint to cable_angle [N m/rad]"
@@ -107,7 +107,7 @@ class Drive(BaseModel):
                 "presliding_damping needs a presliding_stiffness greater than 0: there is no spring to damp"
             )
         if self.stops is not None and self.stops[0] >= self.stops[1]:
-            raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be the smaller")
+            raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be less than the second")
         if self.backlash and not self.rotor_inertia:
             raise ValueError(
                 "backlash needs a rotor_inertia greater than 0: within the play the rotor moves on its own"

@@ -29,9 +29,9 @@ class Encoder(BaseModel):
 
     noise_ticks: Ticks = Field(0.0, description="standard deviation of white noise [ticks]")
     once_ticks: Ticks = Field(0.0, description="amplitude of the error with one period per turn [ticks]")
-    once_phase: Phase = Field(0.0, description="phase of that error where the encoder reads 0 [rad]")
+    once_phase: Phase = Field(0.0, description="phase of the once-per-turn error where the encoder reads 0 [rad]")
     twice_ticks: Ticks = Field(0.0, description="amplitude of the error with two periods per turn [ticks]")
-    twice_phase: Phase = Field(0.0, description="phase of that error where the encoder reads 0 [rad]")
+    twice_phase: Phase = Field(0.0, description="phase of the twice-per-turn error where the encoder reads 0 [rad]")
 
     @property
     def is_linear(self) -> bool:

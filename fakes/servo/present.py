@@ -17,7 +17,7 @@ PRESENT_END = 147
 
 STATE_START = 126
 STATE_END = 136
-"""The same for Present Current, Velocity and Position, which a control cycle reads."""
+"""Address of the first and the address after the last of Present Current, Velocity and Position."""
 
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
@@ -55,7 +55,7 @@ class Present:
         self.sign = direction
         """+1 or -1: sign of the servo's current, velocity and PWM relative to the joint's."""
         self.position_sign = direction
-        """The same for its position, which Reverse Mode inverts on every model."""
+        """+1 or -1: sign of the servo's position relative to the joint's; Reverse Mode inverts it on every model."""
         self.jump_ticks = 0
         """Error of the encoder injected by a fault [ticks]."""
         self._memory = memory
@@ -109,12 +109,12 @@ class Present:
         return StatusError.NONE
 
     def ticks(self, position: float) -> float:
-        """Return Present Position at a joint angle [rad], before rounding and without noise."""
+        """Return Present Position [ticks] for a joint angle [rad], before rounding and without noise."""
         ticks = self._encoder.steady(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
         return (TICKS_PER_TURN - ticks if self._reversed else ticks) + self._shift
 
     def angle(self, ticks: float) -> float:
-        """Return the joint angle [rad] at a Present Position."""
+        """Return the joint angle [rad] for a Present Position [ticks]."""
         ticks -= self._shift
         if self._reversed:
             ticks = TICKS_PER_TURN - ticks

@@ -54,14 +54,13 @@ def chain_slips(config: "Config") -> Iterator[str]:
             f"arm.urdf and fake.chain.urdf are two files with the same name, {fake.name}, and a run folder holds "
             "both: rename one"
         )
-    if config.stabiliser is None:
+    if config.experiment.pilot:
+        if config.joint_path is not None:
+            yield "joint_path: with experiment.pilot = true the path is found; remove one of the two"
+    elif config.stabiliser is None:
         yield (
             "stabiliser is missing: a spatial arm does not hang at rest, so a spring and a damper must hold it "
-            "on its path"
-        )
-    if config.experiment.pilot:
-        yield (
-            "experiment.pilot = true: only planar arms support the pilot so far; set it to false and give [joint_path]"
+            "on its path; or set experiment.pilot = true, which finds both"
         )
     if config.known is not None:
         yield "known: only for planar arms; a URDF gives its own masses"
@@ -74,13 +73,13 @@ def chain_slips(config: "Config") -> Iterator[str]:
 
 
 def _path_slips(config: "Config") -> Iterator[str]:
-    if config.joint_path is None:
-        return
     if config.experiment.band is None:
         yield (
             "experiment.lines: a spatial arm follows a path, whose highest frequency is the upper end of "
             "experiment.band"
         )
+    if config.joint_path is None:
+        return
     parts = zip(config.joints, *config.joint_path.model_dump().values(), strict=False)
     for joint, centre, swing, speed in parts:
         low, high = joint.position_limit

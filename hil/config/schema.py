@@ -22,6 +22,7 @@ from pydantic import (
 from hil import fakes
 from hil.config.bundled import find_config
 from hil.config.chain import MOST_JOINTS, chain_slips
+from hil.config.clearance import ClearanceConfig
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
@@ -119,6 +120,10 @@ class SafetyConfig(Table):
     )
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes, where possible, before torque is cut')
     damp_time: float = Field(0.06, ge=0, le=2, description="s, maximum braking time")
+    lower_speed: PositiveFloat = Field(
+        0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose"
+    )
+    lower_time: PositiveFloat = Field(10.0, le=60, description="s: longest time for that; a longer way is taken faster")
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
     )
@@ -159,6 +164,7 @@ class Config(Table):
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
     stabiliser: StabiliserConfig | None = None
+    clearance: ClearanceConfig = ClearanceConfig()
     known: KnownConfig | None = None
     columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
     fake: FakeArm | None = None

@@ -13,6 +13,8 @@ from hil.config.schema import Config, PriorConfig
 from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior, stall_torque
 from hil.errors import ConfigError
+from hil.estimation.model_from_config import voltage_driven
+from hil.estimator.models.terms import term_of
 
 Array = NDArray[np.float64]
 
@@ -62,6 +64,8 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     base = _base(drawn, np.array(lengths), config.arm.gravity)
     for joint in range(offset.shape[1]):
         base |= {f"offset_{joint + 1}": offset[:, joint], f"zero_{joint + 1}": zero[:, joint]}
+    for joint in voltage_driven(config):
+        base[f"back_emf_{joint}"] = np.full(count, term_of("back_emf").initial)
     # The model has one lag for all joints: the servos are similar, so the first joint's is used.
     return base | {"lag": drawn["lag"][:, 0]}
 

@@ -8,7 +8,7 @@ import numpy as np
 from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimation.model_from_config import wanted_model
+from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
 from hil.estimator.calibration import Calibration, KnownMass, calibrate
 from hil.estimator.identify import identify
@@ -76,7 +76,7 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
         for each, run in ((config, without), (other, with_mass))
     ]
     # The known mass determines every torque constant, so a torque_scale would be redundant.
-    model = wanted_model(config.model, len(config.joints)).without("torque_scale")
+    model = wanted_model(config.model, len(config.joints), voltage_driven(config)).without("torque_scale")
     first = identify(periods[0], model)
     found = calibrate(periods[0], periods[1], first, known, config.arm.gravity)
     return _described(config, found)

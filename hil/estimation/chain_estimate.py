@@ -15,7 +15,7 @@ from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.prediction import predict
 from hil.fakes.plants.arm import armature
-from hil.plan.chain_plan import KnownChain, known_chain
+from hil.plan.chain_model import KnownChain, known_chain
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.results.parts import ChainFacts, Covariance, Quantity, RunTiming, SettledFit, Validation, Verdict
 from hil.results.result import SettledResult

@@ -9,7 +9,7 @@ import numpy as np
 from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimation.model_from_config import wanted_model
+from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
 from hil.estimation.truth import true_parameters
 from hil.estimator.baselines.compare import Peer, compare_peers
@@ -80,7 +80,7 @@ def all_methods(
     config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
 ) -> Iterator[Peer]:
     """Yield the estimate of hil, then those of the other methods."""
-    ours = _ours(period, OURS, wanted_model(config.model, period.joints))
+    ours = _ours(period, OURS, wanted_model(config.model, period.joints, voltage_driven(config)))
     yield ours
     length = link_length(config)
     yield from compare_peers(period, length, config.arm.gravity)

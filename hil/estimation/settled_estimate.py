@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.estimation.chain_estimate import estimate_chain_run
-from hil.estimation.model_from_config import wanted_model
+from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.plausibility import doubts
 from hil.estimation.result import Checks, make_result
@@ -107,10 +107,17 @@ def _estimate(
     executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
     """Fit the configured model, or choose one; the choice is None if the model is fixed."""
-    wanted = config.model
+    wanted, by_voltage, lever = config.model, voltage_driven(config), lever_of(config)
     if wanted.friction == "auto":
         choice = choose(
-            [period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts, executor=executor
+            [period],
+            other,
+            wanted.drive,
+            torque_scale=wanted.torque_scale,
+            by_voltage=by_voltage,
+            lever=lever,
+            starts=starts,
+            executor=executor,
         )
         return choice.estimate, choice
-    return identify(period, wanted_model(wanted, len(config.joints)), starts=starts), None
+    return identify(period, wanted_model(wanted, len(config.joints), by_voltage, lever), starts=starts), None

@@ -12,7 +12,7 @@ from typing import NamedTuple, NoReturn
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
-from hil.drivers.packet import ALERT
+from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
@@ -29,6 +29,12 @@ JUMP_ALLOWANCE_RAD = 0.01
 
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while resting before the start [rad]."""
+
+FARTHER_OUT_RAD = 0.01
+"""How much farther out a joint may move that a run before this one left beyond its limit."""
+
+MOST_OUTSIDE_RAD = 0.15
+"""How far beyond its limit a joint may be found that a run before this one left there [rad]."""
 
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
@@ -66,11 +72,14 @@ class Guard:
 
     planned: largest planned goal of each joint [A, or V under PWM]; by default, from the configuration.
 
+    left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
+    have come to rest a little beyond it: a joint found there may move back in, and no farther out.
+
     The work of the motors is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot
     return more work than was put in, so a motor that continually takes work out of it turns the wrong way.
     """
 
-    def __init__(self, config: Config, planned: Sequence[float] | None = None) -> None:
+    def __init__(self, config: Config, planned: Sequence[float] | None = None, *, left_by_a_run: bool = False) -> None:
         rate = config.experiment.rate
         safety = config.safety
         self._names = [str(joint.joint) for joint in config.joints]
@@ -107,6 +116,10 @@ class Guard:
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
+        self._may_start_outside = left_by_a_run
+        self._found_outside: dict[int, float] = {}
+        self._shortest = float("inf")
+        self._unsure = 0.0
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
         """Clamp goals to each joint's current limit and slew rate [A or V]. Raises SafetyStop for a goal that is not
@@ -125,6 +138,10 @@ class Guard:
             clamped.append(former + slew if change > slew else former - slew if change < -slew else wanted)
         self._former_goal = clamped
         return clamped
+
+    def holding(self, goal: Sequence[float]) -> None:
+        """The goals that the servos have now [A]: `clamp` goes on from there."""
+        self._former_goal = list(goal)
 
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
@@ -165,6 +182,9 @@ class Guard:
                 f"This program stalled: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
                 Cause.LATE,
             )
+        took = state.time_after_read - now
+        self._shortest = shortest = min(self._shortest, took)
+        self._unsure = took - shortest
         self._late = 0
         if self._often_late > 0.0:
             self._judge_rate()
@@ -183,12 +203,18 @@ class Guard:
         if state.status is not None:
             self._look_status(state.status, state)
 
+    @property
+    def wants_status(self) -> bool:
+        """Whether the servos' status should be read again in the next exchange."""
+        return self._status.is_in_doubt
+
     def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
         low, high, fastest, farthest, _, work_scale, work_least = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
         interval = self._interval
+        elapsed = now - self._seen_at[index]
         # A punctual sample after a late one still represents a whole interval.
-        seconds = max(now - self._seen_at[index], interval * (1 + self._missing[index]))
+        seconds = max(elapsed, interval * (1 + self._missing[index]))
         former = self._position[index]
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
@@ -205,9 +231,9 @@ class Guard:
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
             self._not_followed(index, off)
         consistency = self._consistency[index]
-        if seconds > LONG_GAP * interval:
+        if elapsed > LONG_GAP * interval:
             consistency.lost()
-        if consistency.look(position, velocity, seconds):
+        if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
         work = self._work[index] = self._work[index] + work_scale * goal * velocity
         if work < work_least and self._passive:
@@ -235,7 +261,10 @@ class Guard:
         seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
         self._consistency[index].lost()
         allowed, said = self._missing_limit
-        if is_missing_too_long(self._missing[index], seconds, self._missing_limit):
+        # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
+        # was damaged.
+        refused = bool(error) and error != StatusError.CRC
+        if is_missing_too_long(self._missing[index] + refused, seconds, self._missing_limit):
             if error:
                 self._stop(
                     index,
@@ -258,8 +287,18 @@ class Guard:
             f"{most:.3f}. Check the encoder, its magnet and the supply.",
         )
 
-    def _outside(self, index: int, position: float) -> NoReturn:
+    def _outside(self, index: int, position: float) -> None:
         low, high = self._limits[index][:2]
+        former = self._position[index]
+        beyond = max(low - position, position - high)
+        if former is None and self._may_start_outside and beyond <= MOST_OUTSIDE_RAD:
+            self._found_outside[index] = position
+        found = self._found_outside.get(index)
+        was_inside = former is not None and low <= former <= high
+        if found is not None and not was_inside:
+            farthest = min(low, found - FARTHER_OUT_RAD), max(high, found + FARTHER_OUT_RAD)
+            if farthest[0] <= position <= farthest[1]:
+                return
         self._stop(
             index,
             Cause.POSITION,

@@ -76,6 +76,16 @@ class StopRequest:
         """Whether a second signal arrived, which ends braking."""
         return self._count > 1
 
+    def check_again(self, asked: int) -> None:
+        """Raise StopRequested when more than `asked` signals have come."""
+        if self._count > asked:
+            raise StopRequested(self._said())
+
+    @property
+    def count(self) -> int:
+        """How many signals came."""
+        return self._count
+
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1
         self._received = signal.Signals(number)

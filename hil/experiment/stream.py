@@ -15,11 +15,15 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
+from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import DidNotMove, ExperimentError, NotSettled
+from hil.errors import DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
+from hil.estimator.chain.rollout import ChainArms
+from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
+from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
@@ -27,9 +31,12 @@ from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
 from hil.plan.stabiliser import Stabiliser
 from hil.runs.recording import Phase, Recorder, missed
+from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
+_AGAIN_S = 2.2 * MOST_PATIENCE_S
+"""From one sample to the next there is time for two exchanges, however long both take."""
 
 
 class Progress(NamedTuple):
@@ -63,7 +70,7 @@ class Stream:
         stop: StopRequest,
         watch: Watch,
         note: Note,
-        arms: Ensemble | None = None,
+        arms: Ensemble | ChainArms | None = None,
     ) -> None:
         self._bus = bus
         self._clock = bus.port.clock
@@ -71,15 +78,22 @@ class Stream:
         self._config = config
         self._safety = config.safety
         planned = _largest_goals(plan)
-        self._guard = Guard(config, planned)
-        # Chains have no such model yet: only position, velocity, current and status are checked.
-        self._model = None if config.is_chain else ModelWatch(config, planned, arms)
+        self._left_by_a_run = has_moved()
+        self._guard = Guard(config, planned, left_by_a_run=self._left_by_a_run)
+        self._model: ModelWatch | ChainWatch = (
+            ModelWatch(config, planned, arms)
+            if not isinstance(arms, ChainArms) and not config.is_chain
+            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None)
+        )
+        self._lowering = Lowering(config, plan) if config.is_chain else None
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
         self._watch = watch
         self._note = note
         self._interval = 1 / plan.rate
+        # A lost reply is asked for again where the next sample is far away.
+        self._asks_again = self._interval > _AGAIN_S
         self._ticks = FixedRate(bus.port.clock, plan.rate)
         self._index = 0
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
@@ -89,7 +103,7 @@ class Stream:
         self._sent_at: float | None = None
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
-        self._repetition = Repetition(longest, len(bus.joints))
+        self._repetition = Repetition(longest, len(bus.joints), self._interval)
 
     @property
     def state(self) -> State | None:
@@ -101,7 +115,9 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
-            if may_brake(self._config, error):
+            if self._lowering is not None and may_lower(self._config, error):
+                self._lower(self._lowering, error)
+            elif may_brake(self._config, error):
                 self._brake()
             raise
 
@@ -120,6 +136,12 @@ class Stream:
         self._note("rest")
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
+        window = rest_window(self._plan.rate)
+        # The stabiliser may have to bring it back first from where the run before was stopped.
+        for _ in range(0, self._plan.end_samples if self._left_by_a_run else 0, window):
+            if not moving:
+                break
+            moving = self._moving(self._play(self._silence(window), Phase.REST))
         if moving:
             raise ExperimentError(
                 f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
@@ -167,6 +189,13 @@ class Stream:
         for index, row in enumerate(segment.period_current):
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)
+            if (joint := repetition.unlike) is not None:
+                raise SafetyStop(
+                    f"{self._bus.joints[joint].title} does not repeat its motion: under the same torque it is at "
+                    f"{state.position[joint]:.3f} rad, far from where it was one period ago. Something pushes or holds "
+                    "it, it slips, or its encoder has failed.",
+                    Cause.UNLIKE_BEFORE,
+                )
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")
@@ -198,6 +227,9 @@ class Stream:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
             self._goal = self._guard.clamp(wanted)
             state = self._bus.exchange(self._goal)
+            if self._asks_again and any(state.missing):
+                self._guard.look(state)
+                state = self._bus.exchange(self._goal)
             self._sent_at = state.time_before_write
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
@@ -215,8 +247,9 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
-        if self._model is not None:
-            self._model.look(state)
+        if state.status is not None and self._guard.wants_status:
+            self._bus.read_status_next()
+        self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 
@@ -235,6 +268,41 @@ class Stream:
                 state = self._bus.exchange(goals)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
+    def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
+        """Brake and lower the arm until it lies, anything is wrong, or a second signal comes. Never raises."""
+        state = self._state
+        if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
+            return
+        self._note(f"lowering the arm after: {error}")
+        try:
+            state = self._way_down(lowering, state)
+        except (SafetyStop, StopRequested, DriverError) as ended:
+            self._told(error, f"Torque was cut while the arm was being lowered, so it fell from there: {ended}")
+            return
+        done = "was lowered to its rest pose" if lowering.lies(state) else "was lowered, but not to its rest pose"
+        self._told(error, f"The arm {done}.")
+
+    def _way_down(self, lowering: Lowering, state: State) -> State:
+        """The last state; raises SafetyStop, StopRequested, DriverError."""
+        asked = max(1, self._stop.count)
+        for index in range(lowering.begin(state, self._goal)):
+            deadline, now, late = self._ticks.wait()
+            self._stop.check_again(asked)
+            if late:
+                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
+                lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
+                continue
+            self._goal = lowering.goals(index, state)
+            former, state = state.time_before_write, self._bus.exchange(self._goal)
+            self._sent_at = state.time_before_write
+            self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
+            lowering.look(index, state, state.time_before_write - former)
+        return state
+
+    def _told(self, error: ExperimentError, what: str) -> None:
+        error.add_note(what)
+        self._note(what)
+
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))
 
@@ -249,5 +317,4 @@ class Stream:
 
 def _largest_goals(plan: Plan) -> list[float]:
     """Largest goal of each joint [A, or V under PWM]; NaN counts as 0 here, since the guard rejects it."""
-    peaks = [np.nan_to_num(np.abs(segment.period_current)).max(axis=0) for segment in plan.segments]
-    return [float(peak) for peak in np.max(peaks, axis=0)]
+    return [float(peak) for peak in np.max([segment.peak_goal for segment in plan.segments], axis=0)]

@@ -1,4 +1,5 @@
-"""Gains of a software spring and damper for an arm that does not return to its rest pose: horizontal, or upright.
+"""Gains of a software spring and damper for an arm that does not return to its rest pose: horizontal, upright, or with
+so much friction that gravity moves none of a joint's links. Such a joint wanders, from one period to the next too.
 
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
 and soft enough to leave most of the torque to the excitation.
@@ -16,23 +17,44 @@ _FREQUENCY = 0.7  # Hz, natural frequency of each joint on its own spring
 _DAMPING_RATIO = 0.35
 _OUTWEIGHS = 1.3  # relative to the largest destabilising gravity stiffness of all arms
 _FRICTIONS_PER_RADIAN = 1.5
+_HELD = 1.5  # friction over gravity's torque at one radian from rest: at 1 it holds the joint at any angle
 _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
 def needs_stabiliser(config: Config, belief: Belief) -> bool:
-    """Whether gravity fails to return the median arm to its rest pose."""
-    return float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min()) <= 0.0
+    """Whether the median arm has a joint that gravity fails to return to its rest pose."""
+    return bool(wandering(config, belief).any())
 
 
-def with_stabiliser(config: Config, belief: Belief) -> Config:
-    """Add gains to a configuration that needs a stabiliser and has none."""
-    if config.stabiliser is not None or not needs_stabiliser(config, belief):
+def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
+    """Joints that need a spring (joints,): all of an arm that falls over or lies flat, else those held by friction."""
+    arm = belief.middle
+    stiffness = gravity_stiffness(config, arm)
+    if float(np.linalg.eigvalsh(stiffness).min()) <= 0.0:
+        return np.ones(len(stiffness), dtype=np.bool_)
+    friction = [arm[f"coulomb_{j + 1}"] * (1.0 + arm[f"stribeck_rise_{j + 1}"]) for j in range(len(stiffness))]
+    return np.asarray(np.array(friction) > _HELD * np.diag(stiffness))
+
+
+def falls_over(config: Config, belief: Belief) -> bool:
+    """Whether gravity drives the median arm away from its rest pose: once torque is off, only a person brings it back."""
+    lowest = float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min())
+    return bool(config.arm.gravity) and lowest <= 0.0
+
+
+def with_stabiliser(config: Config, belief: Belief, springs: NDArray[np.bool_] | None = None) -> Config:
+    """Add gains to a configuration that needs a stabiliser and has none.
+
+    springs: joints that get one in any case (joints,).
+    """
+    at = wandering(config, belief) if springs is None else springs | wandering(config, belief)
+    if config.stabiliser is not None or not at.any():
         return config
-    return config.model_copy(update={"stabiliser": proposed(config, belief)})
+    return config.model_copy(update={"stabiliser": proposed(config, belief, at)})
 
 
-def proposed(config: Config, belief: Belief) -> StabiliserConfig:
-    """Gains suitable for the arms of `belief`."""
+def proposed(config: Config, belief: Belief, springs: NDArray[np.bool_]) -> StabiliserConfig:
+    """Gains suitable for the arms of `belief`, 0 for joints without a spring."""
     parameters = belief.parameters
     away = np.max([_pull_away(config, each) for each in parameters], axis=0)
     inertia = np.median([_inertia(config, each) for each in parameters], axis=0)
@@ -42,6 +64,7 @@ def proposed(config: Config, belief: Belief) -> StabiliserConfig:
     spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
     stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)
+    stiffness, damping = np.where(springs, stiffness, 0.0), np.where(springs, damping, 0.0)
     return StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
 
 

@@ -16,7 +16,7 @@ from hil.dry_run.waves import designed_plan, roomy_plan
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, prior_belief
-from hil.pilot.gains import with_stabiliser
+from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
 from hil.runs.run_folder import RunFolder
@@ -37,6 +37,12 @@ _PILOT_PERIOD_SHARE = 0.5
 _PILOT_SETTLING = 1
 _AFTER_LIMIT = 0.85
 """Cap on further torque, relative to the torque at which a limit was exceeded."""
+_FALLING_SHARE = 0.85
+"""Share of the limits for an arm that falls over when it is stopped."""
+_LEAST_TORQUE = 0.05
+"""Torque that such an arm may get whatever it got before, as a share of what the current limit allows."""
+_INSIDE = 0.95
+"""Share of the limits within which an arm is assumed to start that a stopped run left beyond them."""
 _MOST_RAISE = 1.6
 _AT_LIMIT = 0.99
 _MORE, _LITTLE_MORE, _FAIR = 1.15, 1.03, 0.7
@@ -60,6 +66,9 @@ class Search:
     swing: Array | None = None
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
+    springs: NDArray[np.bool_] | None = None
+    """Joints that a stabiliser held (joints,)."""
+
     @classmethod
     def of(cls, config: Config, run: RunFolder, player: Player) -> "Search":
         """Start a search from the prior. Raises ConfigError."""
@@ -68,7 +77,7 @@ class Search:
     @property
     def held(self) -> Config:
         """The configuration, with a stabiliser if the arm is believed to need one."""
-        return with_stabiliser(self.config, self.belief)
+        return with_stabiliser(self.config, self.belief, self.springs)
 
     def find(self) -> tuple[Config, Amplitude]:
         """Find the configuration and the amplitude of the full run.
@@ -81,12 +90,14 @@ class Search:
     def learn(self, config: Config, played: Played) -> None:
         """Update the belief with the outcome of a run of `config`."""
         self.steps.append(played.step)
+        if config.stabiliser is not None:
+            self.springs = np.array(config.stabiliser.stiffness) > 0.0  # a joint that had one keeps it
         if played.passed_limit:
             self.cap = _AFTER_LIMIT * played.step.peak_torque
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
-        self.pose = played.seen.end
+        self.pose = _within_limits(self.config, played.seen.end)
         swing = played.seen.swing
         self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
 
@@ -104,8 +115,14 @@ class Search:
         was not. Raises NoSafeTorque if there was no run yet.
         """
         ensemble = self.belief.ensemble(self._farther)
+        cap = self.cap
+        if falls_over(config, self.belief):
+            share *= _FALLING_SHARE
+            if self.steps:
+                most = np.maximum(_MOST_RAISE * self.steps[-1].peak_torque, _LEAST_TORQUE * most_torque(config))
+                cap = most if cap is None else np.minimum(cap, most)
         try:
-            return largest_amplitude(config, ensemble, share, plan, self.pose, self.cap)
+            return largest_amplitude(config, ensemble, share, plan, self.pose, cap)
         except NoSafeTorque:
             if not self.steps:
                 raise
@@ -160,7 +177,7 @@ class Search:
     def _raise_to_limits(self) -> tuple[Config, Amplitude]:
         """Play intermediate runs until the arm is known well enough to go straight to its limits."""
         config = self.held
-        plan = self._waves(config)
+        plan = self.waves(config)
         found = self.amplitude(config, 1.0, plan)
         while not self._certain(config, found) and len(self.steps) < MOST_STEPS:
             self.player.say(
@@ -169,7 +186,7 @@ class Search:
             number = len(self.steps) + 1
             self._play(step_config(config), f"step-{number}", f"Step {number}", only_first(found))
             former, config = found.peak_torque, self.held
-            found = self.amplitude(config, 1.0, self._waves(config) if config.stabiliser is not None else plan)
+            found = self.amplitude(config, 1.0, self.waves(config) if config.stabiliser is not None else plan)
             if (found.peak_torque <= (_MORE if self._shares(found).min() > _FAIR else _LITTLE_MORE) * former).all():
                 break  # the updated belief allows hardly more torque
         return config, found
@@ -186,7 +203,8 @@ class Search:
         arms = self.belief.ensemble(self._farther)
         return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 
-    def _waves(self, config: Config) -> Plan:
+    def waves(self, config: Config) -> Plan:
+        """Waves for the full run of the arm as it is thought to be."""
         arm = Physics.of(self.belief.middle)
         if config.experiment.design == "optimal":
             return designed_plan(config, arm, [name for name in self.belief.names if _is_base(name)])
@@ -196,7 +214,8 @@ class Search:
         shares = self._shares(found)
         full = found.peak_torque >= _AT_LIMIT * most_torque(config)
         capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= _AT_LIMIT * self.cap
-        return bool(((shares >= CERTAIN) | full | capped).all())
+        enough = CERTAIN * (_FALLING_SHARE if falls_over(config, self.belief) else 1.0)
+        return bool(((shares >= enough) | full | capped).all())
 
     @staticmethod
     def _shares(found: Amplitude) -> Array:
@@ -233,6 +252,13 @@ def pilot_config(config: Config) -> Config:
 def _from_anywhere(config: Config) -> Config:
     """The configuration for an arm that friction may have left away from its rest pose after an earlier run."""
     return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_tolerance": 2 * np.pi})})
+
+
+def _within_limits(config: Config, pose: Array) -> Array:
+    """A pose beyond a limit, where a stopped run may leave the arm, moved to it: the next run begins by moving in."""
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    return np.asarray(np.clip(pose, middle - _INSIDE * half, middle + _INSIDE * half))
 
 
 def only_first(found: Amplitude) -> Amplitude:

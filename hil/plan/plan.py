@@ -47,6 +47,12 @@ class Segment:
         peaks: NDArray[np.float64] = np.abs(self.multisine.torque).max(axis=1)
         return peaks
 
+    @property
+    def peak_goal(self) -> NDArray[np.float64]:
+        """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as nothing."""
+        peaks: NDArray[np.float64] = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
+        return peaks
+
     def _before(self, count: int) -> NDArray[np.float64]:
         index = np.arange(-count, 0) % len(self.period_current)
         return self.period_current[index]
@@ -65,6 +71,8 @@ class Plan:
     periods: int
     settle_within: float
     drift_within: float
+    lower_samples: int = 0
+    """The most that lowering an arm in space takes after a stop."""
 
     def first_segment(self) -> "Plan":
         """The plan with only its first multisine."""
@@ -75,7 +83,7 @@ class Plan:
         """Largest possible number of samples."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played + self.end_samples + self.brake_samples
+        return self.rest_samples + played + 2 * self.end_samples + self.brake_samples + self.lower_samples
 
     @property
     def expected(self) -> int:

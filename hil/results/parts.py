@@ -90,7 +90,8 @@ class SettledFit(Fit):
 
 @dataclass(frozen=True, kw_only=True)
 class ShootingFit(Fit):
-    """Fit of arbitrary motion, divided into segments; residual_rms_rad: the residual in rad RMS, per joint."""
+    """Of any motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint; residual_rms_ticks is
+    empty where the encoders' resolution is not known."""
 
     residual_rms_rad: PerJoint
     residual_rms_ticks: PerJoint
@@ -304,7 +305,7 @@ class StabiliserShare:
 
     @property
     def share(self) -> PerJoint:
-        """RMS of the stabiliser relative to that of the total torque, per joint; above 1 if it opposes the excitation."""
+        """RMS of the stabiliser relative to that of the total torque, per joint; may exceed 1."""
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:

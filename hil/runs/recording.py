@@ -38,6 +38,7 @@ class Phase(IntEnum):
     RAMP_OUT = 4
     COMING_TO_REST = 5
     BRAKING = 6
+    LOWERING = 7
 
 
 def sample_type(joints: int) -> np.dtype[np.void]:

@@ -89,7 +89,7 @@ def test_a_servo_that_keeps_its_torque_though_it_answers_is_named(
             refusing(bus, 2, (TORQUE, 0), monkeypatch)
         assert not servos(bus)[1].torque_enabled
         bus.port.clock.wait_until(bus.port.clock.now() + 0.11)
-        assert servos(bus)[2].watchdog_tripped, "it was left armed"
+        assert servos(bus)[2].watchdog_tripped, "the watchdog was left active"
 
 
 def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(

@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import pytest
 
-from benchmarks import recorded_arm
-from benchmarks.recorded_arm import servo_arm
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import Multisine
 from hil.fakes.plants.arm import Arm
+from tests.support import recorded_arm
+from tests.support.recorded_arm import servo_arm
 
 IDEAL = {"coulomb_width": 0.05}
 STICKING = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}

@@ -207,11 +207,11 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.faults import parse_fault
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 class Still:
     joints, position, velocity, current = 1, (0.0,), (0.0,), (0.0,)
     def advance(self, until, current): pass
-servo = Servo(load_model("XM430-W350"), 1)
+servo = EmulatedServo(load_model("XM430-W350"), 1)
 clock = VirtualClock()
 bus = FakeBus([servo], Still(), clock)
 clock.wait_until(clock.now() + 1.0)

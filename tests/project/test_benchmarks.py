@@ -15,8 +15,6 @@ SHARED = (
     "pty",
     "population_arms",
     "client_calls",
-    "recorded_arm",
-    "short_experiment",
 )
 SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if path.stem not in SHARED)
 

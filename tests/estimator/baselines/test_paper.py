@@ -38,7 +38,7 @@ def test_with_the_papers_noise_the_print_is_biased_and_the_likelihood_is_not() -
     rmse = np.sqrt(np.mean((np.array(likely) - (5.0, 1.5)) ** 2, axis=0))
     assert rmse[0] <= 0.05 and rmse[1] <= 0.004
     assert np.mean(std, axis=0) == pytest.approx(rmse, rel=0.35)
-    assert np.mean([m2 for _, m2 in literal]) < 0.5, "errors in variables drive m2 towards zero"
+    assert np.mean([m2 for _, m2 in literal]) < 0.5, "errors in variables bias m2 towards zero"
 
 
 def test_the_corrected_arm_is_second_order_and_its_friction_is_found() -> None:

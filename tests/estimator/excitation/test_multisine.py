@@ -110,7 +110,7 @@ def test_what_cannot_be_built_is_said(lines: tuple[tuple[int, ...], ...], peak: 
 
 
 def test_an_empty_band_and_a_broken_period_are_refused() -> None:
-    with pytest.raises(ExcitationError, match="holds 1 harmonics"):
+    with pytest.raises(ExcitationError, match="contains 1 harmonics"):
         zippered_lines(1.0, (0.9, 1.1), 2)
     with pytest.raises(ExcitationError, match="whole number"):
         design_multisine(100.0, 1.005, ((1,),), (1.0,), 0)

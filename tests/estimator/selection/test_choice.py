@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.recorded_arm import servo_arm
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.fit.covariance import correlation_time, structured_share
@@ -20,6 +19,7 @@ from hil.estimator.selection.verdict import Evidence, judge
 from hil.fakes.plants.arm import Arm, base_parameters
 from tests.estimator.conftest import STICKING
 from tests.support.elsewhere import Elsewhere
+from tests.support.recorded_arm import servo_arm
 
 Recorder = Callable[[Arm, Multisine], SettledPeriod]
 Wave = Callable[..., Multisine]
@@ -111,12 +111,12 @@ def test_the_zeros_of_the_encoders_are_found(ideal_period: SettledPeriod) -> Non
 def test_the_ratio_of_two_torque_constants_is_found(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
     believed = replace(ideal_period, torque=ideal_period.torque / np.array([[1.0], [1.1]]))
     without, found = identify(believed, Model(2), coarse=True), identify(believed, Model(2, options={"torque_scale"}))
-    assert without.residual_steps.max() > 1.0, "no arm is like this one with equal torque constants"
+    assert without.residual_steps.max() > 1.0, "no arm with equal torque constants moves like this one"
     assert found.parameters["torque_scale_2"] == pytest.approx(1.1, rel=1e-3)
     assert worst(found.parameters, ideal_arm) < 0.002
     elsewhere = {name: 1.5 * value for name, value in found.parameters.items()}
     again = identify(believed, Model(2, options={"torque_scale"}), starts=[elsewhere])
-    assert again.parameters == pytest.approx(found.parameters, rel=0.01), "only a place to start"
+    assert again.parameters == pytest.approx(found.parameters, rel=0.01), "the initial guess must not affect the result"
 
 
 def test_intervals_cover_the_truth_where_the_model_lacks_something(

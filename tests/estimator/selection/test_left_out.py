@@ -28,7 +28,7 @@ def changed(arm: Arm, **changes: float) -> Arm:
 
 
 def wrong_encoders(period: SettledPeriod, once: float, twice: float) -> SettledPeriod:
-    """Return the period as read by encoders with errors of so many steps once and twice per turn."""
+    """Return the period as read by encoders with the given periodic errors [encoder steps]."""
     step = period.position_step[:, None]
     error = once * np.sin(period.position + 0.7) + twice * np.sin(2.0 * period.position - 0.4)
     return replace(period, position=np.round(period.position / step + error) * step)

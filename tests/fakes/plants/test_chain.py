@@ -85,7 +85,7 @@ def test_friction_holds_the_arm_exactly() -> None:
 
 
 def test_half_the_step_gives_the_same_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stiction and Stribeck friction do not depend on the plant's step, by which the estimator is judged."""
+    """The motion with stiction and Stribeck friction does not depend on the plant's step."""
     drives = [drive(viscous=0.05, coulomb=0.05, stribeck_rise=0.4, stribeck_velocity=0.15, current_lag=1e-3)] * 6
 
     def moved() -> np.ndarray:

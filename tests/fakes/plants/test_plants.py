@@ -138,7 +138,7 @@ def test_tilt_is_less_gravity() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"stops": [1.0, 0.5]}, "the first must be the smaller"),
+        ({"stops": [1.0, 0.5]}, "the first must be less than the second"),
         ({"stops": [0.0, 0.5]}, "beyond its stops"),
         ({"backlash": 0.01, "rotor_inertia": 0.0}, "backlash needs a rotor_inertia"),
     ],

@@ -6,7 +6,6 @@ from itertools import product
 import numpy as np
 import pytest
 
-from benchmarks.short_experiment import CONFIG, short_config
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
@@ -17,6 +16,8 @@ from hil.fakes.plants.arm import base_parameters
 from hil.fakes.plants.two_link import TwoLink
 from hil.plan.brake import GETS_FASTER, Brake
 from hil.plan.plan import Plan, make_plan, scaled
+from tests.support.edits import replaced
+from tests.support.short_experiment import CONFIG, short_config
 
 NONE = Feedback.none(2)
 SPEEDS = np.array([3.0, 2.0])
@@ -25,9 +26,7 @@ CLOSE = (("[-4.2, 1.06]", "[-2.6, -0.3]"), ("[-3.1, 3.1]", "[-0.4, 0.4]"))
 
 def close_config(*changes: tuple[str, str]) -> Config:
     text = CONFIG.read_text(encoding="utf-8")
-    for old, new in (*CLOSE, *changes):
-        assert old in text, old
-        text = text.replace(old, new, 1)
+    text = replaced(text, *CLOSE, *changes)
     return short_config(text)
 
 

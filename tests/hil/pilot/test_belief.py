@@ -17,6 +17,7 @@ from hil.pilot.seen import Seen
 from hil.plan.plan import make_plan
 from hil.plan.stabiliser import feedback_of
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 
@@ -89,14 +90,12 @@ def test_arms_that_do_not_come_back_are_given_gains_that_hold_them(
 def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tmp_path: Path) -> None:
     text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
     path = tmp_path / "held.toml"
-    for old, new in (("coulomb = 0.050", "coulomb = 9.0"), ("current_limit = 0.8", "current_limit = 0.1")):
-        assert old in text, old
-        text = text.replace(old, new, 1)
+    text = replaced(text, ("coulomb = 0.050", "coulomb = 9.0"), ("current_limit = 0.8", "current_limit = 0.1"))
     path.write_text(text, encoding="utf-8")
     held = load_config(path)
     said: list[str] = []
     with pytest.raises(
-        ExperimentError, match=r"Elbow did not move by 12 encoder steps\. Tried: Pilot .*; Pilot 2 "
+        ExperimentError, match=r"Elbow did not move by 26 encoder steps\. Tried: Pilot .*; Pilot 2 "
     ) as error:
         identify_in_steps(held, RunFolder.create(tmp_path / "run", held), path, lambda _: None, said.append)
     assert "current limits allow" in str(error.value) and "stronger servo" in str(error.value)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.dry_run import worst_relative_std
 from hil.cli.views.result_table import print_result
 from hil.config.schema import load_config
 from hil.estimation.settled_estimate import estimate_run
@@ -18,6 +17,7 @@ from hil.report.page import make_page
 from hil.report.run_data import RunData
 from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
+from tests.support.dry_runs import worst_relative_std
 from tests.support.paths import CONFIGS
 
 

@@ -14,6 +14,7 @@ from hil.study.run import StudyProgress, run_study
 from hil.study.schema import EngineTable, load_study
 from hil.study.work import TIMINGS
 from tests.support.command_line import hil
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 STUDY = """
@@ -37,9 +38,7 @@ columns = ["parameters.*.value", "verdict.trust"]
 @pytest.fixture
 def study_file(tmp_path: Path) -> Path:
     text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
-    for old, new in (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]")):
-        assert old in text
-        text = text.replace(old, new)
+    text = replaced(text, ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
     (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
     path = tmp_path / "study.toml"
     path.write_text(STUDY, encoding="utf-8")
