@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.fault_campaign.arms import PERIOD_S, Setting, settings
 from benchmarks.fault_campaign.campaign import DoesNotRun, Outcome, inject, prepare
+from hil.study import jobs as study_jobs
 
 INJECTIONS = 5000
 
@@ -39,12 +40,26 @@ def campaign(
 ) -> tuple[list[Outcome], list[str]]:
     """Distribute the injections among the settings; return their outcomes, and why settings could not be run."""
     shares = [injections // len(chosen) + (number < injections % len(chosen)) for number in range(len(chosen))]
-    if jobs == 1:
-        done = list(map(_all_of, chosen, shares, [first] * len(chosen), [period] * len(chosen)))
-    else:
-        with ProcessPoolExecutor(jobs) as processes:
-            done = list(processes.map(_all_of, chosen, shares, [first] * len(chosen), [period] * len(chosen)))
+    parts = [(setting, share, first, period) for setting, share in zip(chosen, shares, strict=True)]
+    done = (
+        study_jobs.each(_in_this_process, parts, count=0)
+        if jobs == 1
+        else study_jobs.each(_in_own_process, parts, count=jobs)
+    )
     return [outcome for part, _ in done for outcome in part], [why for _, why in done if why]
+
+
+Part = tuple[Setting, int, int, float]
+
+
+def _in_this_process(part: Part) -> tuple[list[Outcome], str]:
+    return _all_of(*part)
+
+
+def _in_own_process(part: Part) -> tuple[list[Outcome], str]:
+    """Injected signals need a main thread, and a worker's is Dask's."""
+    with ProcessPoolExecutor(1) as process:
+        return process.submit(_all_of, *part).result()
 
 
 def _all_of(setting: Setting, count: int, first: int, period: float) -> tuple[list[Outcome], str]:

@@ -19,7 +19,7 @@ from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.rollout import ChainArms
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
