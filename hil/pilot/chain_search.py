@@ -137,9 +137,8 @@ class ChainSearch:
         samples = load_samples(folder.samples_path, len(config.joints))
         peaks = peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
         foreseen = found.foreseen.peaks
-        step = Step(
-            name, found.plan.segments[0].peak_torque, foreseen.median, foreseen.quantile, peaks, str(error or "")
-        )
+        torque = found.plan.segments[0].peak_goal * np.array([joint.torque_per_goal for joint in config.joints])
+        step = Step(name, torque, foreseen.median, foreseen.quantile, peaks, str(error or ""))
         self.steps.append(step)
         self.say(f"{name}: {100 * found.share:.0f} % of the path. {step} Least clearance foreseen: {found.foreseen}.")
         if error is not None:
