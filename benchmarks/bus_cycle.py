@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,19 +32,21 @@ from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHand
 
 from benchmarks.machine import machine
 from benchmarks.pty import responder_binary, served_pty
-from hil.config.schema import Config, load_config
+from hil.config.schema import load_config
 from hil.drivers.control_table import load_control_table
 from hil.drivers.exchange import Exchange
-from hil.drivers.joint import Joint
 from hil.drivers.port import open_port
-from hil.drivers.servo_model import Mode, servo_model
+from hil.drivers.servo_model import Mode
 from hil.drivers.state import Converter, spans
 
 BAUD = 1_000_000
 BYTE_NS = 10_000
 PARTS = 3
-PATIENCE_S = 0.5
+PATIENCE_S = 2.0
 """Reply timeout [s], long enough that late replies on a busy machine do not count as lost."""
+
+STILL_A = 0.01
+"""A current that dry friction resists."""
 
 GOAL_CURRENT, PRESENT = (102, 2), (126, 10)
 
@@ -82,17 +85,26 @@ def make_exchange(port: Any, servos: int, *, fast: bool = False) -> Exchange:
 
 @contextmanager
 def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
-    """The complete work of an experiment for one sample: exchange in SI units, guard, recorder."""
+    """The complete work of an experiment for one sample: exchange in SI units, recorder, guard, and the model that
+    runs beside the experiment, which exists for up to two joints.
+
+    The responder's arm hangs still, under currents too small to move it: nothing that the guard has to stop.
+    """
     from hil.experiment.guard import Guard
+    from hil.experiment.model_watch import ModelWatch
     from hil.runs.recording import Phase, Recorder
 
-    joints = [Joint(f"joint{index}", index + 1, servo_model("XM430-W350")) for index in range(servos)]
-    guard = Guard(_without_limits(servos))
+    config = load_config(Path(__file__).parents[1] / "configs" / "fake_two_link.toml")
+    given = [config.joints[index % 2] for index in range(servos)]
+    joints = [replace(joint.joint, id=index) for index, joint in enumerate(given, 1)]
+    safety = config.safety.model_copy(update={"watchdog": PATIENCE_S + 0.5})
+    guard = Guard(config.model_copy(update={"joints": given, "safety": safety}))
+    model = ModelWatch(config, [STILL_A] * 2) if servos == 2 else None
     port = open_port(name, BAUD)
     port.latency = PATIENCE_S
     exchange = make_exchange(port, servos)
     converter = Converter(joints, [joint.drive_unit(12.0) for joint in joints])
-    goals = [0.25] * servos
+    goals = [STILL_A] * servos
     with ExitStack() as stack:
         folder = stack.enter_context(_temporary_folder())
         recorder = stack.enter_context(Recorder(folder / "samples.npy", servos, 1_000_000))
@@ -102,18 +114,11 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
             state = converter.state(ticks, exchange.cycle(ticks))
             recorder.keep(state.time_before_write, Phase.PERIODIC, 0, 0, state)
             guard.look(state)
+            if model is not None:
+                model.look(state)
 
         yield cycle
     port.close()
-
-
-def _without_limits(servos: int) -> Config:
-    """A configuration whose guard performs all checks but never stops: the responder's arm follows no command."""
-    config = load_config(Path(__file__).parents[1] / "configs" / "fake_two_link.toml")
-    free = {"position_limit": [-1e9, 1e9], "velocity_limit": 1e9}
-    joints = [config.joints[0].model_copy(update=free)] * servos
-    safety = config.safety.model_copy(update={"follow_time": 1e6})
-    return config.model_copy(update={"joints": joints, "safety": safety})
 
 
 @contextmanager

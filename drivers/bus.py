@@ -1,7 +1,7 @@
 """The servos of one arm on one port: preparation, the control cycle, and torque off afterwards."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from hil.drivers.control_table import ControlTable, load_control_table, model_names
@@ -14,15 +14,15 @@ from hil.drivers.errors import (
 )
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
-from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
+from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.hold import let_sink, refuse_held
 from hil.drivers.preparation.prepare import check_quiet, fault_text, learn_latency, prepare_servo, shared
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
-from hil.drivers.shield import signals_held_back
 from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_span
-from hil.drivers.sync_read import one_each
+from hil.drivers.sync_read import Answer, one_each
+from hil.drivers.torque_off import TorqueOff, cut_torque, disarm_watchdogs, signals_held_back
 
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
@@ -35,9 +35,6 @@ _SHARE, _MOST_SHARE = 0.6, 0.9
 
 MOST_STRANGERS = 2
 """Tolerated number of foreign instructions heard during an experiment; a corrupted reply can look like one."""
-
-_INTERRUPTS_BORNE = 5
-"""Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 
 @dataclass(frozen=True)
@@ -74,36 +71,6 @@ class BusConfig:
         return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
 
 
-@dataclass(frozen=True)
-class TorqueOff:
-    """Result of an attempt to cut torque.
-
-    confirmed: joints whose servos were read back as off.
-    unconfirmed: the other joints, each with the reason.
-    unwatched: joints, of either group, whose servos have no Bus Watchdog.
-    """
-
-    confirmed: tuple[Joint, ...]
-    unconfirmed: tuple[tuple[Joint, str], ...]
-    unwatched: frozenset[Joint] = frozenset()
-
-    def __str__(self) -> str:
-        if not self.unconfirmed:
-            servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
-            return f"Torque is off on {servos}, read back."
-        names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
-        alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
-        if alone:
-            return (
-                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
-                "Watchdog and may keep its last current: cut the supply now."
-            )
-        return (
-            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
-            "but cut the supply before you reach into the arm."
-        )
-
-
 class ServoBus:
     """The servos of an arm on an open port. Use as a context manager; `close` may be called twice.
 
@@ -129,6 +96,8 @@ class ServoBus:
         self._exchange: Exchange | None = None
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
+        self._watchdog = 0.0
+        self._last_answers: Sequence[Answer] = ()
         self.torque_off_report: TorqueOff | None = None
 
     @classmethod
@@ -319,10 +288,16 @@ class ServoBus:
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
         ticks = self._converter.ticks(goals)
         exchange = self._exchange or self.prepared
-        state = self._converter.state(ticks, exchange.cycle(ticks))
+        reply = exchange.cycle(ticks)
+        self._last_answers = reply.servos
+        state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:
             raise shared(f"has sent {exchange.strangers} instructions")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
+
+    def read_status_next(self) -> None:
+        """Read the servos' status in the next exchange, if they report one at all."""
+        self.prepared.read_status_next()
 
     def check_alerts(self, state: State) -> None:
         """Read the cause wherever a servo has raised its alert bit; raises ServoFault naming all of them."""
@@ -374,6 +349,7 @@ class ServoBus:
         ticks = round(watchdog / WATCHDOG_UNIT)
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
+        self._watchdog = watchdog
         for joint, servo in self._servos.items():
             watched = joint not in self._without_watchdog
             if watched:
@@ -391,71 +367,25 @@ class ServoBus:
                 raise
 
     def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back. All servos are tried, whatever fails.
+        """Cut torque on every servo and read it back (`hil.drivers.torque_off`). All servos are tried, whatever fails.
 
-        After each servo that cannot be confirmed, torque off is sent to all again: the servo may receive without being
-        able to reply, and while it was being polled the other servos' watchdogs saw traffic and did not trip. Signals
-        are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
+        Signals are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
         `torque_off_report` is set.
         """
         interrupts: list[BaseException] = []
         with signals_held_back():
-            try:
-                self._torque_off_at_once()
-            except BaseException as interrupt:  # the servos must be tried one by one whatever happens
-                interrupts.append(interrupt)
-            confirmed, unconfirmed = self._confirm_torque_off(interrupts)
+            silent = {
+                drive
+                for drive, answer in zip(self._drives, self._last_answers, strict=False)
+                if answer is None or len(answer) == 1
+            }
+            confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
+            watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
+            disarm_watchdogs(watched, interrupts)
             self.torque_off_report = TorqueOff(confirmed, unconfirmed, frozenset(self._without_watchdog))
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report
-
-    def _confirm_torque_off(
-        self, interrupts: list[BaseException]
-    ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
-        confirmed, unconfirmed = [], []
-        for joint, servo in self._servos.items():
-            why = _write_surely(servo, "Torque Enable", 0, interrupts)
-            if why is None:
-                confirmed.append(joint)
-            else:
-                unconfirmed.append((joint, why))
-                self._torque_off_at_once()
-        for joint in confirmed:
-            if joint not in self._without_watchdog:
-                _write_surely(self._servos[joint], "Bus Watchdog", 0, interrupts)
-        return tuple(confirmed), tuple(unconfirmed)
-
-    def _torque_off_at_once(self) -> None:
-        """Send torque off to all servos of the arm in one broadcast.
-
-        The broadcast takes 0.3 ms; confirmed writes take a few ms per servo, and 0.1 s for one that does not reply. It
-        is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be
-        lost.
-        """
-        entry = self._servos[self._drives[0]].table["Torque Enable"]
-        body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
-        body += b"".join(bytes((drive.id, 0)) for drive in self._drives)
-        # If this fails, the confirmed writes that follow report it.
-        with suppress(DriverError):
-            self.port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
-
-
-def _write_surely(servo: Servo, register: str, value: int, interrupts: list[BaseException]) -> str | None:
-    """Write a register and read it back; return None, or the reason for the failure.
-
-    An interrupt is appended to `interrupts` and the write is tried again.
-    """
-    for _ in range(_INTERRUPTS_BORNE):
-        try:
-            servo.write(register, value)
-        except Exception as error:  # whatever fails on one servo, the next must still be tried
-            return str(error) or type(error).__name__
-        except BaseException as interrupt:
-            interrupts.append(interrupt)
-        else:
-            return None
-    return "The write was interrupted repeatedly."
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

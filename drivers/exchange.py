@@ -124,6 +124,11 @@ class Exchange:
         """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
         return self._port.wire_time(max(self._bytes(read) for read in self._reads))
 
+    def read_status_next(self) -> None:
+        """Read the status in the next cycle instead of when its turn comes."""
+        if self._status_every < _NEVER:
+            self._until_status = min(self._until_status, 1)
+
     def cycle(self, goal_ticks: Sequence[int]) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
 

@@ -52,11 +52,11 @@ class Servo:
 
         return self._try("ping", ask, attempts)
 
-    def read(self, register: str) -> int:
+    def read(self, register: str, attempts: int = _ATTEMPTS) -> int:
         """Return the value of a register in ticks; raises NoReply, WrongReply, ServoRefused, PortLost."""
-        return self.read_entry(self.table[register])
+        return self.read_entry(self.table[register], attempts)
 
-    def read_entry(self, entry: Register) -> int:
+    def read_entry(self, entry: Register, attempts: int = _ATTEMPTS) -> int:
         """Read a register that is missing from the model's table; raises as `read`."""
 
         def ask() -> tuple[list[int], int, int]:
@@ -83,14 +83,18 @@ class Servo:
                 return [], COMM_RX_CORRUPT, error
             return data, result, error
 
-        return entry.decode(bytes(self._try(f"reading {entry.name}", ask)))
+        return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts)))
 
-    def write(self, register: str, value: int) -> None:
-        """Write a register and read it back; raises as `read`, and ServoRefused if another value is read back."""
+    def write(self, register: str, value: int, attempts: int | None = None) -> None:
+        """Write a register and read it back; raises as `read`, and ServoRefused if another value is read back.
+
+        attempts: of the write and of the read; by default as many as for all set-up work.
+        """
+        attempts = _ATTEMPTS if attempts is None else attempts
         # The status packet may be lost or switched off (Status Return Level 1); what counts is the register's value.
         with suppress(NoReply):
-            self.write_only(register, value)
-        actual = self.read(register)
+            self.write_only(register, value, attempts)
+        actual = self.read(register, attempts)
         if actual != value:
             raise ServoRefused(f"{self.title}: {register} was written as {value} but reads back as {actual}.")
 

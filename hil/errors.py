@@ -7,6 +7,7 @@ HilError                    exit code
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
 ├── ResultError             2   result.json is missing, incomplete, damaged, or from a newer hil
 ├── ExportError             2   the format cannot hold this arm, or a package for it is not installed
+├── SchedulerLost           1   a study's scheduler answers no more
 └── ExperimentError         1   the experiment could not be finished
     ├── SafetyStop          1   the guard stopped the arm because a limit was exceeded
     ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
@@ -53,7 +54,7 @@ class Cause(Enum):
 
     @property
     def allows_lowering(self) -> bool:
-        """Whether the servos still take commands, so that an arm that would fall may be lowered, watched all the way."""
+        """Whether the servos still take commands, so that an arm may be lowered, watched all the way."""
         return self.allows_braking or self in {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER}
 
 
@@ -77,6 +78,10 @@ class RunFolderError(HilError):
     """The run folder cannot be used. Example: `--out` names a folder that holds another run."""
 
     exit_code = 2
+
+
+class SchedulerLost(HilError):
+    """The scheduler of a study answers no more. Example: its machine was switched off; --resume goes on."""
 
 
 class CsvError(HilError):

@@ -23,12 +23,33 @@ class Kind(StrEnum):
     FREEZE = "freeze"
     SCALE = "scale"
     REPLAY = "replay"
+    BIAS = "bias"
+    CREEP = "creep"
+    LAG = "lag"
+    JITTER = "jitter"
+    STUCK_BIT = "stuck_bit"
+    CONSTANT = "constant"
+    COLLISION = "collision"
     DEAF = "deaf"
     DEAF_TO_GOALS = "deaf_to_goals"
     TWICE_TOLD = "twice_told"
     TORQUE_TAKEN = "torque_taken"
     WATCHDOG_TRIPPED = "watchdog_tripped"
     STRANGE_GOAL = "strange_goal"
+    RAISED_LIMIT = "raised_limit"
+    LOWERED_LIMIT = "lowered_limit"
+    WATCHDOG_OFF = "watchdog_off"
+    WATCHDOG_LONG = "watchdog_long"
+    TURNED_ROUND = "turned_round"
+    SLOW_REPLIES = "slow_replies"
+    NEW_ID = "new_id"
+    NEW_BAUD = "new_baud"
+    CLOCK_RATE = "clock_rate"
+    CLOCK_WRAP = "clock_wrap"
+    WEAK = "weak"
+    SATURATED = "saturated"
+    PUSHED = "pushed"
+    DISK_FULL = "disk_full"
     STALL = "stall"
     SIGINT = "SIGINT"
     SIGTERM = "SIGTERM"
@@ -36,11 +57,14 @@ class Kind(StrEnum):
     KILLED = "killed"
 
 
-ON_REPLIES = frozenset(
-    {Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.SWAP, Kind.FREEZE, Kind.SCALE}
-) | {Kind.REPLAY}
+ON_REPLIES = frozenset({Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.COLLISION})
+FORGED = frozenset({Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY, Kind.BIAS, Kind.CREEP, Kind.LAG, Kind.JITTER}) | {
+    Kind.STUCK_BIT,
+    Kind.CONSTANT,
+}
+ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED})
 ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD})
-AT_ONCE = frozenset(set(Kind) - ON_REPLIES - ON_INSTRUCTIONS - {Kind.ECHO})
+AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - {Kind.ECHO})
 """Attacks that happen once, at their start time."""
 
 
@@ -48,8 +72,8 @@ AT_ONCE = frozenset(set(Kind) - ON_REPLIES - ON_INSTRUCTIONS - {Kind.ECHO})
 class Attack:
     """One attack, from `start` to `end` [s on the port's clock].
 
-    servo: bus ID, None for all. chance: probability of affecting a packet. amount: seconds, bits or a factor, depending
-    on the kind. field: the register that is forged, "state" for all three.
+    servo: bus ID, None for all. chance: probability of affecting a packet. amount: seconds, bits, ticks or a factor,
+    depending on the kind. field: the register that is forged, "state" for all three.
     """
 
     kind: Kind

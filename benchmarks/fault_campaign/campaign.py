@@ -21,8 +21,9 @@ from benchmarks.fault_campaign.arms import PERIOD_S, Setting
 from benchmarks.fault_campaign.attack import Kind
 from benchmarks.fault_campaign.draw import Drawn, draw
 from benchmarks.fault_campaign.judge import Story, Verdict, describe, judge
-from benchmarks.fault_campaign.middle import Killed, Middle, Traffic
+from benchmarks.fault_campaign.middle import Middle, Traffic
 from benchmarks.fault_campaign.protocol_campaign import Bench
+from benchmarks.fault_campaign.touch import Killed
 from benchmarks.fault_campaign.witness import Witness
 from hil.cli.app import main
 from hil.config.schema import Config, parse_config
@@ -149,7 +150,7 @@ def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str
         port = Bench.port
         if port is None:  # the command ended before it opened the port
             return Story(np.empty(0), Traffic(), 0.0, code, text), True, ()
-        port.over = True
+        port.let_be()
         ended = port.clock.now()
         port.bus.faults.clear()
         port.clock.wait_until(ended + AFTER_S)

@@ -13,11 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_in
-from benchmarks.fault_campaign.draw import CAUSES, SHIFTED, UNHEARD, WORDS, Drawn
+from benchmarks.fault_campaign.draw import CAUSES, HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn
 from benchmarks.fault_campaign.middle import Traffic
+from benchmarks.fault_campaign.visible import Heard, visible_from
 from benchmarks.fault_campaign.witness import STEP_S
 from hil.config.schema import Config
 from hil.drivers.packet import Framer
+from hil.estimator.models.momentum_observer import NAMES
+from hil.experiment.model_watch import known_arm
 from hil.fakes.bus.faults import FaultKind
 
 BOUND_MS = 100.0
@@ -38,6 +41,14 @@ OBEYED = 0.1
 
 ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
 """Tolerance for the deviation from the undisturbed motion, absolute and relative to the range of that motion."""
+
+TO_BE_SEEN = (
+    "is not where the program was told",
+    "is not as fast as told",
+    "is beyond a limit",
+    "is not where it would be",
+)
+"""What nobody can know before it shows in what the program is told."""
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
 _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
@@ -60,7 +71,8 @@ class Verdict:
 
     owed: why the current had to end, "" if there was no reason. late_ms: how long it flowed after that. beyond:
     overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
-    stopped the run. misleading: the output names only wrong causes.
+    stopped the run. misleading: the output names only wrong causes. unseen: late_ms counts from the moment at which the
+    fault became observable (`fault_campaign.visible`), later than it began.
     """
 
     owed: str
@@ -69,6 +81,7 @@ class Verdict:
     beyond: NDArray[np.float64]
     named: bool | None
     misleading: bool
+    unseen: bool = False
 
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
@@ -77,23 +90,46 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
     driven = story.record["driven"].any(axis=1)
     time = story.record["time"][:, 0]
-    ends = time[driven]
-    flowed = ends[ends >= since]
-    late_ms = 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
     bound = BOUND_MS
     if set(drawn.kinds) & UNHEARD:
         bound = max(bound, 1e3 * config.safety.watchdog + TRIP_MS)
+    late_ms, unseen = _flowed_ms(time[driven], since), False
+    if late_ms > bound:
+        seen = visible_from(*_shown(config, story, undisturbed))
+        later = [(what, max(when, seen) if what.endswith(TO_BE_SEEN) else when) for what, when in reasons]
+        owed, since = min(later, key=lambda reason: reason[1])
+        late_ms, unseen = _flowed_ms(time[driven], since), late_ms > _flowed_ms(time[driven], since)
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
-    return Verdict(owed, late_ms, late_ms > bound or left_on, beyond, named, misleading)
+    return Verdict(owed, late_ms, late_ms > bound or left_on, beyond, named, misleading, unseen)
+
+
+def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:
+    """For how long current flowed from a moment on; driven: the moments at which it did [s]."""
+    flowed = driven[driven >= since]
+    return 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
+
+
+def _shown(
+    config: Config, story: Story, undisturbed: Story
+) -> tuple[Config, tuple[NDArray[np.float64], NDArray[np.float64]], Heard, Heard]:
+    """What `visible_from` needs: the prior is that of the program."""
+    told, usual = (
+        Heard(config, every.heard, every.sent)
+        for every in (_Told(config, each.traffic, 0.0) for each in (story, undisturbed))
+    )
+    mean, covariance = known_arm(config, np.abs(usual.torque).max(axis=0), None)
+    return config, (np.array([mean.get(name, 0.0) for name in NAMES]), covariance), told, usual
 
 
 def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
     """Whether the message names the cause among at most three causes, and whether it names only wrong ones."""
     offered = causes_in(text)
+    if set(drawn.kinds) <= HARMLESS:
+        return False, True  # whatever it says: it should not have stopped
     right = frozenset().union(*(CAUSES[kind] for kind in drawn.kinds))
     if not right:
         return True, False  # none of the faults had to stop the run, so the message is not judged
@@ -166,8 +202,8 @@ class _Told:
 
     def __init__(self, config: Config, traffic: Traffic, start: float) -> None:
         self._joints = config.joints
-        self._sent: list[list[tuple[float, int]]] = [[] for _ in config.joints]
-        self._heard: list[list[tuple[float, float, float]]] = [[] for _ in config.joints]
+        self.sent: list[list[tuple[float, int]]] = [[] for _ in config.joints]
+        self.heard: list[list[tuple[float, ...]]] = [[] for _ in config.joints]
         self._begun = np.inf
         self._largest = [1] * len(config.joints)
         index = {joint.id: number for number, joint in enumerate(config.joints)}
@@ -193,7 +229,7 @@ class _Told:
             for servo_id, (_, goal) in goals_in(packet).items():
                 if servo_id in index:
                     self._begun = min(self._begun, time)
-                    self._sent[index[servo_id]].append((time, goal))
+                    self.sent[index[servo_id]].append((time, goal))
                     self._largest[index[servo_id]] = max(self._largest[index[servo_id]], abs(goal))
 
     def _keep_answers(self, time: float, data: bytes, request: Request, index: dict[int, int]) -> None:
@@ -203,18 +239,19 @@ class _Told:
             if servo_id not in index or velocity is None or position is None or error & 0x7F:
                 continue
             joint = self._joints[index[servo_id]]
-            heard = self._heard[index[servo_id]]
+            heard = self.heard[index[servo_id]]
             told = (
                 time,
                 joint.direction * (position - joint.zero_ticks) / _TICKS_PER_RAD,
                 joint.direction * velocity / _TICKS_PER_RAD_S,
+                (field_of(block, request, "current") or 0) * joint.joint.drive_unit(12.0),
             )
             if not heard or heard[-1][1:] != told[1:] or time - heard[-1][0] > 5e-4:
                 heard.append(told)
 
     def lies(self, joint: int, time: NDArray[Any], own: NDArray[Any], what: str, interval: float) -> NDArray[np.bool_]:
         wrong = np.zeros(time.size, bool)
-        heard = np.array(self._heard[joint]).reshape(-1, 3)
+        heard = np.array(self.heard[joint]).reshape(-1, 4)
         if not heard.size:
             return wrong
         at = np.clip(np.searchsorted(time, heard[:, 0]), 0, time.size - 1)
@@ -229,7 +266,7 @@ class _Told:
         return wrong
 
     def silent(self, joint: int, time: NDArray[Any], interval: float, ended: float) -> NDArray[np.bool_]:
-        heard = np.array([each[0] for each in self._heard[joint]])
+        heard = np.array([each[0] for each in self.heard[joint]])
         if not heard.size or not np.isfinite(self._begun):
             return np.zeros(time.size, bool)
         latest = heard[np.clip(np.searchsorted(heard, time, "right") - 1, 0, None)]
@@ -237,10 +274,10 @@ class _Told:
         return running & (time - latest > interval + 2e-3)
 
     def disobeys(self, joint: int, time: NDArray[Any], own: NDArray[Any], interval: float) -> NDArray[np.bool_]:
-        if not self._sent[joint]:
+        if not self.sent[joint]:
             return np.zeros(time.size, bool)
-        when = np.array([each[0] for each in self._sent[joint]])
-        goals = np.array([each[1] for each in self._sent[joint]])
+        when = np.array([each[0] for each in self.sent[joint]])
+        goals = np.array([each[1] for each in self.sent[joint]])
         done = np.where(own["torque"], own["goal"], 0)
         tolerance = OBEYED * self._largest[joint] + 1
         # While a goal is in transit, the servo may still hold the previous one.
@@ -273,5 +310,6 @@ def _astray(drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[An
 def describe(verdict: Verdict) -> str:
     """The verdict on one line."""
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
+    said += ["seen only later"] * verdict.unseen
     said += ["UNSAFE"] * verdict.unsafe + ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
     return ", ".join(said)

@@ -14,7 +14,9 @@ drift slowly). The range of admissible motion is therefore wide for a poorly kno
 An alarm is raised if the torque missing at a joint exceeds three thresholds for `HOLD_S` (a shorter time if it exceeds
 them by far): `TIMES` standard deviations of the uncertainty due to parameters and noise, what friction can hold while
 the joint stands still, and a fraction of the largest planned torque. The noise is estimated as well: effects that the
-model lacks (Stribeck friction, backlash, flexibility) widen the admissible range.
+model lacks (Stribeck friction, backlash, flexibility) widen the admissible range. A deviation that may become an alarm
+enters that estimate only once it has ended without one; otherwise a joint that is held for long would widen the range
+until nothing exceeds it. While a joint stands still its noise is lower, since most of it needs motion.
 """
 
 import math
@@ -44,7 +46,8 @@ _STATIC = 1.5  # ratio of static to Coulomb friction
 _VELOCITY_STD = 0.0135  # rad/s: rounding of the register, with steps of 0.024, and some noise
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
 _NOISE_S = 1.0  # time constant of the noise estimate
-_CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances
+_CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
+_STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
 _MOST_WEIGHT = 4.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
 _WARM_S = 3 * FILTER_S
@@ -53,9 +56,12 @@ _LONGEST_GAP = 3.0  # number of intervals between two samples after which the ob
 # Rows of the observer's memory: filtered momentum and rest, rest at the previous sample (two joints each), the
 # parameters, a row of scalars, and the parameters' covariance.
 _MOMENTUM, _REST, _FORMER, _THETA, _SINGLE, _COVARIANCE = 0, 2, 4, 6, 7, 8
+_PENDING = _COVARIANCE + _COUNT
 # Scalars: per joint filtered torque, noise variance, fraction of time at standstill, duration and sample count of a
 # possible alarm, missing torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
+# Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration.
+_TAUGHT, _TEACHES = 0, 2
 
 
 class MomentumObserver:
@@ -72,9 +78,9 @@ class MomentumObserver:
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
             raise ValueError(f"{joints} joints and a covariance of {covariance.shape}: 1 or 2, and 14 x 14, are needed")
         self._joints = joints
-        self._memory = np.zeros((_COVARIANCE + _COUNT, _COUNT))
+        self._memory = np.zeros((_PENDING + 1, _COUNT))
         self._memory[_THETA] = [mean.get(name, 0.0) for name in NAMES]
-        self._memory[_COVARIANCE:] = covariance
+        self._memory[_COVARIANCE:_PENDING] = covariance
         self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * largest) ** 2
         floor = np.zeros(2)
         floor[:joints] = FLOOR_SHARE * largest
@@ -138,6 +144,7 @@ def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
         single[_TORQUE + j] = t1 if j == 0 else t2
         single[_STANDS + j] = 1.0
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
+        m[_PENDING, _TAUGHT + j] = m[_PENDING, _TEACHES + j] = 0.0
     single[_LESSON] = single[_AGE] = 0.0
 
 
@@ -199,6 +206,19 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
     return bool(single[_HELD + j] >= HOLD_S and single[_SAMPLES + j] >= 2.0)
 
 
+def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> None:
+    """Update the noise variance; the contribution of a possible alarm waits until the alarm has ended."""
+    for_later = m[_PENDING]
+    if pending:
+        for_later[_TAUGHT + j] += taught * dt
+        for_later[_TEACHES + j] += dt
+        return
+    seconds = dt + for_later[_TEACHES + j]
+    mean = (taught * dt + for_later[_TAUGHT + j]) / seconds
+    m[_SINGLE, _NOISE + j] += min(seconds / _NOISE_S, 1.0) * (mean - m[_SINGLE, _NOISE + j])
+    for_later[_TAUGHT + j] = for_later[_TEACHES + j] = 0.0
+
+
 def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float) -> int:
     momentum, rest = np.zeros((2, _COUNT)), np.zeros((2, _COUNT))
     _regressors(momentum, rest, q1, q2, v1, v2)
@@ -226,20 +246,21 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
         lacking, left_open = _lacks(m, j, row, gain)
         single[_LACKING + j] = lacking
         holds, rounding = _held_by_friction(m, j), _of_rounding(m, j, slope)
-        spread = left_open + rounding + single[_NOISE + j]
+        quiet = 1.0 - (1.0 - _STANDING_NOISE) * min(max(single[_STANDS + j], 0.0), 1.0)
+        spread = left_open + rounding + quiet * quiet * single[_NOISE + j]
         beyond = max(abs(lacking) - holds, 0.0)
         is_beyond = beyond > TIMES * math.sqrt(spread)
-        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), k[2 + j]), dt):
+        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), quiet * k[2 + j]), dt):
             alarm = j
-        taught = min(beyond * beyond, _CLIPPED * spread) - left_open - rounding
-        single[_NOISE + j] += min(dt / _NOISE_S, 1.0) * (max(taught, k[4 + _COUNT + j]) - single[_NOISE + j])
+        taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
+        _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt, single[_SAMPLES + j] > 0.0)
         if lesson and not is_beyond:
             _learn(m, gain, lacking, spread + holds * holds)
     return alarm
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
-_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms = map(
-    _inner, (_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms)
+_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms, _teach_noise = map(
+    _inner, (_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms, _teach_noise)
 )
 _observe: Callable[..., int] = numba.njit(cache=True, nogil=True, error_model="numpy")(_observe_loop)

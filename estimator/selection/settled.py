@@ -8,6 +8,7 @@ Statistics 6 (1978) 461), with the number of samples reduced according to the re
 
 import time
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -106,6 +107,7 @@ def choose(
     lever: float | None = None,
     starts: Sequence[Mapping[str, float]] = (),
     options: SelectionOptions = DEFAULTS,
+    executor: Executor | None = None,
 ) -> Choice:
     """Fit `periods` with the terms that the data support.
 
@@ -127,14 +129,51 @@ def choose(
         lever: as of `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         options: thresholds.
+        executor: of concurrent.futures; fits that may be needed are begun before it is known that they are. The choice
+            is the same with and without it.
 
     Raises:
         ConvergenceError: if no model can be fitted.
     """
-    search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None)
-    grown = search.grow(Model(periods[0].joints, "stribeck", drive, by_voltage=by_voltage, lever=lever))
-    pruned = search.prune(grown)
+    search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None, executor)
+    try:
+        grown = search.grow(Model(periods[0].joints, "stribeck", drive, by_voltage=by_voltage, lever=lever))
+        pruned = search.prune(grown)
+    finally:
+        search.end()
     return Choice(tuple(search.trials), search.judged(pruned))
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """The fit of one model to one set of periods, as a value that another process can be given."""
+
+    periods: Sequence[SettledPeriod]
+    held_out: SettledPeriod | None
+    starts: Sequence[Mapping[str, float]]
+
+    def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
+        """From where `near` ended, with `values` for what it lacks, or from scratch; raises ConvergenceError."""
+        started = time.perf_counter()
+        place = None
+        if near is not None and near.estimate is not None:
+            place = Near({**near.estimate.parameters, **values}, near.estimate.start)
+        options = QUICK if coarse and "presliding" in model.options else THOROUGH
+        estimate = identify(self.periods, model, starts=self.starts, near=place, coarse=coarse, options=options)
+        relative, score = self._predicted(estimate)
+        return Trial(model, estimate, relative, score, time.perf_counter() - started)
+
+    def _predicted(self, estimate: Estimate) -> tuple[Array | None, float]:
+        other = self.held_out
+        if other is None:
+            return None, _criterion(estimate, self.periods)
+        try:
+            predicted = predict_period(estimate, other)
+        except PeriodicityError:
+            return None, np.inf
+        return relative_error(other, predicted), float(
+            np.sqrt(np.nanmean(((other.position - predicted) / other.noise[:, None]) ** 2))
+        )
 
 
 class Selection:
@@ -147,25 +186,42 @@ class Selection:
         starts: Sequence[Mapping[str, float]],
         options: SelectionOptions,
         fixed: Option | None,
+        executor: Executor | None = None,
     ) -> None:
         self._periods = [without_spikes(period) for period in periods]
         self._held_out = held_out
-        self._starts = starts
+        self._fitting = Fitting(self._periods, held_out, starts)
         self._options = options
         self._fixed = fixed
+        self._executor = executor
+        self._begun: dict[tuple[Model, int, bool], Future[Trial]] = {}
         self.trials: list[Trial] = []
         """All trials in chronological order."""
+
+    def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
+        """Begin a fit that may be needed, if there is an executor; one that is not needed is no trial."""
+        key = (model, id(near), coarse)
+        if self._executor is not None and key not in self._begun:
+            self._begun[key] = self._executor.submit(self._fitting.trial, model, near, {}, coarse)
+
+    def end(self) -> None:
+        """Give up fits that were begun and not needed."""
+        for future in self._begun.values():
+            future.cancel()
 
     def grow(self, model: Model) -> Trial:
         """Extend `model` to the richest one that the data support; raises ConvergenceError."""
         unknown: set[Option] = {"zeros"}
         if model.joints == 2:
             unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
+        smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
+        self._begin(model.having(*unknown), coarse=True)
+        self._begin(smooth)
+        self._begin(smooth.having("presliding"), coarse=True)
         plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
             return plain
-        smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
             best = self._better(self._try_or_none(smooth, plain), plain)
@@ -216,6 +272,10 @@ class Selection:
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
             return best  # effects of missing terms would be attributed to present ones
+        for level in self._options.prune_levels:
+            plainest = _without_nothings(best.estimate, level, self._fixed)
+            if plainest != best.model:
+                self._begin(plainest, best)
         for level in self._options.prune_levels:
             plainer = self._pruned_at(level, best)
             if plainer is best or self._gain(best, plainer) < self._worth(best, plainer):
@@ -280,29 +340,11 @@ class Selection:
             return None
 
     def _try(self, model: Model, near: Trial | None, values: Mapping[str, float], *, coarse: bool = False) -> Trial:
-        """Fit a model, starting where `near` ended, with `values` for its additional terms, or from scratch."""
-        started = time.perf_counter()
-        place = None
-        if near is not None and near.estimate is not None:
-            place = Near({**near.estimate.parameters, **values}, near.estimate.start)
-        options = QUICK if coarse and "presliding" in model.options else THOROUGH
-        estimate = identify(self._periods, model, starts=self._starts, near=place, coarse=coarse, options=options)
-        relative, score = self._predicted(estimate)
-        trial = Trial(model, estimate, relative, score, time.perf_counter() - started)
+        """Fit from the result of `near`, using `values` for what it lacks, or from scratch."""
+        begun = None if values else self._begun.pop((model, id(near), coarse), None)
+        trial = self._fitting.trial(model, near, values, coarse) if begun is None else begun.result()
         self.trials.append(trial)
         return trial
-
-    def _predicted(self, estimate: Estimate) -> tuple[Array | None, float]:
-        other = self._held_out
-        if other is None:
-            return None, _criterion(estimate, self._periods)
-        try:
-            predicted = predict_period(estimate, other)
-        except PeriodicityError:
-            return None, np.inf
-        return relative_error(other, predicted), float(
-            np.sqrt(np.nanmean(((other.position - predicted) / other.noise[:, None]) ** 2))
-        )
 
 
 def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
@@ -324,8 +366,15 @@ def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) ->
     Significance is judged by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
     errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.
     """
-    model, value, covariance = estimate.model, estimate.value.copy(), estimate.covariance.copy()
-    names = list(estimate.names)
+    return pruned_model(estimate.model, estimate.names, estimate.value, estimate.covariance, level, fixed)
+
+
+def pruned_model(
+    model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
+) -> Model:
+    """`model` without what its parameters (parameters,) and covariance do not tell from nothing at `level`; `fixed`
+    stays in."""
+    names, value, covariance = list(names), value.copy(), covariance.copy()
     covariance[~np.isfinite(covariance)] = 0.0
     while True:
         doubtful = []

@@ -65,6 +65,10 @@ class ManyArms:
     def joints(self) -> int:
         return int(self.scale.shape[1])
 
+    def part(self, first: int, last: int) -> "ManyArms":
+        """The arms from number `first` up to, not including, `last`."""
+        return ManyArms(self.physics[first:last], self.scale[first:last], self.pose[first:last], self.feedback)
+
     def peaks(
         self, multisines: Sequence[Commands], rate: float, settling: SettlingRule
     ) -> tuple[Array, npt.NDArray[np.int64]]:

@@ -1,6 +1,7 @@
 """Search, by dry runs, for the largest torque of each joint at which exceeding a limit is sufficiently unlikely."""
 
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -48,6 +49,7 @@ def largest_amplitude(
     plan: Plan | None = None,
     pose: Array | None = None,
     cap: Array | None = None,
+    executor: Executor | None = None,
 ) -> Amplitude:
     """Find the largest torque that keeps the arms within `share` of their limits, up to probability
     safety.limit_chance.
@@ -67,10 +69,10 @@ def largest_amplitude(
         share *= PRIOR_ROOM
     base = with_peaks(config, most_torque(config) / 8) if plan is None else plan
     most = most_torque(config) if cap is None else np.minimum(most_torque(config), cap)
-    found = _search(config, base, ensemble.first(SEARCH_ARMS), share, pose, most)
+    found = _search(config, base, ensemble.first(SEARCH_ARMS), share, pose, most, executor)
     for _ in range(_ROUNDS):
         plan = scaled(config, base, found)
-        prediction = predict(config, plan, ensemble, pose=pose)
+        prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
         if _chance(prediction, share) <= config.safety.limit_chance:
             return Amplitude(plan, found, prediction)
         found = found * _BACK_OFF
@@ -86,13 +88,21 @@ def with_peaks(config: Config, peak_torque: Array) -> Plan:
     return make_plan(config.model_copy(update={"experiment": experiment}))
 
 
-def _search(config: Config, base: Plan, ensemble: Ensemble, share: float, pose: Array | None, most: Array) -> Array:
+def _search(
+    config: Config,
+    base: Plan,
+    ensemble: Ensemble,
+    share: float,
+    pose: Array | None,
+    most: Array,
+    executor: Executor | None,
+) -> Array:
     """Approach the limits in several rounds, since the joints are coupled; return peak torques (joints,) [N m]."""
     torque = base.segments[0].peak_torque
     first = base.first_segment() if ensemble.source == "prior" else base
 
     def reached_with(tried: Array) -> Array:
-        prediction = predict(config, scaled(config, first, tried), ensemble, pose=pose, briefly=True)
+        prediction = predict(config, scaled(config, first, tried), ensemble, pose=pose, briefly=True, executor=executor)
         return _reached(config, prediction, share)
 
     best, used = 0.25 * torque, 0.0

@@ -5,6 +5,8 @@ and subject to lag and stabiliser, for as many periods as settling takes. Peaks 
 distance from rest to the limit; if any fraction of an arm reaches 1, the guard would have stopped that arm.
 """
 
+from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from math import erfc, sqrt
 
@@ -16,7 +18,7 @@ from hil.drivers.servo_model import Mode
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.rollout import commands_of, simulate_experiment
 from hil.estimator.simulation.closed_loop import Feedback
-from hil.estimator.simulation.many_arms import LOWEST, TORQUE, ManyArms, SettlingRule
+from hil.estimator.simulation.many_arms import LOWEST, TORQUE, Commands, ManyArms, SettlingRule
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import feedback_of
 
@@ -29,6 +31,8 @@ GUARDED = 3
 """
 
 QUANTILE = 0.99
+_ARMS_A_TASK = 16
+"""Number of arms that one task of an executor simulates."""
 _LEAST_SPREAD = 2e-3
 
 
@@ -115,7 +119,14 @@ def quantities_of(config: Config) -> tuple[tuple[str, str], ...]:
 
 
 def predict(
-    config: Config, plan: Plan, ensemble: Ensemble, *, pose: Array | None = None, briefly: bool = False, shown: int = 0
+    config: Config,
+    plan: Plan,
+    ensemble: Ensemble,
+    *,
+    pose: Array | None = None,
+    briefly: bool = False,
+    shown: int = 0,
+    executor: Executor | None = None,
 ) -> Prediction:
     """Simulate `plan` on every arm of the ensemble.
 
@@ -126,6 +137,7 @@ def predict(
         pose: where the arm starts at rest (joints,) [rad]; by default the rest pose.
         briefly: simulate only one period of each multisine; used during a search.
         shown: number of arms whose motion is stored.
+        executor: simulates the arms, some at a time; the result is the same with and without it.
     """
     commands = [commands_of(config, segment) for segment in plan.segments]
     start = np.array(config.arm.rest_pose) if pose is None else pose
@@ -133,12 +145,12 @@ def predict(
     feedback = feedback_of(config)
     arms = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback)
     if briefly:
-        each = [arms.peaks([command], plan.rate, SettlingRule(0.0, 0, 1))[0] for command in commands]
+        each = [_peaks(arms, [command], plan.rate, SettlingRule(0.0, 0, 1), executor)[0] for command in commands]
         peaks = _extreme(np.stack(each))
         settled_after = np.zeros(ensemble.size, dtype=np.int64)
     else:
         settling = SettlingRule(plan.settle_within, plan.max_settling_periods, plan.periods)
-        peaks, settled_after = arms.peaks(commands, plan.rate, settling)
+        peaks, settled_after = _peaks(arms, commands, plan.rate, settling, executor)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
     constant = np.array([joint.torque_per_goal for joint in config.joints])
     values = np.insert(peaks, TORQUE, peaks[:, TORQUE] / constant, axis=1)
@@ -149,6 +161,18 @@ def predict(
     return Prediction(
         values, _shares(values, limits, rest), limits, settled_after, _side_by_side(motions), rest, plan.rate
     )
+
+
+def _peaks(
+    arms: ManyArms, commands: Sequence[Commands], rate: float, settling: SettlingRule, executor: Executor | None
+) -> tuple[Array, NDArray[np.int64]]:
+    """`ManyArms.peaks`, by the executor where there is one: each arm is simulated for itself."""
+    if executor is None:
+        return arms.peaks(commands, rate, settling)
+    parts = [arms.part(first, first + _ARMS_A_TASK) for first in range(0, len(arms.physics), _ARMS_A_TASK)]
+    count = len(parts)
+    found = list(executor.map(ManyArms.peaks, parts, [commands] * count, [rate] * count, [settling] * count))
+    return np.concatenate([peaks for peaks, _ in found]), np.concatenate([settled for _, settled in found])
 
 
 def _extreme(peaks: Array) -> Array:

@@ -1,5 +1,6 @@
 """The work of `hil dry-run`: simulate the experiment on an ensemble and find the largest safe torque."""
 
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,13 @@ SHOWN = 30
 """Number of arms whose motion is stored for the plot."""
 
 
-def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos: bool = False) -> DryRun:
+def dry_run(
+    config: Config,
+    result: Path | None = None,
+    arms: int = ARMS,
+    servos: bool = False,
+    executor: Executor | None = None,
+) -> DryRun:
     """Simulate the configured experiment; `result` is a run folder or result.json of an earlier identification.
 
     Raises ConfigError, ResultError, RunFolderError, ExperimentError and, with `servos`, DriverError.
@@ -28,9 +35,9 @@ def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
     plan = None if config.experiment.peak_torque is None else make_plan(config)
-    asked = None if plan is None else predict(config, plan, ensemble, shown=SHOWN)
-    largest = largest_amplitude(config, ensemble)
-    shown = predict(config, largest.plan, ensemble, shown=SHOWN) if asked is None else asked
+    asked = None if plan is None else predict(config, plan, ensemble, shown=SHOWN, executor=executor)
+    largest = largest_amplitude(config, ensemble, executor=executor)
+    shown = predict(config, largest.plan, ensemble, shown=SHOWN, executor=executor) if asked is None else asked
     largest = replace(largest, prediction=shown) if asked is None else largest
     stopping = stopping_distance(config, plan or largest.plan, ensemble, shown.quantile[2].clip(max=shown.limits[2]))
     return DryRun(ensemble.source, ensemble.size, asked, largest, stopping, said)

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -35,9 +36,10 @@ from hil.runs.timing import timing
 log = logging.getLogger(__name__)
 
 
-def estimate_run(run: RunFolder) -> SettledResult:
+def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledResult:
     """Estimate from the recording in `run`, write its result.json and return the result.
 
+    executor: begins fits that `friction = "auto"` may need before it is known that it does.
     Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
@@ -47,7 +49,7 @@ def estimate_run(run: RunFolder) -> SettledResult:
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
-    estimate, choice = _estimate(config, period, other, run.load_starts())
+    estimate, choice = _estimate(config, period, other, run.load_starts(), executor)
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=considered(period, estimate))
     drift = None if other is None else _drift(facts, samples, other, estimate)
@@ -98,7 +100,11 @@ def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
 
 
 def _estimate(
-    config: Config, period: SettledPeriod, other: SettledPeriod | None, starts: list[dict[str, float]]
+    config: Config,
+    period: SettledPeriod,
+    other: SettledPeriod | None,
+    starts: list[dict[str, float]],
+    executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
     """Fit the configured model, or choose one; the choice is None if the model is fixed."""
     wanted, by_voltage, lever = config.model, voltage_driven(config), lever_of(config)
@@ -111,6 +117,7 @@ def _estimate(
             by_voltage=by_voltage,
             lever=lever,
             starts=starts,
+            executor=executor,
         )
         return choice.estimate, choice
     return identify(period, wanted_model(wanted, len(config.joints), by_voltage, lever), starts=starts), None

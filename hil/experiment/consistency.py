@@ -33,8 +33,11 @@ class Consistency:
         self._open = 0.0
         self._highest = self._lowest = 0.0
 
-    def look(self, position: float, velocity: float, seconds: float) -> bool:
-        """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent."""
+    def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
+        """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
+
+        unsure: by how much longer than usual its exchange took [s]: when in it the servo measured is not known.
+        """
         former, self._position = self._position, position
         before, self._velocity = self._velocity, velocity
         if former is None:
@@ -46,7 +49,7 @@ class Consistency:
         change = velocity - before
         self._apart = kept * self._apart + moved - felt
         self._open = kept * self._open + SCALE * abs(moved)
-        self._open += CURVED * seconds * abs(change)
+        self._open += CURVED * seconds * abs(change) + unsure * abs(velocity)
         highest, lowest = kept * self._highest + (1 - kept) * velocity, kept * self._lowest + (1 - kept) * velocity
         self._highest = highest = velocity if velocity > highest else highest
         self._lowest = lowest = velocity if velocity < lowest else lowest

@@ -12,7 +12,7 @@ from typing import NamedTuple, NoReturn
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
-from hil.drivers.packet import ALERT
+from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
@@ -118,6 +118,8 @@ class Guard:
         self._resting: tuple[float, ...] | None = None
         self._may_start_outside = left_by_a_run
         self._found_outside: dict[int, float] = {}
+        self._shortest = float("inf")
+        self._unsure = 0.0
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
         """Clamp goals to each joint's current limit and slew rate [A or V]. Raises SafetyStop for a goal that is not
@@ -180,6 +182,9 @@ class Guard:
                 f"This program stalled: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
                 Cause.LATE,
             )
+        took = state.time_after_read - now
+        self._shortest = shortest = min(self._shortest, took)
+        self._unsure = took - shortest
         self._late = 0
         if self._often_late > 0.0:
             self._judge_rate()
@@ -198,12 +203,18 @@ class Guard:
         if state.status is not None:
             self._look_status(state.status, state)
 
+    @property
+    def wants_status(self) -> bool:
+        """Whether the servos' status should be read again in the next exchange."""
+        return self._status.is_in_doubt
+
     def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
         low, high, fastest, farthest, _, work_scale, work_least = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
         interval = self._interval
+        elapsed = now - self._seen_at[index]
         # A punctual sample after a late one still represents a whole interval.
-        seconds = max(now - self._seen_at[index], interval * (1 + self._missing[index]))
+        seconds = max(elapsed, interval * (1 + self._missing[index]))
         former = self._position[index]
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
@@ -220,9 +231,9 @@ class Guard:
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
             self._not_followed(index, off)
         consistency = self._consistency[index]
-        if seconds > LONG_GAP * interval:
+        if elapsed > LONG_GAP * interval:
             consistency.lost()
-        if consistency.look(position, velocity, seconds):
+        if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
         work = self._work[index] = self._work[index] + work_scale * goal * velocity
         if work < work_least and self._passive:
@@ -250,7 +261,10 @@ class Guard:
         seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
         self._consistency[index].lost()
         allowed, said = self._missing_limit
-        if is_missing_too_long(self._missing[index], seconds, self._missing_limit):
+        # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
+        # was damaged.
+        refused = bool(error) and error != StatusError.CRC
+        if is_missing_too_long(self._missing[index] + refused, seconds, self._missing_limit):
             if error:
                 self._stop(
                     index,

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hil.config.schema import Config
+from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
@@ -27,7 +28,11 @@ _FRICTIONS = 8.0
 """Smallest torque scale, in multiples of the mean dry friction, so that less than twice the friction causes no alarm.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity out of the assumed direction, relative to gravity
+_FRICTION_SPREAD = 3.0
+"""Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
 _STILL_RAD_S = 0.06
+_VAGUE_S = 0.004
+"""Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 
 
 class ModelWatch:
@@ -40,14 +45,17 @@ class ModelWatch:
     def __init__(self, config: Config, planned: Sequence[float], arms: Ensemble | None = None) -> None:
         self._constants = [joint.torque_per_goal for joint in config.joints]
         largest = np.array([constant * goal for constant, goal in zip(self._constants, planned, strict=True)])
-        mean, covariance = _known(config, largest, arms)
+        mean, covariance = known_arm(config, largest, arms)
         interval = 1.0 / config.experiment.rate
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
-        dry = [_FRICTIONS * mean.get(f"coulomb_{number}", 0.0) for number in range(1, len(largest) + 1)]
+        is_described = arms is not None or config.arm.link_lengths is not None
+        dry = [_FRICTIONS * is_described * mean[f"coulomb_{number}"] for number in range(1, len(largest) + 1)]
         self._observer = MomentumObserver(mean, covariance, np.maximum(largest, dry), interval)
         self._names = [joint.joint.title for joint in config.joints]
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
+        self._shortest = float("inf")
+        self._long = max(interval, _VAGUE_S)
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
@@ -55,7 +63,10 @@ class ModelWatch:
             return
         goal, self._goal = self._goal, state.goal_current
         seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
-        if goal is None:
+        # When in a long exchange the servos measured is not known: the motion up to there tells nothing.
+        took = state.time_after_read - state.time_before_write
+        self._shortest = min(self._shortest, took)
+        if goal is None or took - self._shortest > self._long:
             goal, seconds = state.goal_current, float("inf")
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
@@ -79,10 +90,10 @@ class ModelWatch:
         raise SafetyStop(said, Cause.UNEXPECTED)
 
 
-def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
+def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
     """Mean and covariance of the observer's parameters."""
     if arms is None and config.arm.link_lengths is None:
-        return {}, np.diag(_hardly_known(largest) ** 2)
+        return _hardly_known(config, largest)
     arms = prior_ensemble(config, ARMS) if arms is None else arms
     joint = np.array([1 if name.endswith("_2") else 0 for name in NAMES])
     drawn = np.array(
@@ -103,12 +114,22 @@ def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[
     return dict(zip(NAMES, mean.tolist(), strict=True)), np.asarray(covariance)
 
 
-def _hardly_known(largest: Array) -> Array:
-    """Standard deviations (parameters,) if only the planned torque is known."""
-    each = {"gravity": 3.0, "tilt": 1.0, "coulomb": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
-    torque = [largest[-1] if name.endswith("_2") else largest[0] for name in NAMES]
-    share = [each.get(name.rpartition("_")[0], 3.0) for name in NAMES]
-    spread: Array = np.array(share) * np.array(torque)
-    if len(largest) == 1:
-        spread[[name in _OF_TWO for name in NAMES]] = 0.0
-    return spread
+def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Array]:
+    """Mean and covariance if only the planned torque and the servos' dry friction are known.
+
+    Friction decides whether a joint that stands still is held: without a bound on it, any torque might be too small.
+    """
+    each = {"gravity": 3.0, "tilt": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
+    guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
+    mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
+    spread = np.zeros(len(NAMES))
+    for index, name in enumerate(NAMES):
+        if len(largest) == 1 and name in _OF_TWO:
+            continue
+        joint = len(largest) - 1 if name.endswith("_2") else 0
+        term = name.rpartition("_")[0]
+        if term == "coulomb":
+            spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
+        else:
+            spread[index] = each.get(term, 3.0) * largest[joint]
+    return mean, np.diag(spread**2)

@@ -19,7 +19,7 @@ from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
-from hil.plan.chain_plan import plan_of
+from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
@@ -66,6 +66,8 @@ def run_experiment(
         HilError, DriverError: if torque was switched on, the exception carries a note that says whether it is off.
     """
     plan = plan_of(config) if plan is None else plan
+    if config.is_chain and not config.is_fake:
+        check_clearance(config, plan)
     fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
@@ -73,6 +75,8 @@ def run_experiment(
         def note(what: str) -> None:
             log.note(clock.now(), what)
 
+        if config.is_chain and not config.is_fake:
+            note("experiments on real arms in space are not tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
         if has_moved():

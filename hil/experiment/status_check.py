@@ -37,6 +37,11 @@ class StatusCheck:
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
+    @property
+    def is_in_doubt(self) -> bool:
+        """Whether the latest status was wrong in a way that one lost packet could explain: read it again at once."""
+        return any(self._missed) or any(stale for *_, stale in self._clock)
+
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         """Check a status reading; return the fault's cause and text, or None.
 

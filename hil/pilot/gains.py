@@ -37,7 +37,7 @@ def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
 
 
 def falls_over(config: Config, belief: Belief) -> bool:
-    """Whether gravity drives the median arm away from its rest pose: without torque, only a person brings it back."""
+    """Whether gravity drives the median arm away from its rest pose, to which only a person can bring it back."""
     lowest = float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min())
     return bool(config.arm.gravity) and lowest <= 0.0
 

@@ -20,7 +20,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
-from hil.drivers.shield import signals_held_back
+from hil.drivers.torque_off import signals_held_back
 from hil.errors import RunFolderError
 from hil.setup import settings_file
 from hil.setup.current_limit import current_limit_ticks

@@ -8,7 +8,7 @@ import tomli_w
 from hil.config.schema import Config, parse_config
 from hil.errors import ConfigError
 from hil.study.draw import arm_path, arm_values, drawn, put, run_count
-from hil.study.schema import Study
+from hil.study.schema import ON_ARM, Study
 
 BYTES_A_ROW = 4_000
 """Generous estimate of the Parquet size of one row [bytes], for about a hundred columns."""
@@ -22,10 +22,11 @@ _LOOKED_AT = 32
 def check_study(study: Study, out: Path) -> int:
     """Number of runs. Raises ConfigError for an unknown field, an invalid value, or insufficient disk space."""
     runs = run_count(study)
-    if study.study.task in ("identify", "dry_run"):
+    if study.study.task in ON_ARM:
         step = max(1, runs // _LOOKED_AT)
         for run in range(0, runs, step):
             config = checked_arm(study, run)
+            _check_fake(study, config)
         needed = runs * (BYTES_A_ROW + (_folder_bytes(config) if study.keep.run_folders else 0))
     else:
         if study.vary and study.study.task == "empty" and study.study.config is not None:
@@ -63,6 +64,17 @@ def checked_arm(study: Study, run: int) -> Config:
     except ConfigError as error:
         said = ", ".join(f"{key} = {value!r}" for key, value in drawn(study, run).items())
         raise ConfigError(f"{study.path}: run {run} ({said}) is not a valid arm: {error}") from error
+
+
+def _check_fake(study: Study, config: Config) -> None:
+    """Raise ConfigError for an arm that would move, unattended and by several workers at once."""
+    if study.study.task != "dry_run" and not config.url.startswith("fake://"):
+        raise ConfigError(
+            f'{study.path}: study.config: {arm_path(study).name} has port.url = "{config.port.url}", and a study moves '
+            'no real arm. Set port.url = "fake://", or record its runs one by one and use task = "estimate".'
+        )
+    if study.study.task == "fault" and config.experiment.pilot:
+        raise ConfigError(f'{study.path}: task = "fault" plays one experiment: set experiment.pilot = false.')
 
 
 def _folder_bytes(config: Config) -> int:

@@ -16,6 +16,8 @@ from hil.errors import RunFolderError
 from hil.study.work import Row
 
 _PART = "part-*.parquet"
+_WHOLE = ("run", "seed", "worker")
+"""Columns of integers."""
 
 
 class Dataset:
@@ -113,7 +115,7 @@ def _table(rows: Iterable[Row]) -> pa.Table:
 
 def _column(values: list[Any], name: str) -> pa.Array:
     kinds = {type(value) for value in values if value is not None}
-    if name == "run":
+    if name in _WHOLE:
         return pa.array(values, pa.int64())
     if kinds <= {bool}:
         return pa.array(values, pa.bool_()) if kinds else pa.nulls(len(values))

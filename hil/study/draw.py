@@ -14,6 +14,7 @@ import numpy as np
 
 from hil.config.bundled import find_config
 from hil.errors import ConfigError
+from hil.fakes.description import found_beside
 from hil.study.schema import Draw, Scalar, Study
 
 
@@ -66,12 +67,17 @@ def arm_values(study: Study) -> dict[str, Any]:
     """The arm's TOML as a dictionary. Raises ConfigError."""
     path = arm_path(study)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ConfigError(f"{study.path}: study.config = {study.study.config!r}: {path}: {reason}.") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{study.path}: study.config: {path}: not valid TOML: {error}.") from error
+    for table in (values.get("arm"), values.get("fake", {}).get("chain")):
+        if isinstance(table, dict) and isinstance(table.get("urdf"), str):
+            # A run's arm is a file in another folder.
+            table["urdf"] = str(found_beside(path.parent.absolute(), table["urdf"]))
+    return values
 
 
 def arm_path(study: Study) -> Path:
@@ -85,12 +91,13 @@ def arm_path(study: Study) -> Path:
 def put(values: dict[str, Any], key: str, value: Scalar) -> None:
     """Set `key`, such as "fake.arm.drives.0.coulomb", in `values`. Raises KeyError with the missing part of the key.
 
-    Tables are created if necessary (for settings that the file leaves at their defaults); list entries must exist.
+    Tables may be new (settings that the file leaves at their defaults; the arm's own check knows their names), entries
+    of lists may not, except in a list that the file does not have: "fake.faults.0.kind" makes the first fault.
     """
     *parents, last = key.split(".")
     place: Any = values
-    for part in parents:
-        place = _inside(place, part)
+    for part, after in zip(parents, [*parents[1:], last], strict=True):
+        place = _inside(place, part, after)
     if isinstance(place, list):
         _inside(place, last)
         place[int(last)] = value
@@ -100,9 +107,15 @@ def put(values: dict[str, Any], key: str, value: Scalar) -> None:
         raise KeyError(last)
 
 
-def _inside(place: Any, part: str) -> Any:
+class _NewList(list[Any]):
+    """A list that the file does not have, which therefore may grow."""
+
+
+def _inside(place: Any, part: str, after: str = "") -> Any:
     if isinstance(place, dict):
-        return place.setdefault(part, {})
+        return place.setdefault(part, _NewList() if after.isdigit() else {})
+    if isinstance(place, _NewList) and part == str(len(place)):
+        place.append({})
     if isinstance(place, list) and part.isdigit() and int(part) < len(place):
         return place[int(part)]
     raise KeyError(part)

@@ -9,6 +9,9 @@ import pyarrow as pa
 
 _NORMAL_95 = 1.959964
 _MOST_CATEGORIES = 12
+_NO_FIGURE = ("status", "message", "where", "task", "seed", "config_sha256", "worker", "recording")
+"""Columns that tell one run from another; a study has no rate or quantile of them."""
+
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 
 
@@ -65,7 +68,7 @@ def figures(table: pa.Table) -> Figures:
     categories, spreads = {}, []
     for name, values in columns.items():
         known = [value for value in values if value is not None]
-        if name in ("status", "message", "where", "task", "config_sha256", "worker", "recording") or not known:
+        if name in _NO_FIGURE or name.endswith(".message") or not known:
             continue
         if all(isinstance(value, str | bool) for value in known):
             counted = Counter(map(str, known))

@@ -1,7 +1,7 @@
 """STUDY.toml: what to vary, run and record, and on which workers.
 
 [study]
-task = "identify"                    # identify, dry_run, estimate, empty
+task = "identify"                    # identify, dry_run, fault, estimate, empty
 config = "fake_two_link"             # an arm's TOML, or a bundled one
 runs = 200                           # rows; default: every combination of the lists in [vary]
 seed = 1
@@ -25,7 +25,8 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from hil.errors import ConfigError
 from hil.toml_errors import describe
 
-Task = Literal["identify", "dry_run", "estimate", "empty"]
+Task = Literal["identify", "dry_run", "fault", "estimate", "empty"]
+ON_ARM: tuple[Task, ...] = ("identify", "dry_run", "fault")
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Scalar = bool | int | float | str
 
@@ -75,7 +76,7 @@ class StudyTable(_Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.task in ("identify", "dry_run") and self.config is None:
+        if self.task in ON_ARM and self.config is None:
             raise ValueError(f'task = "{self.task}" needs config = "ARM.toml"')
         if (self.task == "estimate") != (self.recordings is not None):
             raise ValueError('task = "estimate" needs recordings = "FOLDER"; no other task has recordings')

@@ -18,6 +18,7 @@ from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
 from hil.fakes.plants.arm import Arm, base_parameters
 from tests.estimator.conftest import STICKING
+from tests.support.elsewhere import Elsewhere
 from tests.support.recorded_arm import servo_arm
 
 Recorder = Callable[[Arm, Multisine], SettledPeriod]
@@ -46,7 +47,12 @@ def test_the_plain_model_is_kept_where_nothing_more_is_true(
 def test_friction_is_chosen_by_what_it_predicts(
     sticking_arm: Arm, sticking_period: SettledPeriod, recorded: Recorder, wave: Wave
 ) -> None:
-    choice = choose([sticking_period], recorded(sticking_arm, wave(2, (0.8, 0.42))), "lag")
+    other, elsewhere = recorded(sticking_arm, wave(2, (0.8, 0.42))), Elsewhere()
+    choice = choose([sticking_period], other, "lag")
+    again = choose([sticking_period], other, "lag", executor=elsewhere)
+    assert elsewhere.submitted >= 3
+    assert [each.model for each in again.trials] == [each.model for each in choice.trials]
+    assert (again.estimate.value == choice.estimate.value).all()
     assert choice.estimate.model == Model(2, "stribeck", "lag")
     assert worst(choice.estimate.parameters, sticking_arm) < 0.005
     assert choice.estimate.residual_steps.max() <= 0.30

@@ -16,6 +16,7 @@ from hil.plan.plan import make_plan
 from tests.support.command_line import hil
 from tests.support.dry_runs import is_within, prior_study, run_on
 from tests.support.edits import replaced
+from tests.support.elsewhere import Elsewhere
 from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
@@ -36,6 +37,15 @@ def test_the_same_prior_gives_the_same_prediction_and_more_torque_larger_peaks(k
     less = predict(known, make_plan(known.model_copy(update={"experiment": experiment})), ensemble)
     assert (less.median[2] < first.median[2]).all()
     assert (first.quantile[1:] >= first.median[1:] - 1e-9).all() and (first.quantile[0] <= first.median[0]).all()
+
+
+def test_an_executor_gives_the_same_prediction(known: Config) -> None:
+    ensemble, plan, elsewhere = prior_ensemble(known, 40), make_plan(known), Elsewhere()
+    here, there = predict(known, plan, ensemble), predict(known, plan, ensemble, executor=elsewhere)
+    assert elsewhere.submitted == 3
+    assert (here.values == there.values).all() and (here.settled_after == there.settled_after).all()
+    found, again = largest_amplitude(known, ensemble), largest_amplitude(known, ensemble, executor=elsewhere)
+    assert (found.peak_torque == again.peak_torque).all()
 
 
 def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known: Config) -> None:

@@ -72,9 +72,14 @@ def test_a_current_that_does_not_follow(arm: Arm) -> None:
         guard.look(state)
 
 
+def at(number: int, state: State) -> State:
+    """The same as sample `number` of 400 a second."""
+    return state._replace(time_before_write=number / 400, time_after_read=number / 400 + 0.001)
+
+
 def test_a_motor_that_only_takes_work_out_turns_the_wrong_way(arm: Arm) -> None:
     braking = STILL._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0))
-    falling = [braking._replace(position=(-1.57 - 0.0075 * n, 0.0)) for n in range(12)]
+    falling = [at(n, braking._replace(position=(-1.57 - 0.0075 * n, 0.0))) for n in range(12)]
     assert look(Guard(arm()), *falling) is Cause.WRONG_SIGN
 
 
@@ -99,7 +104,7 @@ def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> No
 
     def states(count: int) -> list[State]:
         position = [(-1.57 - 0.0075 * n, 0.0225 * n) for n in range(count)]
-        return [STILL._replace(position=each, **taken) for each in position]
+        return [at(n, STILL._replace(position=each, **taken)) for n, each in enumerate(position)]
 
     guard = Guard(arm())
     for state in states(60):
@@ -114,12 +119,9 @@ def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> No
 def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:
     given = "[stabiliser]\nstiffness = [1.0, 1.0]\ndamping = [0.1, 0.1]\n\n[experiment]\n"
     guard = Guard(arm(("[experiment]\n", given)))
+    braking = STILL._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0))
     for n in range(60):
-        guard.look(
-            STILL._replace(
-                goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0), position=(-1.57 - 0.0075 * n, 0.0)
-            )
-        )
+        guard.look(at(n, braking._replace(position=(-1.57 - 0.0075 * n, 0.0))))
 
 
 def test_lost_torque_is_measured_against_what_the_configuration_plans(arm: Arm) -> None:

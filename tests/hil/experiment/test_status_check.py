@@ -46,7 +46,7 @@ def test_a_goal_may_get_lost_once_but_not_twice_in_a_row(arm: Arm) -> None:
     assert check.look(0, FINE, 0.1, 1.0) is None
     assert check.look(0, lost, 0.1, 1.0) is None
     wrong = check.look(0, lost, 0.1, 1.0)
-    assert wrong is not None and wrong[0] is Cause.GOALS_LOST and "holds 0.050 A where 0.100 A was sent" in wrong[1]
+    assert wrong is not None and wrong[0] is Cause.GOALS_LOST and "holds 0.050 A but 0.100 A was sent" in wrong[1]
 
 
 def readings(check: StatusCheck, clock: Callable[[float], float], until: float) -> tuple[float, str] | None:

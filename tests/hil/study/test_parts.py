@@ -63,7 +63,7 @@ def test_a_run_draws_the_same_whatever_was_drawn_before(tmp_path: Path) -> None:
         ("[study]\ntask = 'identify'\n", "needs config"),
         (EMPTY + "[vary]\na = {uniform = [2.0, 1.0]}\n", "must not be larger"),
         (EMPTY + "[vary]\na = {uniform = [1.0, 2.0]}\n", "runs is missing"),
-        (EMPTY + "[vary]\na = {uniform = [1.0, 2.0], choice = [1]}\n", "give one of"),
+        (EMPTY + "[vary]\na = {uniform = [1.0, 2.0], choice = [1]}\n", "give exactly one of"),
         (EMPTY + "[vary]\na = []\n", "empty list"),
         (EMPTY + "runs = 0\n", "runs"),
         (EMPTY + "colour = 1\n", "colour"),
