@@ -144,8 +144,10 @@ class ChainSearch:
         if error is not None:
             self.say(f"{name} ended early: {error} {self.torque}")
         elif not step.within:
-            self.say(f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
-                     "assumed.")
+            self.say(
+                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
+                "assumed."
+            )
 
 
 def identify_chain_in_steps(
@@ -168,7 +170,9 @@ def identify_chain_in_steps(
                 break
             number = len(search.steps) + 1
             share = min(wanted.share, MOST_RAISE * last)
-            last = search.step(f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6))).share
+            last = search.step(
+                f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6))
+            ).share
         torque = _full(search)
         result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
     run.write_result(result)
