@@ -28,6 +28,7 @@ def dry_run(
 
     from hil.api.dry_run import dry_run as simulate
     from hil.cli.terminal import Terminal
+    from hil.dry_run.chain_summary import ChainDryRun, print_chain_dry_run
     from hil.dry_run.plot import draw
     from hil.dry_run.summary import print_dry_run
 
@@ -37,6 +38,8 @@ def dry_run(
         draw(rehearsal.config, rehearsal.prediction, picture)
     if json_only:
         print(strict_json.dumps(rehearsal.to_json()))
+    elif isinstance(rehearsal.found, ChainDryRun):
+        print_chain_dry_run(rehearsal.found, Console(highlight=False))
     else:
         print_dry_run(rehearsal.config, rehearsal.found, Console(highlight=False))
     if not rehearsal.is_safe:

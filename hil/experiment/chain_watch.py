@@ -88,7 +88,7 @@ def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
 
 
 def linear_parameters(arms: ChainArms) -> Array:
-    """Of each arm the base parameters, viscous and dry friction and offsets (arms, base + 3 joints) per commanded torque.
+    """Of each arm the base parameters, viscous and dry friction, offsets (arms, base + 3 joints) per commanded torque.
 
     Torque constants that are all off alike scale everything. Where joints differ, a base parameter, which several
     joints feel, is taken by the first of them.

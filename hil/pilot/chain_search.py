@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
-from hil.dry_run.prediction import GUARDED, QUANTITIES, peaks_of
+from hil.dry_run.chain_summary import unsafe
+from hil.dry_run.prediction import peaks_of
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -202,19 +203,3 @@ def step_config(config: Config) -> Config:
     """One path, two periods, settled or not."""
     update: dict[str, Any] = {"held_out": False, "max_settling_periods": 1, "periods": 1, "settle_within": 0.99}
     return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
-
-
-def unsafe(config: Config, foreseen: ChainPrediction) -> str:
-    """Why a motion is not safe; nothing where it is."""
-    peaks = foreseen.peaks
-    if not foreseen.is_clear:
-        return f"too near, {foreseen}"
-    touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
-    chance = peaks.limit_chance[:GUARDED]
-    if touched.any() or peaks.stop_chance > config.safety.limit_chance:
-        row, joint = np.unravel_index(int(np.argmax(touched + chance)), chance.shape)
-        return (
-            f"joint {config.joints[int(joint)].name!r} reaches {QUANTITIES[int(row)]} "
-            f"{peaks.quantile[row, joint]:.3g} of {peaks.limits[row, joint]:.3g} in 1 of 100 arms"
-        )
-    return ""

@@ -16,7 +16,7 @@ from hil.dry_run.waves import designed_plan, roomy_plan
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, prior_belief
-from hil.pilot.gains import with_stabiliser
+from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
 from hil.runs.run_folder import RunFolder
@@ -37,6 +37,10 @@ _PILOT_PERIOD_SHARE = 0.5
 _PILOT_SETTLING = 1
 _AFTER_LIMIT = 0.85
 """Cap on further torque, relative to the torque at which a limit was exceeded."""
+_FALLING_SHARE = 0.85
+"""Share of the limits for an arm that falls over when it is stopped."""
+_LEAST_TORQUE = 0.05
+"""Torque that such an arm may get whatever it got before, as a share of what the current limit allows."""
 _INSIDE = 0.95
 """Share of the limits within which an arm is assumed to start that a stopped run left beyond them."""
 _MOST_RAISE = 1.6
@@ -111,8 +115,14 @@ class Search:
         was not. Raises NoSafeTorque if there was no run yet.
         """
         ensemble = self.belief.ensemble(self._farther)
+        cap = self.cap
+        if falls_over(config, self.belief):
+            share *= _FALLING_SHARE
+            if self.steps:
+                most = np.maximum(_MOST_RAISE * self.steps[-1].peak_torque, _LEAST_TORQUE * most_torque(config))
+                cap = most if cap is None else np.minimum(cap, most)
         try:
-            return largest_amplitude(config, ensemble, share, plan, self.pose, self.cap)
+            return largest_amplitude(config, ensemble, share, plan, self.pose, cap)
         except NoSafeTorque:
             if not self.steps:
                 raise
@@ -204,7 +214,8 @@ class Search:
         shares = self._shares(found)
         full = found.peak_torque >= _AT_LIMIT * most_torque(config)
         capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= _AT_LIMIT * self.cap
-        return bool(((shares >= CERTAIN) | full | capped).all())
+        enough = CERTAIN * (_FALLING_SHARE if falls_over(config, self.belief) else 1.0)
+        return bool(((shares >= enough) | full | capped).all())
 
     @staticmethod
     def _shares(found: Amplitude) -> Array:

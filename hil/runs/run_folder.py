@@ -131,6 +131,11 @@ class RunFolder:
     def open(cls, path: Path) -> "RunFolder":
         """Open the folder of a run. Raises RunFolderError."""
         run = cls(path)
+        if (path / "recordings.npz").is_file():
+            raise RunFolderError(
+                f"{path} is an estimate from another tool's recording; this command needs a run of hil identify or hil "
+                "record."
+            )
         for needed in (run.config_path, run.run_path, run.samples_path):
             if not needed.is_file():
                 raise RunFolderError(f"{path} is not a run folder: it has no {needed.name}.")

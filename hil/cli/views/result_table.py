@@ -23,8 +23,8 @@ def print_result(result: SettledResult, config: Config, run: Path, console: Cons
         console.print(line, soft_wrap=True, markup=False)
 
 
-def print_shooting_result(result: ShootingResult) -> None:
-    """Print a result of multiple shooting."""
+def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
+    """A result of multiple shooting. run: the folder it is in."""
     print(f"{result.joints}-joint arm, {result.config}")
     for name, entry in result.quantities.items():
         print(f"{name:22s} {entry.unit:10s} {entry.value:12.5g} {entry.std:9.1e}")
@@ -33,17 +33,25 @@ def print_shooting_result(result: ShootingResult) -> None:
         shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(found.zero, found.std, strict=True))
         print(f"Encoder zeros of {found.recording or result.config}: {shown} rad.")
     print(f"{result.method}.")
-    print(f"Residual {rms} mrad RMS over {result.fit.segments} segments.")
-    for warning in result.warnings:
-        print(f"Warning: {warning}")
+    steps = ", ".join(f"{value:.3g}" for value in result.fit.residual_rms_ticks)
+    counted = f", {steps} encoder steps" if steps else ""
+    print(f"Residual {rms} mrad RMS{counted} over {result.fit.segments} segments.")
     if result.model_choice is not None:
         choice = result.model_choice
-        print(
-            f"Chosen by cross-validation on held-out segments: {choice.chosen}, error {choice.error_divided_by:.2f} "
-            "times smaller."
-        )
+        times = f"error {choice.error_divided_by:.3g} times smaller than with the plainest model"
+        print(f"Chosen on held-out segments: {choice.chosen}, {times}.")
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
+    for note in result.notes:
+        print(f"Note: {note}")
+    for warning in result.warnings:
+        print(f"Warning: {warning}")
+    if result.verdict is not None:
+        print(f"Trust this model: {result.verdict.trust}. " + " ".join(result.verdict.sentences))
+    if run is not None:
+        print(f"Run folder: {run}, report: {run / 'report.html'}")
+        if result.recordings:
+            print(f"To use it elsewhere: hil export {run} --format mjcf")
 
 
 def _parameters(result: SettledResult) -> Table:
