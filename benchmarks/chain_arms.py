@@ -3,8 +3,8 @@
     python benchmarks/chain_arms.py [--arm koch]
 
 For each: trust, residual in encoder steps, held-out error, coverage of the 95 % intervals, arm time and
-processor time, least clearance and largest excess over a position limit in all that was recorded, and the worst relative
-standard error of the designed path over that of random ones.
+processor time, least clearance and largest excess over a position limit in all that was recorded, and the worst
+relative standard error of the designed path over that of random ones.
 """
 
 import argparse
