@@ -116,7 +116,7 @@ class Space:
         return self._arrays[0]
 
     def names_of(self, pair: int) -> tuple[str, str]:
-        """What a pair is made of, in words."""
+        """Names of the two bodies of a pair."""
         link = self._arrays[0]
         first, second = self._pairs[pair]
         return self.shapes.names[link[first]], self._partner(int(second))
@@ -189,7 +189,7 @@ def _space(key: _Key) -> Space:
 
 
 def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:
-    """Capsules of links that are no neighbours; with the floor those beyond the first link, which stands on the base."""
+    """Pairs of capsules of non-adjacent links, and of the floor with every link but the first, which is at the base."""
     count = len(shapes.capsules)
     found = [(a, b) for a in range(count) for b in range(a + 1, count) if abs(link[a] - link[b]) > 1]
     found += [(a, FLOOR) for a in range(count) if link[a] > 1 and has_floor]

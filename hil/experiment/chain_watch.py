@@ -88,7 +88,7 @@ def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
 
 
 def linear_parameters(arms: ChainArms) -> Array:
-    """Of each arm the base parameters, viscous and dry friction and offsets (arms, base + 3 joints) per commanded torque.
+    """Base parameters, viscous and dry friction and offsets of each arm per commanded torque (arms, base + 3 joints).
 
     Torque constants that are all off alike scale everything. Where joints differ, a base parameter, which several
     joints feel, is taken by the first of them.

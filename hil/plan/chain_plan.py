@@ -69,7 +69,7 @@ def make_chain_plan(config: Config) -> Plan:
 
 
 def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str, int], Path]) -> Plan:
-    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where they take too much torque."""
+    """Plan the paths that `path` returns for each role and seed. Raises ConfigError if they need too much torque."""
 
     def segment(config: Config, role: str, seed: int) -> PathSegment:
         return path_segment(config, thought, role, path(config, role, seed))
