@@ -1,8 +1,8 @@
 """Spatial arms that could be the real one, updated by the recording of a run.
 
 Torque is linear in base parameters and friction, so each arm is moved by a randomised maximum a posteriori step
-(Y. Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1): drawn again as if it were the prior's mean and the recording had
-other noise. What a motion does not reveal keeps its spread.
+(Y. Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1): drawn again as if it were the prior's mean and the
+recording had other noise. What a motion does not reveal keeps its spread.
 """
 
 from dataclasses import dataclass
