@@ -29,13 +29,14 @@ from machine import machine
 from scipy.optimize import minimize
 from scipy.signal import savgol_filter
 
-from hil.config.csv_columns import load_csv_config
+from hil.config.csv_columns import load_recording_config
 from hil.estimation.model_from_config import wanted_model
-from hil.estimation.unsettled.csv_recording import read_csv
 from hil.estimator.baselines.idim import fit_inverse_dynamics, uniform
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.selection.prediction import prediction_errors, prediction_rms
+from hil.recordings.convert import convert
+from hil.recordings.csv_file import read_csv_table
 
 CONFIG = Path(__file__).parents[1] / "configs" / "recordings" / "dfki_double_pendulum.toml"
 SEPARATE = 30.0  # Hz, cut-off of positions if regressors and torques have a separate one
@@ -52,10 +53,10 @@ GRAVITY = 9.81
 
 
 def load(folder: Path, pattern: str, torque: str) -> list[Recording]:
-    columns = load_csv_config(CONFIG).columns
+    columns = load_recording_config(CONFIG).columns
     between = "linear" if torque == "meas" else "held"
     columns = columns.model_copy(update={"torque": [f"tau_{torque}1", f"tau_{torque}2"], "between": between})
-    return [read_csv(path, columns) for path in sorted(folder.glob(pattern))]
+    return [convert(read_csv_table(path), columns).recordings[0] for path in sorted(folder.glob(pattern))]
 
 
 def idle_inertia(folder: Path) -> list[float]:
@@ -128,7 +129,7 @@ def filtered_fit(sines: list[Recording], swings: list[Recording], cutoffs: tuple
 
 
 def shooting_fit(recordings: list[Recording]) -> ShootingEstimate:
-    config = load_csv_config(CONFIG)
+    config = load_recording_config(CONFIG)
     model = wanted_model(config.model, 2).without("zeros")
     start = fit_inverse_dynamics(recordings, START_CUTOFF, WIDTH).value
     return estimate_by_shooting(recordings, model, start, length=config.columns.segment, zeros=True)

@@ -165,8 +165,16 @@ class ShootingOptions:
     """Options of multiple shooting, which fits any recording."""
 
     ftol: float = 3e-5
-    ftol_start: float = 1e-3
-    """Tolerance of the first fits, on short segments."""
+    ftol_refine: float = 1e-3
+    """Of fits between which segments are downweighted."""
+    ftol_start: float = 1e-2
+    """Of those that only lead near a minimum."""
+    max_step: float = 1e-3
+    """Of the integration, in the last fit [s]."""
+    coarse_step: float = 2.6e-3
+    """In the fits before: off by a few hundredths of a standard error, for a third of the time [s]."""
+    start_segments: int = 80
+    """That many of the segments, evenly chosen, lead near a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
     """A width below 3e-3 rad/s is slow to simulate and has no visible effect in a second of motion."""
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()

@@ -74,8 +74,20 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
     return _model(saved.arm, {**saved.parameters, **saved.extra}, saved.chain, Path(path))
 
 
-def model_of(result: SettledResult, path: Path) -> ArmModel:
-    """The model in a result that was read from `path`. Raises ResultError."""
+def read_usable_result(path: Path) -> Result:
+    """The same, of an estimate that says enough of the arm for a model; raises ResultError for any other."""
+    result = read_result(path)
+    if result.arm is None:
+        raise ResultError(
+            f"{path}: was estimated by multiple shooting without a settled period; this command needs one."
+        )
+    return result
+
+
+def model_of(result: Result, path: Path) -> ArmModel:
+    """The model in a result that was read from `path`; raises ResultError."""
+    if result.arm is None:
+        raise ResultError(f"{path}: holds no facts of the arm's joints. Run hil estimate again.")
     return _model(result.arm, result.quantities, result.chain, path)
 
 

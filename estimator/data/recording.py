@@ -1,6 +1,7 @@
 """A recording of any motion: torque and position at the actual sampling times."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -11,10 +12,13 @@ from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 Between = Literal["held", "linear"]
 
 FEWEST_SAMPLES = 32
-LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
-LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
-MOST_GAP = 0.2  # s: maximum sampling interval, since motion in between is not observed
-MOST_ANGLE = 200.0  # rad: larger values are probably degrees or encoder steps
+LEAST_VALID = 0.5  # of a joint's samples
+LEAST_MOTION = 4.0  # encoder steps from end to end
+MOST_GAP = 0.2  # s between samples: what moves in between is not seen
+MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # from which on samples are missing: usual intervals, s
+LONGEST_GAP = 10.0  # s within one recording
+LEAST_NOISE = 1e-5  # rad: no encoder of an arm has less
+MOST_ANGLE = 200.0  # rad: more is degrees or encoder steps
 MOST_SPEED = 500.0  # rad/s between samples, likewise
 MOST_TORQUE = 1e4  # N m
 
@@ -58,10 +62,16 @@ class Recording:
         return float(np.median(np.diff(self.time)))
 
     @property
+    def longest_interval(self) -> float:
+        """Samples further apart have a gap between them [s]."""
+        return max(MOST_INTERVALS * self.interval, SHORTEST_GAP)
+
+    @cached_property
     def noise(self) -> Array:
-        """Standard deviation of a position sample due to rounding (joints,) [rad]."""
-        noise: Array = self.position_step / np.sqrt(12.0)
-        return noise
+        """Standard deviation of one position (joints,) [rad]: what is measured to be white, and rounding at least."""
+        rounding = self.position_step / np.sqrt(12.0)
+        white = np.array([_white_noise(self.time, row) for row in self.position])
+        return np.asarray(np.maximum(rounding, white))
 
     def filled(self) -> Array:
         """Return the positions (joints, samples) [rad], with missing ones interpolated between their neighbours."""
@@ -99,6 +109,28 @@ class Recording:
         return means
 
 
+def _white_noise(time: Array, row: Array) -> float:
+    """Standard deviation of what neighbouring samples do not share [rad]: from the cubic through four of five.
+
+    The median over the recording: quick motion, which no cubic follows, is the smaller part of it.
+    """
+    valid = np.isfinite(row)
+    time, row = time[valid], row[valid]
+    count = time.size - 4
+    if count < FEWEST_SAMPLES:
+        return LEAST_NOISE
+    near = np.arange(count)[:, None] + np.arange(5)
+    t, y = time[near] - time[near[:, 2:3]], row[near]
+    weight = np.ones((count, 5))
+    for i in range(5):
+        for j in range(5):
+            if i != j:
+                weight[:, i] /= t[:, i] - t[:, j]
+    # Divided differences of fourth order: a cubic has none.
+    left = np.sum(weight * y, axis=1) / np.sqrt(np.sum(weight**2, axis=1))
+    return max(LEAST_NOISE, float(np.median(np.abs(left))) / 0.6745)
+
+
 def _check_shapes(recording: Recording) -> None:
     position, torque, time = recording.position, recording.torque, recording.time
     if position.ndim != 2 or torque.shape != position.shape or time.shape != position.shape[1:]:
@@ -128,7 +160,7 @@ def _check_times(recording: Recording) -> None:
         raise RecordingError(
             f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is allowed. Is time in seconds?"
         )
-    if step.max() > 5.0 * MOST_GAP:
+    if step.max() > LONGEST_GAP:
         k = int(np.argmax(step))
         raise RecordingError(
             f"{step[k]:.3g} s are missing after sample {k + 1} at {time[k]:g} s: split the recording there"

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 
@@ -35,7 +35,9 @@ class RecordingSegment:
     position: Array
     """Measured positions (joints, samples) [rad]."""
     state: Array
-    """Angles and velocities at its start from a local fit (2, joints) [rad, rad/s]."""
+    """Angles and velocities at its start by a local fit (2, joints) [rad, rad/s]."""
+    samples: slice
+    """Which of the recording's samples are its own."""
 
     def at_samples(self, grid: Array) -> Array:
         """Interpolate values on the grid (joints, grid points, ...) at the sampling times (joints, samples, ...)."""
@@ -58,10 +60,10 @@ class Grid:
     """Times of all grid points (steps + 1,) [s]."""
 
     @classmethod
-    def of(cls, recording: Recording) -> "Grid":
-        """Return a grid from the first sample to the last, with steps of at most LONGEST_STEP."""
+    def of(cls, recording: Recording, longest: float = LONGEST_STEP) -> "Grid":
+        """From the first sample to the last, in steps of at most `longest` [s]."""
         span = float(recording.time[-1] - recording.time[0])
-        count = int(np.ceil(span / LONGEST_STEP))
+        count = int(np.ceil(span / longest - 1e-9))
         step = span / count
         return cls(float(recording.time[0]), step, recording.time[0] + step * np.arange(count + 1))
 
@@ -69,27 +71,38 @@ class Grid:
 def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[RecordingSegment]:
     """Cut a recording into equal pieces of about `length` [s]; `number` is the recording's index.
 
-    Raises RecordingError if no piece has FEWEST samples.
+    A piece in which the recording has a gap is left out. Raises RecordingError when no piece holds FEWEST samples.
     """
     steps = len(grid.edges) - 1
     pieces = max(1, round(steps * grid.step / length))
     edges = np.round(np.linspace(0, steps, pieces + 1)).astype(np.int64)
     place = (recording.time - grid.start) / grid.step
+    gaps = np.diff(recording.time) > recording.longest_interval
+    before, after = place[:-1][gaps], place[1:][gaps]
     segments = []
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         inside = (place >= first - 1e-6) & (place < last) if last < steps else (place >= first - 1e-6)
+        if np.any((before < last) & (after > first)):
+            continue
         if inside.sum() < FEWEST or not np.isfinite(recording.position[:, inside]).any(axis=1).all():
             continue
         index, weight = _cubic(place[inside] - first, last - first)
         state = _state_at(recording, grid.start + grid.step * first)
         segments.append(
-            RecordingSegment(number, first, last - first, index, weight, recording.position[:, inside], state)
+            RecordingSegment(
+                number, first, last - first, index, weight, recording.position[:, inside], state, _slice(inside)
+            )
         )
     if not segments:
         raise RecordingError(
             f"no piece of {length:g} s holds {FEWEST} samples: record faster, or choose longer segments"
         )
     return segments
+
+
+def _slice(inside: Mask) -> slice:
+    at = np.flatnonzero(inside)
+    return slice(int(at[0]), int(at[-1]) + 1)
 
 
 def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:

@@ -30,6 +30,28 @@ MIN_PART = 1e-4  # squared component of a coordinate in such a direction; anythi
 
 
 @dataclass(frozen=True)
+class Expected:
+    """What is expected of the shared coordinates before any measurement: independent normal distributions."""
+
+    centre: Array
+    """(shared,)."""
+    precision: Array
+    """Inverse variances times `weight` (shared,), 0 where nothing is expected."""
+    weight: float = 1.0
+    """Mean square of the residual in units of the noise, as far as it is correlated: what the model leaves tells as
+    much less as it is larger, and so must the prior be held against it."""
+
+    @classmethod
+    def nothing(cls, size: int) -> "Expected":
+        """No prior on any of `size` coordinates."""
+        return cls(np.zeros(size), np.zeros(size))
+
+    def cost(self, x: Array) -> float:
+        """What the coordinates `x` (shared,) add to the sum of squares."""
+        return float(np.sum(self.precision * (x - self.centre) ** 2))
+
+
+@dataclass(frozen=True)
 class Segmented:
     """Minimum of the sum of squares."""
 
@@ -44,6 +66,8 @@ class Segmented:
     scores: Array
     """Gradient of each segment by the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
+    expected: Expected | None = None
+    """What of `information` was expected, not measured."""
 
     def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
         """Return the sandwich covariance of the shared coordinates (shared, shared), taking segments as independent.
@@ -65,7 +89,10 @@ class Segmented:
         if segments < MIN_SEGMENTS * size:
             covariance = few * _size(self.scores, bread) / size * bread
         else:
-            covariance = few * bread @ (self.scores.T @ self.scores) @ bread
+            meat = few * self.scores.T @ self.scores
+            if self.expected is not None:
+                meat += self.expected.weight * np.diag(self.expected.precision)
+            covariance = bread @ meat @ bread
         if groups is not None and np.unique(groups).size > 1:
             together = np.stack([self.scores[groups == group].sum(axis=0) for group in np.unique(groups)])
             fewer = len(together) / (len(together) - 1)
@@ -126,25 +153,20 @@ def minimise_segmented(
     own: Array,
     ftol: float,
     options: SegmentedMinimiserOptions = DEFAULTS,
+    expected: Expected | None = None,
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    The result does not depend on the number of threads.
-
-    Args:
-        residual: returns the residuals of one segment; called from several threads.
-        derivative: returns the residuals and their derivatives; called from several threads.
-        shared: initial shared coordinates of order 1 (shared,).
-        own: initial own coordinates of order 1 (segments, own).
-        ftol: stop when the relative decrease of a step is below this.
-        options: limits of the iteration; after `max_iterations`, a relative decrease below `unfinished` is accepted.
-
-    Raises:
-        ConvergenceError: if a simulation diverges or the sum of squares still decreases too much.
+    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1; `expected` adds what is known of
+    the shared ones beforehand. Ends when the relative decrease
+    of a step is below `ftol`, or after `options.max_iterations` when it gained less than `options.unfinished`.
+    `residual` and `derivative` are called from several threads; the result does not depend on their number. Raises
+    ConvergenceError.
     """
+    prior = expected or Expected.nothing(shared.size)
     with ThreadPoolExecutor(thread_count()) as threads:
         rows = _residuals(residual, shared, own, threads)
-        cost = _cost(rows)
+        cost = _cost(rows) + prior.cost(shared)
         if not np.isfinite(cost):
             raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
         damping = options.initial_damping
@@ -152,9 +174,9 @@ def minimise_segmented(
             blocks = _blocks(derivative, shared, own, threads)
             gained = 0.0
             while damping < options.max_damping:
-                there = _stepped(blocks, shared, own, damping, options.max_step)
+                there = _stepped(blocks, prior, shared, own, damping, options.max_step)
                 rows_there = _residuals(residual, *there, threads)
-                gained = cost - _cost(rows_there)
+                gained = cost - _cost(rows_there) - prior.cost(there[0])
                 if gained > 0.0:
                     (shared, own), rows, cost = there, rows_there, cost - gained
                     damping = max(0.2 * damping, options.min_damping)
@@ -164,7 +186,8 @@ def minimise_segmented(
             if gained < ftol * cost or (last and gained < options.unfinished * cost):
                 blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
-                return Segmented(shared, own, cost, information, scores, iteration)
+                information = information + np.diag(prior.precision)
+                return Segmented(shared, own, cost, information, scores, iteration, prior)
     raise ConvergenceError(
         f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} per "
         "iteration: try a simpler friction model or shorter segments"
@@ -172,7 +195,8 @@ def minimise_segmented(
 
 
 def _cost(rows: Sequence[Array]) -> float:
-    return float(sum(np.sum(np.square(row)) for row in rows))
+    with np.errstate(over="ignore"):  # a motion that diverges costs infinitely much
+        return float(sum(np.sum(np.square(row)) for row in rows))
 
 
 def _residuals(residual: Residual, shared: Array, own: Array, threads: ThreadPoolExecutor) -> list[Array]:
@@ -194,12 +218,16 @@ def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPo
     return _Blocks(normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:], gradient[:, :n], gradient[:, n:])
 
 
-def _stepped(blocks: _Blocks, shared: Array, own: Array, damping: float, max_step: float) -> tuple[Array, Array]:
+def _stepped(
+    blocks: _Blocks, prior: Expected, shared: Array, own: Array, damping: float, max_step: float
+) -> tuple[Array, Array]:
     information, scores, solve, known = blocks.reduced(damping)
-    full = np.diag(blocks.shared.sum(axis=0))
+    information = information + np.diag(prior.precision)
+    gradient = scores.sum(axis=0) + prior.precision * (shared - prior.centre)
+    full = np.diag(blocks.shared.sum(axis=0)) + prior.precision
     scale = np.sqrt(np.maximum(full, 1e-12 * full.max()))
     matrix = information / np.outer(scale, scale) + damping * np.eye(shared.size)
-    step = -np.linalg.lstsq(matrix, scores.sum(axis=0) / scale, rcond=1e-13)[0] / scale
+    step = -np.linalg.lstsq(matrix, gradient / scale, rcond=1e-13)[0] / scale
     step = np.clip(step, -max_step, max_step)
     own_step = -known - np.einsum("sij,j->si", solve, step)
     return shared + step, own + np.clip(own_step, -max_step, max_step)

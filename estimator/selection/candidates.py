@@ -150,18 +150,26 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
     `known`: the period of ripple (`ripple_cycles`), by parameter name; without it, ripple is not considered.
     """
     model = estimate.model
-    richer = _richer(model)
+    richer = richer_models(model)
     if not known:
         richer.pop("ripple", None)
     new = {part: tuple(n for n in more.names if n not in model.names) for part, more in richer.items()}
     about = linearised(period, estimate, [n for names in new.values() for n in names], known)
-    base, _ = about.fall(estimate.names)
+    return ranked(about, estimate.names, richer, known)
+
+
+def ranked(
+    about: Linearised, fitted: Sequence[str], richer: Mapping[str, Model], known: Mapping[str, float]
+) -> list[Candidate]:
+    """Score tests of the models `richer`, by the part that each adds to the parameters `fitted`."""
+    new = {part: tuple(n for n in more.names if n not in fitted) for part, more in richer.items()}
+    base, _ = about.fall(fitted)
     found = []
     for part, more in richer.items():
-        fall, step = about.fall((*estimate.names, *new[part]))
+        fall, step = about.fall((*fitted, *new[part]))
         free = sum(term_of(name).part != "ripple" or "cycles" not in name for name in new[part])
         chance = about.colour * free * np.log(max(about.samples / about.colour, 3.0))
-        moved = dict(zip(new[part], step[len(estimate.names) :].tolist(), strict=True))
+        moved = dict(zip(new[part], step[len(fitted) :].tolist(), strict=True))
         found.append(
             Candidate(
                 more,
@@ -181,14 +189,23 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
     Since its value actually stays unchanged, the resulting shift of the other parameters is added.
     """
-    model = estimate.model
-    absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
-    left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
-    left_out = [name for name in left_out if term_of(name).spread is not None]
+    left_out = unruled(estimate.model)
     if not left_out:
         return estimate.covariance
-    about = linearised(period, estimate, left_out, {})
-    fitted = [*about.places(estimate.names), *about.states]
+    return widened(linearised(period, estimate, left_out, {}), estimate.names, estimate.covariance, left_out)
+
+
+def unruled(model: Model) -> list[str]:
+    """Parameters that the model lacks and that have an expected size."""
+    absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
+    left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
+    return [name for name in left_out if term_of(name).spread is not None]
+
+
+def widened(about: Linearised, names: Sequence[str], covariance: Array, left_out: Sequence[str]) -> Array:
+    """The covariance of the fitted parameters `names` including that those `left_out` may not be what they are taken
+    for."""
+    fitted = [*about.places(names), *about.states]
     extra = about.places(left_out)
     scale = np.sqrt(np.maximum(np.diag(about.normal), 1e-300))
     normal, gradient = about.normal / np.outer(scale, scale), about.gradient / scale
@@ -201,12 +218,11 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     told = (normal[np.ix_(extra, extra)] + across.T @ follow) / about.colour
     open_ = np.linalg.inv(0.5 * (told + told.T) + np.diag(prior) + 1e-12 * np.eye(len(extra)))
     moved = -open_ @ (gradient[extra] + follow.T @ gradient[fitted]) / about.colour
-    count = len(estimate.names)
+    count = len(names)
     wider = follow[:count] / scale[:count, None]
-    widened = wider @ (open_ + np.outer(moved, moved)) @ wider.T
-    seen = np.isfinite(np.diag(estimate.covariance))
-    covariance: Array = estimate.covariance + np.where(np.outer(seen, seen), widened, 0.0)
-    return covariance
+    more = wider @ (open_ + np.outer(moved, moved)) @ wider.T
+    seen = np.isfinite(np.diag(covariance))
+    return np.asarray(covariance + np.where(np.outer(seen, seen), more, 0.0))
 
 
 def simulated_run(period: SettledPeriod) -> Run:
@@ -230,8 +246,8 @@ def colour(residual: Array) -> float:
     return worst
 
 
-def _richer(model: Model) -> dict[str, Model]:
-    """Return the models with one more option or friction law, limited to those that are linear in the added terms."""
+def richer_models(model: Model) -> dict[str, Model]:
+    """Models with one option, or one law of friction, more: those that are linear in what they add."""
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     richer: dict[str, Model] = {option: model.having(option) for option in absent if option != "presliding"}
     higher = FRICTIONS[FRICTIONS.index(model.friction) + 1 :][:1]

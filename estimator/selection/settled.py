@@ -366,8 +366,15 @@ def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) ->
     Significance is judged by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
     errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.
     """
-    model, value, covariance = estimate.model, estimate.value.copy(), estimate.covariance.copy()
-    names = list(estimate.names)
+    return pruned_model(estimate.model, estimate.names, estimate.value, estimate.covariance, level, fixed)
+
+
+def pruned_model(
+    model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
+) -> Model:
+    """`model` without what its parameters (parameters,) and covariance do not tell from nothing at `level`; `fixed`
+    stays in."""
+    names, value, covariance = list(names), value.copy(), covariance.copy()
     covariance[~np.isfinite(covariance)] = 0.0
     while True:
         doubtful = []

@@ -135,14 +135,14 @@ def _taking_over(config: Config) -> Config:
 
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
-    """Create the run folder `out`, or one in runs/ named after time and arm. Raises RunFolderError."""
-    path = _unused(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
+    """The folder `out`, or a new one in runs/ named after time and arm. Raises RunFolderError."""
+    path = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
     log.info("run folder %s", path)
     return RunFolder.create(path, config)
 
 
-def _unused(path: Path) -> Path:
-    """Return `path`, with a number appended if it exists: a program may start two runs within a second."""
+def unused_path(path: Path) -> Path:
+    """`path`, or `path` with a number appended: a program may start two runs within a second."""
     number = 2
     tried = path
     while tried.exists():

@@ -28,6 +28,8 @@ def report(
     from hil.report.run_data import RunData
 
     print(write_report(run, out))
+    if png is None and svg is None:
+        return
     data = RunData.load(run)
     for kind, folder in (("png", png), ("svg", svg)):
         if folder is not None:
@@ -75,8 +77,12 @@ def export(
 def write_report(run: Path, out: Path | None = None) -> Path:
     """Write the report of a run, by default into its folder. Return its path."""
     from hil.report import page
+    from hil.report.recording_page import write_recording_report
     from hil.report.run_data import RunData
+    from hil.runs.recording_folder import is_recording_folder
 
+    if is_recording_folder(run):
+        return write_recording_report(run, out)
     path = out or run / page.FILE_NAME
     page.write_report(RunData.load(run), path)
     return path

@@ -85,12 +85,12 @@ def predict_chain(
             if worst is None or nearest.room < worst[0]:
                 worst = nearest.room, nearest, segment.role, moment
             if number == 0 and arm < shown:
-                seen.append(position.astype(np.float32))
+                seen.append(position.copy())
             done += 1
             if tell is not None:
                 tell(done, arms.size * len(plan.segments))
     assert worst is not None
-    together = np.stack(seen) if seen else np.empty((0, 0, 0), dtype=np.float32)
+    together = np.stack(seen) if seen else np.empty((0, 0, 0))
     prediction = Prediction(
         values,
         _shares(values, limits, rest, _centre(plan)),

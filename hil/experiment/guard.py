@@ -33,6 +33,9 @@ EARLY_MOTION_RAD = 0.05
 FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move that a run before this one left beyond its limit."""
 
+MOST_OUTSIDE_RAD = 0.15
+"""How far beyond its limit a joint may be found that a run before this one left there [rad]."""
+
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
@@ -287,7 +290,8 @@ class Guard:
     def _outside(self, index: int, position: float) -> None:
         low, high = self._limits[index][:2]
         former = self._position[index]
-        if former is None and self._may_start_outside:
+        beyond = max(low - position, position - high)
+        if former is None and self._may_start_outside and beyond <= MOST_OUTSIDE_RAD:
             self._found_outside[index] = position
         found = self._found_outside.get(index)
         was_inside = former is not None and low <= former <= high

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
 from hil.errors import RunFolderError
-from hil.model_file import model_of, read_settled_result
-from hil.results.result import SettledResult
+from hil.model_file import model_of, read_usable_result
+from hil.results.result import Result
 
 
 @dataclass(frozen=True)
@@ -20,21 +20,27 @@ class Source:
     """A run with a result; link_length: length of link 1 [m] if the parameters do not determine it."""
 
     run: Path
-    result: SettledResult
+    result: Result
     model: ArmModel
     link_length: float | None = None
 
     @classmethod
     def open(cls, run: Path, link_length: float | None = None) -> "Source":
-        """Read a run folder. Raises ResultError."""
-        result = read_settled_result(run)
+        """Read a run folder; raises ResultError."""
+        result = read_usable_result(run)
         return cls(run, result, model_of(result, run), link_length)
 
     @cached_property
     def samples(self) -> NDArray[np.void]:
         """The recording's rows (hil.runs.recording.sample_type). Raises RunFolderError."""
         from hil.runs.recording import load_samples
+        from hil.runs.recording_folder import is_recording_folder
 
+        if is_recording_folder(self.run):
+            raise RunFolderError(
+                f"{self.run} is an estimate from another tool's recording: the samples are in its files. Export the "
+                "arm: urdf, mjcf, toml or json."
+            )
         return load_samples(self.run / "samples.npy", len(self.model.joints))
 
     @cached_property

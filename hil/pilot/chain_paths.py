@@ -59,7 +59,9 @@ class Paths:
                 return False
             if space.room(path.position).min() < EXTRA_ROOM:
                 return False
-            return bool(space.room(_ways(path, rest, experiment.ramp / experiment.period), on_the_way=True).min() >= 0.0)
+            return bool(
+                space.room(_ways(path, rest, experiment.ramp / experiment.period), on_the_way=True).min() >= 0.0
+            )
 
         limits = PathLimits(low + room, high - room, speed, allowed)
         try:

@@ -13,12 +13,12 @@ model_choice with friction = "auto": the models tried, the one chosen, its gain 
 timing       how well the stream kept its deadlines, and the duration of the estimation
 arm          facts needed to use the model: gravity, rest pose, and per joint name, servo, mode, limits, torque per
              goal [N m/A, or N m/V in pwm mode]
-chain        only for a spatial arm: its geometry, and the composition of each base parameter
-truth        only for a fake arm: its true base parameters
-physical     masses, centres of mass and inertias, if [known] is given
-stabiliser   its share of the torque, if there was one
-steps        with a pilot: predicted and measured peaks of each step
-zeros, recordings   only for recordings made elsewhere
+chain        only of an arm in space: its geometry, and what each base parameter is made of
+truth        only on a fake arm: the base parameters it was built with
+physical     masses, centres and inertias, where [known] says something
+stabiliser   what it gave of the torque, where there was one
+steps        with a pilot: what was predicted of each step, and what was seen
+zeros, recordings, notes   only of recordings made elsewhere; notes: what was guessed, put right or averaged
 """
 
 from collections.abc import Mapping
@@ -129,6 +129,7 @@ class ShootingResult(Result):
     fit: ShootingFit
     zeros: tuple[Zeros, ...] | None = None
     recordings: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
 
 
 def result_from_json(value: Mapping[str, Any]) -> Result:

@@ -131,6 +131,11 @@ class RunFolder:
     def open(cls, path: Path) -> "RunFolder":
         """Open the folder of a run. Raises RunFolderError."""
         run = cls(path)
+        if (path / "recordings.npz").is_file():
+            raise RunFolderError(
+                f"{path} is an estimate from another tool's recording; this command needs a run of hil identify or hil "
+                "record."
+            )
         for needed in (run.config_path, run.run_path, run.samples_path):
             if not needed.is_file():
                 raise RunFolderError(f"{path} is not a run folder: it has no {needed.name}.")
@@ -162,7 +167,12 @@ class RunFolder:
 
     def load_config(self) -> Config:
         """The configuration, with the experiment as it was actually played. Raises ConfigError, RunFolderError."""
-        config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
+        try:
+            text = self.config_path.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+            raise RunFolderError(f"{self.config_path} cannot be read: {reason}.") from error
+        config = parse_config(text, self.config_path)
         if not self.played_path.is_file():
             return config
         played: dict[str, Any] = {}

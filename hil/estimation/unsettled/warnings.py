@@ -1,6 +1,7 @@
 """Warnings about an estimate from unsettled data, each with the joint and a remedy."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,21 +17,31 @@ LEFT = 0.1  # RMS residual relative to the motion's RMS
 WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 
-def any_warnings(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[str]:
-    """One sentence per warning."""
-    found = _signs(recordings)
+@dataclass(frozen=True)
+class Doubts:
+    """Sentences. faults: the estimate is of no use; doubts: it may be wrong; warnings: worth knowing."""
+
+    faults: tuple[str, ...]
+    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Doubts:
+    """What looks wrong in the recordings, or in how the estimate explains them."""
+    faults, doubts, warnings = _signs(recordings), [], []
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
-        found += _motion(recordings, joint, name)
-        found += _flat(recordings, joint, name)
+        warnings += _motion(recordings, joint, name)
+        doubts += _turns(recordings, joint, name)
+        warnings += _flat(recordings, joint, name)
         motion = float(np.sqrt(np.mean([np.var(each.filled()[joint]) for each in recordings])))
         left = float(estimate.residual_rms[joint]) / motion
         if left > LEFT:
-            found.append(
+            faults.append(
                 f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
                 "check the units, signs and zero of position and torque; then try shorter segments."
             )
-    return [*found, *_weak(estimate)]
+    return Doubts(tuple(faults), tuple(doubts), (*warnings, *_weak(estimate)))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
@@ -54,13 +65,17 @@ def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]
         found.append(
             f"{name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; drive it harder."
         )
-    turns = swing / (2.0 * np.pi)
-    if turns > MANY_TURNS:
-        found.append(f"{name} moved over {turns:.0f} turns; if it did not, its positions are not in the stated unit.")
     lost = 1.0 - float(np.mean(np.concatenate([np.isfinite(each.position[joint]) for each in recordings])))
     if lost > LOST:
         found.append(f"{name}: {100 * lost:.1f} % of its positions are missing.")
     return found
+
+
+def _turns(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
+    turns = max(float(np.ptp(each.filled()[joint])) for each in recordings) / (2.0 * np.pi)
+    if turns <= MANY_TURNS:
+        return []
+    return [f"{name} moved over {turns:.0f} turns: if it did not, its positions are not in the stated unit."]
 
 
 def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:

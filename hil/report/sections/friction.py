@@ -7,6 +7,7 @@ from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.report.chart import BLUE, GREY, Array, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
+from hil.results.parts import Covariance
 from hil.runs.period_file import PlayedPeriod
 
 _CURVE = 401  # points on the curve
@@ -47,8 +48,8 @@ def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) ->
     fastest = float(np.abs(speed).max())
     # Cubes of an even grid are denser near zero speed, where the curve bends.
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3
-    curve = _torque(data.model, at)[:, joint]
-    low, high = _interval(data, at, joint)
+    curve = friction_curve(data.model, at)[:, joint]
+    low, high = friction_interval(data.model, data.result.covariance, at, joint)
     series = (
         Series("from the measured motion", speed, torque, GREY, "dots"),
         Series("95 % interval", at, high, BLUE, "area", low),
@@ -60,25 +61,24 @@ def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) ->
     return Picture(chart, f"{name}: friction versus speed, without the constant offset.{more}")
 
 
-def _torque(model: ArmModel, speed: Array) -> Array:
+def friction_curve(model: ArmModel, speed: Array) -> Array:
     return model.friction_torque(np.repeat(speed[:, None], len(model.joints), axis=1))
 
 
-def _interval(data: RunData, speed: Array, joint: int) -> tuple[Array, Array]:
-    """The 2.5 and 97.5 percentiles of the curve, from the parameters' covariance."""
-    kept = data.result.covariance
+def friction_interval(model: ArmModel, kept: Covariance, speed: Array, joint: int) -> tuple[Array, Array]:
+    """The curve's 2.5 and 97.5 percentiles under the parameters' covariance."""
     names = [name for name in kept.names if name.endswith(f"_{joint + 1}")]
     index = [kept.names.index(name) for name in names]
     covariance = kept.array()[np.ix_(index, index)]
     seen = np.isfinite(np.diag(covariance))
     covariance = np.where(seen[:, None] & seen, covariance, 0.0)
-    value = np.array([data.model.values[name] for name in names])
+    value = np.array([model.values[name] for name in names])
     size, turn = np.linalg.eigh(covariance)
     random = np.random.default_rng(0)
     draws = value + random.normal(size=(_DRAWS, len(value))) @ (turn * np.sqrt(np.maximum(size, 0.0))).T
     floor = np.array([1e-6 if name.startswith(("coulomb_width", "stribeck_velocity")) else -np.inf for name in names])
     curves = [
-        _torque(_with(data.model, dict(zip(names, np.maximum(draw, floor).tolist(), strict=True))), speed)[:, joint]
+        friction_curve(_with(model, dict(zip(names, np.maximum(draw, floor).tolist(), strict=True))), speed)[:, joint]
         for draw in draws
     ]
     low, high = np.percentile(curves, [2.5, 97.5], axis=0)

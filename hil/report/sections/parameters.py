@@ -8,13 +8,18 @@ from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import number, percent
 from hil.results.parts import Quantity
+from hil.results.result import Result
 
 TWO_SIDED_95 = 1.96
 
 
 def parameters(data: RunData) -> Section:
-    """The section, always present."""
-    result = data.result
+    """Always present."""
+    return parameters_of(data.result)
+
+
+def parameters_of(result: Result) -> Section:
+    """Of any result."""
     groups = {} if result.chain is None else result.chain.groups
     tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]
     if result.extra:

@@ -5,7 +5,7 @@ from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
 
-_TITLES = {
+TITLES = {
     "yes": ("good", "This model can be trusted"),
     "with care": ("fair", "This model can be used with care"),
     "no": ("poor", "Do not trust this model yet"),
@@ -15,7 +15,7 @@ _TITLES = {
 def verdict(data: RunData) -> Section:
     """Return the section, which every report has."""
     judged = data.result.verdict
-    tone, title = _TITLES[judged.trust]
+    tone, title = TITLES[judged.trust]
     warnings = [f"Warning: {warning}" for warning in data.result.warnings]
     words = [
         *(_residual(data), _truth(data), _limits(data)),

@@ -5,18 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hil.config.csv_columns import load_csv_config
-from hil.estimation.unsettled.csv_recording import read_csv
+from hil.config.csv_columns import load_recording_config
 from hil.estimator.baselines.signs import Signs, suspect_signs
 from hil.estimator.data.recording import Recording
+from hil.recordings.convert import convert
+from hil.recordings.csv_file import read_csv_table
 from tests.support.paths import CONFIGS, DATA
 
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    """Return a recording with both joints excited, at four and ten rad/s."""
-    columns = load_csv_config(CONFIGS / "recordings" / "dfki_double_pendulum.toml").columns
-    return read_csv(DATA / "dfki_double_pendulum" / "c1_sinusoids_143601.csv", columns)
+    """Both joints driven, four and ten rad/s."""
+    columns = load_recording_config(CONFIGS / "recordings" / "dfki_double_pendulum.toml").columns
+    return convert(read_csv_table(DATA / "dfki_double_pendulum" / "c1_sinusoids_143601.csv"), columns).recordings[0]
 
 
 def turned(recording: Recording, torque: tuple[int, int], position: tuple[int, int]) -> Recording:

@@ -1,6 +1,7 @@
 """CSV recordings, incomplete runs, peers and calibration with a known mass, on the command line."""
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -76,11 +77,18 @@ COLUMNS = (
         (CSV, COLUMNS.replace("[1.8, 1.8]", "[1.8]"), 2, "has 1 entries; position has 2"),
         (CSV, COLUMNS.replace('"deg"', '"turns"'), 1, "are these degrees or encoder"),
         (CSV, COLUMNS.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'), 1, "jumps by"),
-        (CSV, "[arm]\ngravity = 9.81\n", 2, "has no [columns] table"),
+        (CSV, "[arm]\ngravity = 9.81\n", 2, "columns.torque_constant is missing"),
         (CSV.replace("\n0.50,", "\n0.50,x"), COLUMNS, 2, "column 'q1' is not a number"),
         (CSV.replace("\n0.50,", "\n0.50,1,"), COLUMNS, 2, "6 fields for 5 columns"),
-        (CSV.replace(",0.1\n", ",nan\n", 3), COLUMNS, 1, "joint 2: 3 torques are not finite"),
+        (CSV.replace(",0.1\n", ",nan\n"), COLUMNS, 2, "holds no numbers at all"),
         (CSV[:300], COLUMNS, 2, "fields for 5 columns"),
+        (CSV, COLUMNS.replace('"q2"]', '"q_2"]'), 2, "Did you mean 'q2'?"),
+        (CSV.replace("t,q1", "t [ms],q1"), COLUMNS + 'time_unit = "s"\n', 2, "states the unit ms"),
+        (CSV.replace("q1,q2", "q1 [furlong],q2"), COLUMNS.replace('position_unit = "deg"', ""), 2, "'furlong'"),
+        (CSV, COLUMNS.replace('"deg"', '"ticks"'), 2, "columns.ticks_per_turn is missing"),
+        (CSV, COLUMNS + 'pwm = ["i1", "i2"]\n', 2, "current and pwm are both given"),
+        (CSV, COLUMNS.replace("current", "voltage"), 2, "columns.torque_per_volt is missing"),
+        (re.sub(r"^(\d\.\d)\d", r"\1", CSV, flags=re.MULTILINE), COLUMNS, 2, "they are too coarse"),
         ("".join(CSV.splitlines(True)[:20]), COLUMNS, 1, "at least 32 are needed"),
         ("", COLUMNS, 2, "is empty"),
     ],
@@ -138,9 +146,14 @@ def estimate_pendulum(spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndar
     return hil("estimate", "data.csv", "--config", "arm.toml", "--json")
 
 
-def test_a_csv_needs_its_config_and_no_run_beside_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_csv_whose_columns_are_unclear_needs_a_config_and_no_run_beside_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Path("data.csv").write_text("a,b,c\n1,2,3\n", encoding="utf-8")
     assert hil("estimate", "data.csv") == 2
-    assert "--config ARM.toml" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "--config ARM.toml" in error and "a, b, c" in error and "[columns]" in error
+    assert not any(Path("runs").glob("*")), "nothing stands in the way of the next try"
     assert hil("estimate", "data.csv", "some_run", "--config", "arm.toml") == 2
 
 
