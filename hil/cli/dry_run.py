@@ -38,7 +38,7 @@ def dry_run(
     if json_only:
         print(strict_json.dumps(rehearsal.to_json()))
     elif isinstance(rehearsal.found, ChainDryRun):
-        print_chain_dry_run(rehearsal.found, Console(highlight=False))
+        print_chain_dry_run(rehearsal.found, result_console())
     else:
         print_dry_run(rehearsal.config, rehearsal.found, result_console())
     if not rehearsal.is_safe:
