@@ -1,6 +1,6 @@
 """`hil identify` on the ready arms in space, from URDF, limits and rest pose alone, pilot included.
 
-    python benchmarks/chain_arms.py [--arm koch]
+    python benchmarks/chain_arms.py [--arm koch] [--json]
 
 For each: trust, residual in encoder steps, held-out error, coverage of the 95 % intervals, arm time and
 processor time, least clearance and largest excess over a position limit in all that was recorded, and the worst
@@ -80,8 +80,15 @@ def identified(name: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--arm", choices=ARMS, action="append")
-    for name in parser.parse_args().arm or ARMS:
-        print(json.dumps({name: identified(name)}), flush=True)
+    parser.add_argument("--json", action="store_true", help="one JSON object for all at the end, and nothing else")
+    options = parser.parse_args()
+    rows = {}
+    for name in options.arm or ARMS:
+        rows[name] = identified(name)
+        if not options.json:
+            print(name, *(f"{key} {value}" for key, value in rows[name].items()), sep="  ", flush=True)
+    if options.json:
+        print(json.dumps({"arms": rows}))
 
 
 if __name__ == "__main__":
