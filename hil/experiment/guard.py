@@ -92,7 +92,7 @@ class Guard:
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit,
                 joint.goal_limit,
-                joint.torque_per_goal / rate,
+                joint.torque_per_goal,
                 -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
             for joint in config.joints
@@ -116,6 +116,7 @@ class Guard:
         self._seen_at = [0.0] * count
         self._missing = [0] * count
         self._work = [0.0] * count
+        self._held_goal = [0.0] * count
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
@@ -231,6 +232,7 @@ class Guard:
             self._too_fast(index, velocity)
         self._position[index] = position
         self._seen_at[index] = now
+        missed = self._missing[index]
         self._missing[index] = 0
         following = self._following[index]
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
@@ -240,7 +242,11 @@ class Guard:
             consistency.lost()
         if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
-        work = self._work[index] = self._work[index] + work_scale * goal * velocity
+        held, self._held_goal[index] = self._held_goal[index], goal
+        # What the goal before has done until now; where it was another one meanwhile, nothing is known.
+        work = self._work[index]
+        if former is not None and elapsed < LONG_GAP * interval and not missed:
+            work = self._work[index] = work + work_scale * held * (position - former)
         if work < work_least and self._passive:
             self._judge_work(index)
 

@@ -42,6 +42,11 @@ class Repetition:
         self._unlike_for = [0] * len(self._former)
         self._sums = [_Sums() for _ in self._former]
 
+    def forget(self) -> None:
+        """Forget all periods: what follows plays another torque."""
+        self._sums = [_Sums() for _ in self._former]
+        self._former = [array("d", [_EMPTY]) * len(former) for former in self._former]
+
     def add(self, index: int, position: Sequence[float]) -> None:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
         compared = index >= self._half

@@ -126,6 +126,7 @@ class Stream:
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
             self._note(f"{segment.role}: ramp in")
+            self._repetition.forget()
             self._play(self._ramps[number][0], Phase.RAMP_IN)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
@@ -229,7 +230,7 @@ class Stream:
             state = self._bus.exchange(self._goal)
             if self._asks_again and any(state.missing):
                 self._guard.look(state)
-                state = self._bus.exchange(self._goal)
+                state = self._bus.exchange(self._goal, hurried=True)
             self._sent_at = state.time_before_write
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1

@@ -112,3 +112,18 @@ def test_the_second_period_may_differ_from_the_first() -> None:
     periods[0] += 1.0
     assert unlike_at(periods) is None
     assert unlike_at(periods + np.array([0.0, 0.0, 11.0, 0.0])[:, None, None]) is not None
+
+
+def test_another_torque_is_not_compared_with_the_one_before() -> None:
+    time = np.arange(200) * INTERVAL
+    first, second = np.sin(time)[None], 2.0 + np.cos(3.0 * time)[None]
+    repetition = Repetition(200, 1, INTERVAL)
+    for period in (first, first, first):
+        played(repetition, period)
+    assert repetition.unlike is None
+    repetition.forget()
+    played(repetition, second)
+    assert repetition.unlike is None
+    played(repetition, second)
+    played(repetition, first)
+    assert repetition.unlike == 0
