@@ -45,7 +45,7 @@ def source(kind: str, folder: Path) -> tuple[str, float]:
     if kind == "clone":
         return str(ROOT), 0.0
     if kind == "git":
-        return f"hil @ git+file://{ROOT}", 0.0
+        return f"git+file://{ROOT}", 0.0
     seconds, done = timed(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT, cwd=folder)
     if done.returncode:
         sys.exit(done.stderr)
