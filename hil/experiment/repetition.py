@@ -33,12 +33,13 @@ class Repetition:
         self._lasting = max(_FEWEST, round(LASTING_S / interval))
         self._sums: list[_Sums] = [_Sums() for _ in range(joints)]
         self._former = [array("d", [_EMPTY]) * samples for _ in range(joints)]
-        self.begin(samples)
+        self.begin(samples, anew=True)
 
-    def begin(self, samples: int) -> None:
-        """Start a new period of `samples` samples."""
+    def begin(self, samples: int, *, anew: bool = False) -> None:
+        """Start a new period of `samples` samples. anew: its torque is not that of the period before."""
+        self._anew = anew
         self._half = samples // 2
-        self._allowed = [TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]
+        self._allowed = [inf if anew else TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]
         self._unlike_for = [0] * len(self._former)
         self._sums = [_Sums() for _ in self._former]
 
@@ -54,7 +55,7 @@ class Repetition:
                 sums.lowest = min(sums.lowest, latest)
                 sums.highest = max(sums.highest, latest)
                 if compared:
-                    sums.add(former[index], latest)
+                    sums.add(_EMPTY if self._anew else former[index], latest)
             former[index] = latest
 
     @property

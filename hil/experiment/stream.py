@@ -185,7 +185,7 @@ class Stream:
     def _play_period(self, segment: Segment, period: int) -> None:
         """Play one period and compare each sample with the one in the period before."""
         repetition = self._repetition
-        repetition.begin(len(segment.period_current))
+        repetition.begin(len(segment.period_current), anew=period == 0)
         for index, row in enumerate(segment.period_current):
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)
