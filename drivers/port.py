@@ -20,6 +20,14 @@ from hil.drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_
 _FAILURES = (OSError, termios.error)
 # OSError covers SerialException. An unplugged cable makes flushing the input raise termios.error, which is no OSError.
 
+_REASONS = {
+    "No such file": "there is no such device",
+    "Inappropriate ioctl": "it is not a serial port",
+    "Permission denied": "permission denied",
+    "Is a directory": "it is a folder, not a serial port",
+}
+"""Reasons in words, by what the operating system says."""
+
 _WRITE_PATIENCE_S = 0.1
 """How long a device may refuse to accept bytes before it counts as lost [s]."""
 
@@ -31,7 +39,7 @@ def open_port(url: str, baud: int) -> "Port":
         opened = serial.serial_for_url(url, baudrate=baud, timeout=0, exclusive=True)
     except (OSError, termios.error, ValueError) as error:
         kind = NotPermitted if "Permission denied" in str(error) else PortNotOpened
-        raise kind(f"Cannot open port {url!r} at {baud} baud: {_why(error)}. {_advice(error)}".rstrip()) from error
+        raise kind(f"Cannot open port {url!r}: {_why(error, baud)}. {_advice(error)}".rstrip()) from error
     return (DescriptorPort if type(opened) is serial.Serial else Port)(url, baud, opened)
 
 
@@ -235,9 +243,15 @@ def _never_ready(_timeout_ms: float | None = None, /) -> list[tuple[int, int]]:
     raise OSError("the port was closed")
 
 
-def _why(error: BaseException) -> str:
+def _why(error: BaseException, baud: int | None = None) -> str:
+    """The reason, without the numbers and repetitions that come with it."""
     text = str(error.args[-1] if error.args else error)
-    return text.rstrip(".") or type(error).__name__
+    of_device = "open port" in text or "configure port" in text
+    for known, said in _REASONS.items():
+        if of_device and known in text:
+            return said
+    at = "" if baud is None else f" (at {baud} baud)"
+    return f"{text.rstrip('.') or type(error).__name__}{at}"
 
 
 def _advice(error: BaseException) -> str:
@@ -248,4 +262,6 @@ def _advice(error: BaseException) -> str:
         return "Another program has it open; close that program first."
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."
+    if "ioctl" in text:
+        return "The adapter's port is usually /dev/ttyUSB0 or /dev/ttyACM0; `hil scan` lists those that exist."
     return ""

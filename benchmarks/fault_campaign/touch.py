@@ -28,7 +28,7 @@ class Killed(BaseException):
 
 
 def prepare(attack: Attack, port: "Middle") -> None:
-    """What has to be known before the program begins."""
+    """Prepare the plant for attacks that must be set up before the program starts."""
     if attack.kind in ON_MOTORS:
         witness = port.bus.plant
         assert isinstance(witness, Witness)

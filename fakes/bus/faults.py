@@ -9,6 +9,7 @@ Faults of packets (replies, instructions, noise) affect each packet while they l
 happen once, at their time; with their probability, or not at all. The same seed gives the same faults.
 """
 
+import difflib
 import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -248,6 +249,10 @@ class Faults:
 def parse_fault(text: str) -> Fault:
     """Parse a fault given on the command line as `KIND` or `KIND:key=value,key=value`; raises ValueError."""
     kind, _, rest = text.partition(":")
+    if kind not in set(FaultKind):
+        near = difflib.get_close_matches(kind, list(FaultKind), 1)
+        meant = f" Did you mean {near[0]}?" if near else ""
+        raise ValueError(f'fault "{text}": there is no kind {kind!r}.{meant} Its kinds: {", ".join(FaultKind)}')
     keys = [name for name in Fault.model_fields if name != "kind"]
     values: dict[str, object] = {"kind": kind}
     for part in filter(None, rest.split(",")):
@@ -263,5 +268,4 @@ def parse_fault(text: str) -> Fault:
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
         key = ".".join(map(str, detail["loc"]))
-        allowed = f"; kinds: {', '.join(FaultKind)}" if key == "kind" else ""
-        raise ValueError(f'fault "{text}": {key} = {detail["input"]!r}: {detail["msg"]}{allowed}') from None
+        raise ValueError(f'fault "{text}": {key} = {detail["input"]!r}: {detail["msg"]}') from None

@@ -24,9 +24,8 @@ def dry_run(
     json_only: Json = False,
 ) -> None:
     """Simulate the experiment on arms like yours; exit code 1 if it might exceed a limit."""
-    from rich.console import Console
-
     from hil.api.dry_run import dry_run as simulate
+    from hil.cli.printing import result_console
     from hil.cli.terminal import Terminal
     from hil.dry_run.chain_summary import ChainDryRun, print_chain_dry_run
     from hil.dry_run.plot import draw
@@ -39,8 +38,8 @@ def dry_run(
     if json_only:
         print(strict_json.dumps(rehearsal.to_json()))
     elif isinstance(rehearsal.found, ChainDryRun):
-        print_chain_dry_run(rehearsal.found, Console(highlight=False))
+        print_chain_dry_run(rehearsal.found, result_console())
     else:
-        print_dry_run(rehearsal.config, rehearsal.found, Console(highlight=False))
+        print_dry_run(rehearsal.config, rehearsal.found, result_console())
     if not rehearsal.is_safe:
         raise typer.Exit(1)

@@ -87,14 +87,13 @@ def _show(result: "Identification | Estimation", json_only: bool) -> None:
     if json_only:
         print(strict_json.dumps(result.to_json()))
         return
-    from rich.console import Console
-
     from hil.api.run import Identification
+    from hil.cli.printing import result_console
     from hil.cli.views.result_table import print_result, print_shooting_result
     from hil.runs.run_folder import RunFolder
 
     if isinstance(result, Identification):
         config = RunFolder.open(result.run).load_config()
-        print_result(result, config, result.run, Console(highlight=False))
+        print_result(result, config, result.run, result_console())
     else:
         print_shooting_result(result, result.run)

@@ -13,6 +13,7 @@ from hil.cli.options import Json, RunPath
 
 if TYPE_CHECKING:
     from hil.estimation.diff import Difference
+    from hil.runs.collection import RunSummary
 
 
 def runs(
@@ -29,21 +30,33 @@ def runs(
     if not found:
         print(f"No runs in {folder}. `hil identify ARM.toml` creates one.")
         return
-    from rich.console import Console
+    _print_runs(found)
+
+
+def _print_runs(found: "list[RunSummary]") -> None:
+    """A table; where the terminal is too narrow for it, each run's path on a line of its own, to be copied whole."""
     from rich.markup import escape
     from rich.table import Table
 
+    from hil.cli.printing import natural_width, print_table, result_console, say
+
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    for heading in ("run", "arm", "when", "verdict"):
-        table.add_column(heading, overflow="fold")
-    table.add_column("residual", justify="right")
-    table.add_column("name, note", overflow="fold")
+    for heading in ("run", "arm", "when", "verdict", "residual", "name, note"):
+        table.add_column(heading, no_wrap=True, justify="right" if heading == "residual" else "left")
+    rows = []
     for run in found:
         when = f"{run.started:%Y-%m-%d %H:%M}" if run.started else "-"
         residual = "-" if run.residual is None else f"{run.residual:.3f}"
         said = ": ".join(each for each in (run.note.name, run.note.text) if each)
-        table.add_row(*(escape(each) for each in (str(run.path), run.arm, when, run.verdict, residual, said)))
-    Console(highlight=False).print(table)
+        rows.append((str(run.path), run.arm, when, run.verdict, residual, said))
+        table.add_row(*(escape(each) for each in rows[-1]))
+    console = result_console()
+    if not console.is_terminal or natural_width(console, table) <= console.width:
+        print_table(console, table)
+        return
+    for path, arm, when, verdict, residual, said in rows:
+        print(path)
+        say(console, "  " + ", ".join(each for each in (arm, when, verdict, f"residual {residual}", said) if each))
 
 
 def note(
@@ -86,9 +99,10 @@ def diff(
 
 
 def _print_difference(difference: "Difference") -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+
+    from hil.cli.printing import print_table, result_console, say
 
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("parameter", no_wrap=True)
@@ -99,14 +113,10 @@ def _print_difference(difference: "Difference") -> None:
         percent = "-" if change.percent is None else f"{change.percent:+.2f}"
         shown = (f"{change.before:.5g}", f"{change.after:.5g}", percent, f"{change.z:+.1f}")
         table.add_row(escape(change.name), *shown, "changed" if change.changed else "")
-    console = Console(highlight=False)
-    console.print(table)
+    console = result_console()
+    print_table(console, table)
     for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):
         if names:
-            console.print(f"Not in the model {lacking}: {', '.join(names)}.", soft_wrap=True, markup=False)
+            say(console, f"Not in the model {lacking}: {', '.join(names)}.")
     found = ", ".join(change.name for change in difference.changed)
-    console.print(
-        f"Significant changes: {found}." if found else "No significant changes.",
-        soft_wrap=True,
-        markup=False,
-    )
+    say(console, f"Significant changes: {found}." if found else "No significant changes.")

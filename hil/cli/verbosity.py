@@ -13,6 +13,8 @@ from typing import Annotated, Any
 
 import typer
 
+from hil.cli.output import readable_output
+
 STOPPED = 130
 """Exit code after Ctrl-C when no arm was moving, as is usual in shells."""
 
@@ -31,7 +33,8 @@ def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.BadParameter("give either --verbose or --quiet, not both.")
         _set_up(verbose, quiet)
         try:
-            command(*args, **options)
+            with readable_output():
+                command(*args, **options)
         except KeyboardInterrupt as stopped:  # before or after the motion; during it, the stream handles Ctrl-C
             print("\n".join(["hil: Stopped by Ctrl-C.", *getattr(stopped, "__notes__", [])]), file=sys.stderr)
             raise typer.Exit(STOPPED) from None

@@ -65,7 +65,7 @@ def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
     shown = run.largest.prediction if run.asked is None else run.asked
     console.print(_table(config, shown, run))
     for line in (*run.servos, *_lines(config, shown, run)):
-        console.print(line, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=not console.is_terminal, markup=False)
 
 
 def settling_text(config: Config, prediction: Prediction) -> str:

@@ -36,7 +36,10 @@ class Repetition:
         self.begin(samples, anew=True)
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
-        """Start a new period of `samples` samples. anew: its torque is not that of the period before."""
+        """Start a new period of `samples` samples. anew: its torque is not that of the period before.
+
+        The buffer is not cleared, which would take too long between two samples.
+        """
         self._anew = anew
         self._half = samples // 2
         self._allowed = [inf if anew else TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]

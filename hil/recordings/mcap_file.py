@@ -6,6 +6,7 @@ Every number of a message is a column, `/topic.field`, an entry of a list `/topi
 """
 
 import json
+import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -107,7 +108,7 @@ def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
                 found = True
                 decoded = decode(message.data)
                 yield channel.topic, _stamp(decoded, message.log_time), decoded
-    except (OSError, McapError, ValueError) as error:
+    except (OSError, McapError, ValueError, KeyError, struct.error) as error:
         raise CsvError(f"{path}: cannot be read: {str(error).rstrip('.') or type(error).__name__}.") from error
     if not found:
         what = ", ".join(sorted(refused)) or "no messages"

@@ -4,6 +4,7 @@ Name and note are stored in note.json in the run's own folder, so that they move
 """
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -130,6 +131,8 @@ def _outcome(path: Path) -> tuple[str, float | None]:
     try:
         result = read_result(path)
     except ResultError:
+        return "result.json is damaged", None
+    if not all(math.isfinite(value) for value in result.values.values()):
         return "result.json is damaged", None
     verdict = "no verdict" if result.verdict is None else result.verdict.trust
     return verdict, max(result.fit.residual_rms_ticks, default=None)

@@ -167,7 +167,12 @@ class RunFolder:
 
     def load_config(self) -> Config:
         """The configuration, with the experiment as it was actually played. Raises ConfigError, RunFolderError."""
-        config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
+        try:
+            text = self.config_path.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+            raise RunFolderError(f"{self.config_path} cannot be read: {reason}.") from error
+        config = parse_config(text, self.config_path)
         if not self.played_path.is_file():
             return config
         played: dict[str, Any] = {}

@@ -1,26 +1,29 @@
 """Print a result in the terminal: parameter, unit, value, standard error and, for a fake arm, the true value."""
 
+import math
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.cli.printing import print_table, say
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
+from hil.estimator.models.terms import joint_of, term_of
 from hil.results.parts import Quantity
 from hil.results.result import SettledResult, ShootingResult
 
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
     """Print the parameter table, the quality of the fit, the verdict and the next commands."""
-    console.print(_parameters(result))
+    print_table(console, _parameters(result))
     physical = [] if result.physical is None else physical_lines(result.physical)
     told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
     told = (*told, *_torque_constants(result, config), *physical)
     for line in (*told, *_next(result, run)):
-        console.print(line, soft_wrap=True, markup=False)
+        say(console, line)
 
 
 def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
@@ -68,7 +71,9 @@ def _parameters(result: SettledResult) -> Table:
     for heading in ("value", "std", *(("truth", "error %", "in std.") if truth else ())):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, entry in result.parameters.items():
-        table.add_row(escape(name), escape(entry.unit), *_numbers(entry, truth.get(name) if truth else None))
+        counted = math.hypot(entry.std, _constant_std(result, name) * abs(entry.value))
+        shown = _numbers(entry, truth.get(name) if truth else None, counted)
+        table.add_row(escape(name), escape(entry.unit), *shown)
     table.add_row()
     for name, entry in result.extra.items():
         table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
@@ -76,13 +81,23 @@ def _parameters(result: SettledResult) -> Table:
     return table
 
 
-def _numbers(entry: Quantity, truth: float | None) -> list[str]:
+def _constant_std(result: SettledResult, name: str) -> float:
+    """Relative standard error of the joint's torque constant, with which the parameter scales; 0 where it does not."""
+    joint = joint_of(name) or 1
+    if not term_of(name).of_torque or joint > len(result.arm.joints):
+        return 0.0
+    facts = result.arm.joints[joint - 1]
+    return facts.torque_per_goal_std / facts.torque_per_goal if facts.torque_per_goal else 0.0
+
+
+def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
+    """counted: standard error that an error is held against, with the torque constant's."""
     value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
         error = value - truth
         percent = f"{100 * error / truth:+.3f}" if truth else "-"
-        cells += [f"{truth:.5g}", percent, f"{error / std:+.1f}" if std > 0 else "-"]
+        cells += [f"{truth:.5g}", percent, f"{error / counted:+.1f}" if counted > 0 else "-"]
     return cells
 
 

@@ -228,3 +228,19 @@ def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
 
     rounds = [(timeit(look, number=500), timeit(add, number=500)) for _ in range(20)]
     assert min(looked for looked, _ in rounds) < 3 * min(added for _, added in rounds)
+
+
+def test_a_joint_that_a_run_left_beyond_its_limit_may_move_in_and_no_farther_out(arm: Arm) -> None:
+    config = arm()
+    high = config.joints[1].position_limit[1]
+
+    def at(*beyond: float) -> list[State]:
+        return [STILL._replace(position=(-1.57, high + each)) for each in beyond]
+
+    assert look(Guard(config), *at(0.006)) is Cause.POSITION, "a person put it there"
+    guard = Guard(config, left_by_a_run=True)
+    for state in at(0.006, 0.007, 0.004, -0.002):
+        guard.look(state)
+    assert look(guard, *at(0.001)) is Cause.POSITION, "it was inside"
+    assert look(Guard(config, left_by_a_run=True), *at(0.006, 0.013, 0.02)) is Cause.POSITION
+    assert look(Guard(config, left_by_a_run=True), *at(0.2)) is Cause.POSITION, "no stop leaves it that far away"

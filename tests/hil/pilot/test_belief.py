@@ -1,5 +1,6 @@
 """Belief updates from runs with and without motion, stabiliser gains, and when the search gives up."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,20 @@ def test_arms_that_do_not_come_back_are_given_gains_that_hold_them(
         position = respond(Physics.of(parameters), start, push, 400.0, feedback).position
         away.append(float(np.abs(position[:, -1] - [rest, 0.0]).max()))
     assert np.mean(np.array(away) < 0.5) > 0.95
+
+
+def test_a_joint_that_friction_holds_against_its_weight_gets_a_spring_alone(config: Config) -> None:
+    belief = prior_belief(config, 48)
+    assert with_stabiliser(config, belief) is config
+    rough = dataclasses.replace(belief, coordinates=belief.coordinates.copy())
+    weight = median(belief, "gravity_2")
+    rough.coordinates[:, belief.names.index("coulomb_2")] = np.log(2.0 * weight)
+    held = with_stabiliser(config, rough)
+    assert held.stabiliser is not None
+    assert held.stabiliser.stiffness[0] == held.stabiliser.damping[0] == 0.0
+    assert held.stabiliser.stiffness[1] > weight
+    kept = with_stabiliser(config, belief, np.array([False, True])).stabiliser
+    assert kept is not None and kept.stiffness[0] == 0.0 < kept.stiffness[1], "what had a spring keeps it"
 
 
 def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tmp_path: Path) -> None:
