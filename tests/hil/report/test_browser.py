@@ -30,7 +30,7 @@ addEventListener("load", () => {
   seen.seconds = performance.now() / 1000;
   const loaded = performance.getEntriesByType("resource").map((entry) => entry.name);
   seen.requests = loaded.filter((name) => !name.startsWith("data:"));
-  const visible = [...document.querySelectorAll("figure svg")].filter((svg) => svg.getBoundingClientRect().width > 0);
+  const visible = [...document.querySelectorAll("figure:not(.motion) svg")].filter((svg) => svg.getBoundingClientRect().width > 0);
   seen.figures = visible.map((svg) => [svg.getAttribute("aria-label"), svg.getBoundingClientRect().width]);
   seen.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
   const svg = visible[0];

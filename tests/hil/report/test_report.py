@@ -91,7 +91,7 @@ def test_a_run_without_held_out_or_period_leaves_those_sections_out(identified: 
     path.write_text(json.dumps(result), encoding="utf-8")
     data = RunData.load(identified)
     keys = [section.key for section in sections(data)]
-    assert keys == ["verdict", "parameters", "correlation", "limits", "timing", "provenance"]
+    assert keys == ["verdict", "parameters", "correlation", "limits", "timing", "next", "provenance"]
     page = make_page(data)
     assert "held-out" not in page and "truth" not in page
 
