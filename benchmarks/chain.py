@@ -24,6 +24,7 @@ import argparse
 import json
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ from hil.estimator.simulation.closed_loop import Feedback, Stabilised
 from hil.fakes.plants.arm import Drive, armature
 from hil.fakes.plants.chain import SpatialChain
 from hil.fakes.plants.chain_arm import ChainArm
+from hil.study.jobs import each
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RATE, PERIOD = 400.0, 10.0
@@ -223,6 +225,17 @@ def measure(joints: int, seed: int) -> dict[str, Any]:
     }
 
 
+_COMPILED: set[int] = set()
+
+
+def _compiled(joints: int, seed: int) -> dict[str, Any]:
+    """`measure`, which a worker does once before its first for everything to be compiled."""
+    if joints not in _COMPILED:
+        measure(joints, 1)
+        _COMPILED.add(joints)
+    return measure(joints, seed)
+
+
 def worst(found: list[dict[str, Any]]) -> dict[str, Any]:
     """The worst figures of all seeds; coverage is averaged over them."""
     result: dict[str, Any] = {
@@ -242,12 +255,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--jobs", type=int, default=1, help="workers; more than one disturb each other's times")
     parser.add_argument("--joints", type=int, nargs="+", default=[4, 6], choices=sorted(BENCHES))
     given = parser.parse_args()
     result: dict[str, Any] = {"machine": machine(), "seeds": given.seeds, "arms": {}}
     for joints in given.joints:
-        measure(joints, 1)  # compiles
-        result["arms"][str(joints)] = worst([measure(joints, seed) for seed in range(1, given.seeds + 1)])
+        seeds = range(1, given.seeds + 1)
+        result["arms"][str(joints)] = worst(each(partial(_compiled, joints), seeds, count=given.jobs))
     if given.json:
         print(json.dumps(result))
         return

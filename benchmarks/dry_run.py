@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.config.schema import parse_config
+from hil.config.schema import Config, parse_config
 from hil.dry_run.amplitude import with_peaks
 from hil.dry_run.waves import design_problem
 from hil.errors import SafetyStop
@@ -31,43 +31,50 @@ from hil.estimation.settled_estimate import estimate_run
 from hil.pilot import identify_in_steps
 from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
+from hil.study.jobs import each
 from tests.support.dry_runs import drawn_arm, fake_of, prior_study, study_config, worst_relative_std
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 
-def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
+def pilot_study(pilots: int, seed: int = 2, jobs: int | None = None) -> dict[str, Any]:
     """Identify arms drawn from the prior, starting from joint limits and link lengths only."""
     plain = parse_config((CONFIGS / "first_time.toml").read_text(encoding="utf-8"), CONFIGS / "first_time.toml")
     random = np.random.default_rng((seed, 22))
-    used, ratios, least, distances, touched = [], [], [], [], 0
-    for number in range(pilots):
-        config = plain if number == 0 else plain.model_copy(update={"fake": drawn_arm(study_config(), random).fake})
-        with fake_of(config) as (drawn, folder):
-            run = RunFolder.create(folder / "run", drawn)
-            try:
-                _, result = identify_in_steps(drawn, run, drawn.path, lambda _: None, lambda _: None)
-            except SafetyStop:
-                touched += 1
-                continue
-            pilot = first_estimate(folder / "run")
-        seen, median = map(np.array, (result.steps[-1].seen, result.steps[-1].predicted_median))
-        allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
-        used.append(float(((seen[1] - seen[0]) / allowed).min()))
-        ratios.append(worst_relative_std(pilot) / worst_relative_std(result))
-        least.append(min(pilot.parameters[n].std / e.std for n, e in result.parameters.items()))
-        rest = np.array(config.arm.rest_pose)
-        moved = np.stack((seen[0] - rest, seen[1] - rest, seen[2]))
-        foreseen = np.stack((median[0] - rest, median[1] - rest, median[2]))
-        distances.append(float(np.abs(foreseen / moved - 1).max()))
+    drawn = [plain.model_copy(update={"fake": drawn_arm(study_config(), random).fake}) for _ in range(pilots - 1)]
+    done = each(_pilot, [plain, *drawn][:pilots], count=jobs)
+    found = [outcome for outcome in done if outcome is not None]
+    used, ratios, least, distances = zip(*found, strict=True) if found else ((), (), (), ())
     return {
         "pilots": pilots,
-        "pilot_limit_touched": touched,
+        "pilot_limit_touched": len(done) - len(found),
         "range_used": min(used, default=0.0),
         "std_ratio_pilot_full": min(ratios, default=0.0),
         "std_ratio_least": min(least, default=0.0),
         "predicted_over_seen": max(distances, default=1.0),
     }
+
+
+def _pilot(config: Config) -> tuple[float, float, float, float] | None:
+    """Range used, ratios of standard deviations, and distance of the prediction of one arm; None if it was stopped."""
+    with fake_of(config) as (drawn, folder):
+        run = RunFolder.create(folder / "run", drawn)
+        try:
+            _, result = identify_in_steps(drawn, run, drawn.path, lambda _: None, lambda _: None)
+        except SafetyStop:
+            return None
+        pilot = first_estimate(folder / "run")
+    seen, median = map(np.array, (result.steps[-1].seen, result.steps[-1].predicted_median))
+    allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
+    rest = np.array(config.arm.rest_pose)
+    moved = np.stack((seen[0] - rest, seen[1] - rest, seen[2]))
+    foreseen = np.stack((median[0] - rest, median[1] - rest, median[2]))
+    return (
+        float(((seen[1] - seen[0]) / allowed).min()),
+        worst_relative_std(pilot) / worst_relative_std(result),
+        min(pilot.parameters[n].std / e.std for n, e in result.parameters.items()),
+        float(np.abs(foreseen / moved - 1).max()),
+    )
 
 
 def first_estimate(run: Path) -> SettledResult:
@@ -106,8 +113,13 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=200)
     parser.add_argument("--pilots", type=int, default=6)
+    parser.add_argument("--jobs", type=int, help="workers; one per core unless given")
     options = parser.parse_args()
-    measured = {**prior_study(options.arms), **pilot_study(options.pilots), **design_study()}
+    measured = {
+        **prior_study(options.arms, jobs=options.jobs),
+        **pilot_study(options.pilots, jobs=options.jobs),
+        **design_study(),
+    }
     if options.json:
         print(json.dumps(measured))
         return

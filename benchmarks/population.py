@@ -25,8 +25,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ from hil.estimation.truth import true_parameters
 from hil.fakes.plants.arm import base_parameters
 from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, load_samples
+from hil.study.jobs import each
 
 try:
     from benchmarks.population_arms import DrawnArm, draw
@@ -227,16 +228,13 @@ def study(
     seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False, others: bool = False
 ) -> list[Outcome]:
     """Identify the arm of each seed; tell: called with each outcome."""
-    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
-        folder = keep or Path(temporary)
-        outcomes = []
-        for ended in as_completed(
-            [pool.submit(run, seed, folder / str(seed), quick=quick, others=others) for seed in seeds]
-        ):
-            outcomes.append(ended.result())
-            if tell:
-                tell(outcomes[-1])
-        return sorted(outcomes, key=lambda each: each.seed)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (keep or Path(temporary)).absolute()
+        return each(partial(_run_in, folder, quick, others), seeds, count=jobs, tell=tell or (lambda _: None))
+
+
+def _run_in(folder: Path, quick: bool, others: bool, seed: int) -> Outcome:
+    return run(seed, folder / str(seed), quick=quick, others=others)
 
 
 def _seeds(text: str) -> list[int]:

@@ -54,7 +54,7 @@ class Cause(Enum):
 
     @property
     def allows_lowering(self) -> bool:
-        """Whether the servos still take commands, so that an arm that would fall may be lowered, watched all the way."""
+        """Whether the servos still take commands, so that an arm may be lowered, watched all the way."""
         return self.allows_braking or self in {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER}
 
 

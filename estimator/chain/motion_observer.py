@@ -87,7 +87,7 @@ class ChainObserver:
         return self._theta.copy()
 
 
-def _observe_loop(  # noqa: PLR0912
+def _observe_loop(  # noqa: PLR0912, PLR0915
     memory: Any,
     theta: Any,
     covariance: Any,

@@ -66,7 +66,8 @@ class PathDesigner:
         self._base, self._prior, self._limits = base, prior, limits
         self._samples, self._period = round(rate * period), period
         few = min(LOOKED_AT, self._samples)
-        self._few, self._all = self._waves(few), None
+        self._few = self._waves(few)
+        self._all: tuple[Array, Array, Array] | None = None
         self._joints = len(limits.low)
 
     def plain(self, centre: Array, seed: int) -> Design:

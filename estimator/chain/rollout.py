@@ -20,9 +20,9 @@ from hil.estimator.compiled import compiled
 
 LONGEST_STEP = 1.3e-3  # s
 RAN_AWAY = 1e3  # rad/s
-NEAR_REST = 0.3  # rad: where what the arm lies on may carry it
+NEAR_REST = 0.2  # rad: where what the arm lies on may carry it
 YIELDS = 0.03  # rad, under a joint's largest torque: how far that gives way
-PRESSED_SHARE = 0.01  # of a joint's largest torque: less weight presses a joint on nothing
+PRESSED_SHARE = 0.03  # of a joint's largest torque: less weight presses a joint on nothing
 VISCOUS, COULOMB, OFFSET, WIDTH, SCALE, LAG = range(6)
 DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", "lag")
 
@@ -118,20 +118,21 @@ def weights(arms: ChainArms, pose: Array) -> Array:
     return out
 
 
-def inertias(arms: ChainArms, poses: Array) -> Array:
-    """Largest inertia that each joint feels alone in any of the poses (poses, joints), per arm (arms, joints)
-    [kg m^2]."""
+def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
+    """Inertia that each joint feels with the others held, the mean over the poses (poses, joints), and with the others
+    free, the least; per arm (arms, joints) [kg m^2]."""
     n = arms.base.chain.joints
     work, still = room(n), np.zeros(n)
     rotation, translation, axis, _ = arms.base.chain.arrays
-    most = np.zeros((arms.size, n))
+    held, free = np.zeros((arms.size, n)), np.full((arms.size, n), np.inf)
     for arm in range(arms.size):
         link, armature = _split(arms, arm)
         for pose in np.ascontiguousarray(poses, dtype=np.float64):
             place(rotation, translation, axis, pose, work[0], work[1])
             move(link, armature, still, work)
-            most[arm] = np.maximum(most[arm], np.diag(work[4]))
-    return most
+            held[arm] += np.diag(work[4]) / len(poses)
+            free[arm] = np.minimum(free[arm], 1.0 / np.diag(np.linalg.inv(work[4])))
+    return held, free
 
 
 def is_physical(arms: ChainArms, poses: Array) -> Any:
@@ -156,7 +157,7 @@ def _split(arms: ChainArms, arm: int) -> tuple[Array, Array]:
     return np.ascontiguousarray(table[:, :-1]), np.ascontiguousarray(table[:, -1])
 
 
-def _roll_loop(
+def _roll_loop(  # noqa: PLR0912
     chain: Any,
     link: Any,
     armature: Any,
@@ -189,9 +190,9 @@ def _roll_loop(
             place(rotation, translation, axis, q, work[0], work[1])
             move(link, armature, v, work)
             accelerate(armature, gravity, v, still, work)
-            near = True
+            carried = 1.0  # share of what lies under the rest pose that is met, fading with the distance from it
             for j in range(n):
-                near = near and abs(q[j] - pose[j]) < NEAR_REST
+                carried = min(carried, 2.0 - 2.0 * abs(q[j] - pose[j]) / NEAR_REST)
             for j in range(n):
                 lag = drive[5, j]
                 kept = math.exp(-h / lag) if lag > 0.0 else 0.0
@@ -203,9 +204,9 @@ def _roll_loop(
                 for i in range(n):
                     A[j, i] = work[4][j, i]
                 A[j, j] += h * slope
-                if near and pressed[j] * (q[j] - pose[j]) > 0.0:
-                    stiff = limit[j] / YIELDS
-                    firm = 2.0 * math.sqrt(stiff * work[4][j, j])
+                if carried > 0.0 and pressed[j] * (q[j] - pose[j]) > 0.0:
+                    stiff = carried * limit[j] / YIELDS
+                    firm = math.sqrt(stiff * work[4][j, j])
                     b[j] -= stiff * (q[j] - pose[j] + h * v[j]) + firm * v[j]
                     A[j, j] += h * (firm + h * stiff)
             if not invert(A, inverse, factor):

@@ -13,6 +13,10 @@ SIGNAL_OVER_NOISE = 4.0  # power ratio above which a band of lines counts as sig
 BAND = 8  # lines that are evaluated together
 
 
+_AHEAD = np.array((3.0, -3.0, 1.0))
+"""Weights of the three nearest samples, nearest first, for the one beyond them: a parabola."""
+
+
 @dataclass(frozen=True)
 class PeriodicMotion:
     """Angles, velocities and accelerations of one period (joints, samples) [rad, rad/s, rad/s^2]."""
@@ -47,11 +51,23 @@ def white_noise(position: Array) -> Array:
     the jump of a period that does not close because the arm drifts spreads over all lines.
     """
     samples = position.shape[1]
-    ramp = (position[:, -1:] - position[:, :1]) * (np.arange(samples) / max(1, samples - 1))
-    lines = lines_of(position - ramp)
+    lines = lines_of(position - _jump(position)[:, None] * (np.arange(samples) / samples))
     upper = lines[:, lines.shape[1] // 2 :]
     noise: Array = np.sqrt(noise_power(upper) * samples)
     return noise
+
+
+def _jump(position: Array) -> Array:
+    """Return by how much a period (joints, samples) fails to close (joints,): the motion between two samples taken off.
+
+    At low rates a joint moves by many encoder steps from the last sample to the next first one.
+    """
+    if position.shape[1] < len(_AHEAD):
+        return np.zeros(len(position))
+    after = position[:, : -len(_AHEAD) - 1 : -1] @ _AHEAD - position[:, 0]
+    before = position[:, -1] - position[:, : len(_AHEAD)] @ _AHEAD
+    jump: Array = 0.5 * (after + before)
+    return jump
 
 
 def cut_off(lines: Lines) -> int:

@@ -10,10 +10,13 @@ from typing import Any
 from hil.api.experiment import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, ignore
 from hil.config.schema import Config
+from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_json
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.run import ARMS
 from hil.dry_run.run import dry_run as simulate
 from hil.dry_run.summary import DryRun, dry_run_json
+from hil.errors import ConfigError
+from hil.pilot.chain_rehearsal import rehearse
 from hil.results.display import html_table
 
 __all__ = ["Rehearsal", "dry_run"]
@@ -28,7 +31,7 @@ class Rehearsal:
 
     file: Path
     config: Config
-    found: DryRun
+    found: DryRun | ChainDryRun
 
     @property
     def is_safe(self) -> bool:
@@ -43,15 +46,21 @@ class Rehearsal:
     @property
     def largest_peak_torque(self) -> tuple[float, ...]:
         """The largest safe peak torque of each joint [N m]."""
+        if isinstance(self.found, ChainDryRun):
+            return self.found.peak_torque
         return tuple(float(value) for value in self.found.largest.peak_torque)
 
     @property
     def prediction(self) -> Prediction:
         """The prediction for the configured torque; without one, for the largest safe torque."""
+        if isinstance(self.found, ChainDryRun):
+            return self.found.prediction
         return self.found.largest.prediction if self.found.asked is None else self.found.asked
 
     def to_json(self) -> dict[str, Any]:
         """The object that `hil dry-run --json` prints."""
+        if isinstance(self.found, ChainDryRun):
+            return chain_dry_run_json(self.found)
         return dry_run_json(self.config, self.found)
 
     def plot(self) -> Any:
@@ -112,4 +121,15 @@ def dry_run(
     checked, shown = loaded(config)
     on_progress(Progress("simulation", "Simulating"))
     former = None if result is None else Path(result)
+    if checked.is_chain:
+        if former is not None:
+            raise ConfigError(
+                f"{shown}: --result: a dry run of an arm in space draws from its description only so far."
+            )
+
+        def tell(done: int, of: int) -> None:
+            if done % max(1, of // 20) == 0:
+                on_progress(Progress("simulation", f"Simulated {done} of {of} motions"))
+
+        return Rehearsal(shown, checked, rehearse(checked, arms, servos, tell))
     return Rehearsal(shown, checked, simulate(checked, former, arms, servos, executor))

@@ -111,14 +111,14 @@ def _distance(first: int, second: int, at: Any, radius: Any, floor: Any, boxes: 
     """Of one pair [m]; negative where they overlap."""
     a = at[first]
     if second >= 0:
-        return _segments(a, at[second]) - radius[first] - radius[second]
+        return float(_segments(a, at[second]) - radius[first] - radius[second])
     if second == FLOOR:
         low = min(
             floor[0] * a[0, 0] + floor[1] * a[0, 1] + floor[2] * a[0, 2],
             floor[0] * a[1, 0] + floor[1] * a[1, 1] + floor[2] * a[1, 2],
         )
-        return low - floor[3] - radius[first]
-    return _box(a, boxes[BOXES - second]) - radius[first]
+        return float(low - floor[3] - radius[first])
+    return float(_box(a, boxes[BOXES - second]) - radius[first])
 
 
 def _all_loop(chain: Any, shapes: Any, pairs: Any, q: Any, out: Any) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +124,7 @@ class Space:
 
     def _partner(self, second: int) -> str:
         if second >= 0:
-            return self.shapes.names[self._arrays[0][second]]
+            return str(self.shapes.names[self._arrays[0][second]])
         return "floor" if second == FLOOR else self.obstacles[BOXES - second]
 
     def _needed(self, on_the_way: bool) -> Array:
@@ -181,7 +182,7 @@ def _space(key: _Key) -> Space:
     space = Space(shapes, obstacles, wanted.margin, (), rest, np.zeros(len(pairs)), pairs, chain, arrays)  # type: ignore[arg-type]
     kept = np.array([frozenset(space.names_of(pair)) not in ignored for pair in range(len(pairs))], dtype=bool)
     touching = _touch_as_built(config, chain, arrays, pairs, wanted.margin)
-    as_built = sorted({space.names_of(pair) for pair in np.flatnonzero(touching & kept)})
+    as_built = sorted({space.names_of(int(pair)) for pair in np.flatnonzero(touching & kept)})
     pairs = pairs[kept & ~touching]
     at_rest = np.empty((1, len(pairs)))
     all_distances(chain, arrays, pairs, rest[None], at_rest)
@@ -189,7 +190,7 @@ def _space(key: _Key) -> Space:
 
 
 def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:
-    """Capsules of links that are no neighbours; with the floor those beyond the first link, which stands on the base."""
+    """Capsules of links that are no neighbours; with the floor those beyond the first link, which is on the base."""
     count = len(shapes.capsules)
     found = [(a, b) for a in range(count) for b in range(a + 1, count) if abs(link[a] - link[b]) > 1]
     found += [(a, FLOOR) for a in range(count) if link[a] > 1 and has_floor]
@@ -197,8 +198,8 @@ def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool)
 
 
 def _touch_as_built(
-    config: Config, chain: object, arrays: tuple[NDArray[np.int64], ...], pairs: NDArray[np.int64], margin: float
-) -> Array:
+    config: Config, chain: object, arrays: tuple[Any, ...], pairs: NDArray[np.int64], margin: float
+) -> NDArray[np.bool_]:
     """Of which pairs the capsules are near in nearly every pose within the limits (pairs,)."""
     link = arrays[0]
     low, high = np.array([joint.position_limit for joint in config.joints]).T
@@ -206,10 +207,11 @@ def _touch_as_built(
     distance = np.empty((RANDOM_POSES, len(pairs)))
     all_distances(chain, arrays, pairs, poses, distance)
     second = np.maximum(pairs[:, 1], 0)
-    are_close = np.abs(link[pairs[:, 0]] - link[second]) == 2  # noqa: PLR2004 (one link in between)
+    are_close = np.abs(link[pairs[:, 0]] - link[second]) == 2  # one link in between
     needed = np.where(are_close, ALWAYS_SHARE, ALWAYS_SHARE_OF_OTHERS)
-    near: Array = (distance < margin + BUILT_NEAR).mean(axis=0) >= needed
-    return near & (pairs[:, 1] >= 0)
+    near = (distance < margin + BUILT_NEAR).mean(axis=0) >= needed
+    touching: NDArray[np.bool_] = near & (pairs[:, 1] >= 0)
+    return touching
 
 
 def _ignored(config: Config, names: tuple[str, ...]) -> set[frozenset[str]]:

@@ -25,7 +25,7 @@ class ClearanceConfig(Table):
     floor: float | Literal["none"] = Field(
         0.0, description='height of the table or floor above the base\'s origin, m; "none" where there is none in reach'
     )
-    boxes: list[BoxConfig] = []
+    boxes: list[BoxConfig] = Field([], description="what else is in the way")
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = Field(
         [], description='pairs of links (or "floor", or a box) that need no clearance'
     )

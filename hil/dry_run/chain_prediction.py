@@ -23,7 +23,7 @@ Tell = Callable[[int, int], None]
 PERIODS = 2
 SHOWN = 30
 LOOKED_AT_HZ = 100.0
-"""Poses a second whose clearance is computed."""
+"""Rate at which the clearance of a motion is computed [Hz]."""
 
 RAN_AWAY = 1e3
 """Times its limit, which stands for the peaks of an arm that runs away."""
@@ -85,12 +85,12 @@ def predict_chain(
             if worst is None or nearest.room < worst[0]:
                 worst = nearest.room, nearest, segment.role, moment
             if number == 0 and arm < shown:
-                seen.append(position.astype(np.float32))
+                seen.append(position.copy())
             done += 1
             if tell is not None:
                 tell(done, arms.size * len(plan.segments))
     assert worst is not None
-    together = np.stack(seen) if seen else np.empty((0, 0, 0), dtype=np.float32)
+    together = np.stack(seen) if seen else np.empty((0, 0, 0))
     prediction = Prediction(
         values,
         _shares(values, limits, rest, _centre(plan)),

@@ -24,14 +24,23 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     The phases determine how evenly an arm swings to both sides. Reversing the sign or time of a wave gives another wave
     with the same lines and peaks at no design cost.
     """
+    return roomy_plans(config, physics, 1)[0]
+
+
+def roomy_plans(config: Config, physics: Physics, count: int) -> list[Plan]:
+    """Return up to `count` plans like `roomy_plan`, best first: with the next best variants of the first multisine."""
     problem = design_problem(config, physics, ())
     plan = with_peaks(config, _torque_limits(config))
-    segments = []
-    for segment in plan.segments:
-        wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
-        best = max(_turned(wave), key=lambda each: _evenness(problem, each))
-        segments.append(_with_wave(config, segment, best))
-    return replace(plan, segments=tuple(segments))
+    first, *others = [_variants(config, problem, segment) for segment in plan.segments]
+    rest = tuple(each[0] for each in others)
+    return [replace(plan, segments=(each, *rest)) for each in first[:count]]
+
+
+def _variants(config: Config, problem: DesignProblem, segment: Segment) -> list[Segment]:
+    """Return the segment with each variant of its wave, the most even motion first."""
+    wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
+    ordered = sorted(_turned(wave), key=lambda each: _evenness(problem, each), reverse=True)
+    return [_with_wave(config, segment, each) for each in ordered]
 
 
 def _evenness(problem: DesignProblem, wave: Multisine) -> float:

@@ -24,6 +24,9 @@ WIDENED = 1.5
 """Times the ensemble's standard deviations: what its arms lack is none of their parameters."""
 
 LYING_RAD = 0.08
+_FRICTIONS = 8.0
+"""Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
+an alarm."""
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 
@@ -35,7 +38,9 @@ class ChainWatch:
         arms = prior_arms(config, known_chain(config), ARMS) if arms is None else arms
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         mean, covariance = observed_parameters(arms)
-        largest = np.maximum(self._constants * np.array(planned), 1e-3)
+        n = len(self._constants)
+        # A light joint's torque is hardly more than dry friction, whose behaviour near standstill is not in the model.
+        largest = np.maximum(self._constants * np.array(planned), _FRICTIONS * mean[len(mean) - 2 * n : len(mean) - n])
         self._observer = ChainObserver(arms.base, mean, covariance, largest, 1.0 / config.experiment.rate)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
@@ -88,7 +93,7 @@ def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
 
 
 def linear_parameters(arms: ChainArms) -> Array:
-    """Of each arm the base parameters, viscous and dry friction and offsets (arms, base + 3 joints) per commanded torque.
+    """Of each arm the base parameters, viscous and dry friction, offsets (arms, base + 3 joints) per commanded torque.
 
     Torque constants that are all off alike scale everything. Where joints differ, a base parameter, which several
     joints feel, is taken by the first of them.

@@ -33,6 +33,9 @@ EARLY_MOTION_RAD = 0.05
 FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move that a run before this one left beyond its limit."""
 
+MOST_OUTSIDE_RAD = 0.15
+"""How far beyond its limit a joint may be found that a run before this one left there [rad]."""
+
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
@@ -87,7 +90,7 @@ class Guard:
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit,
                 joint.goal_limit,
-                joint.torque_per_goal / rate,
+                joint.torque_per_goal,
                 -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
             for joint in config.joints
@@ -110,6 +113,7 @@ class Guard:
         self._seen_at = [0.0] * count
         self._missing = [0] * count
         self._work = [0.0] * count
+        self._held_goal = [0.0] * count
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
@@ -223,6 +227,7 @@ class Guard:
             self._too_fast(index, velocity)
         self._position[index] = position
         self._seen_at[index] = now
+        missed = self._missing[index]
         self._missing[index] = 0
         following = self._following[index]
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
@@ -232,7 +237,11 @@ class Guard:
             consistency.lost()
         if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
-        work = self._work[index] = self._work[index] + work_scale * goal * velocity
+        held, self._held_goal[index] = self._held_goal[index], goal
+        # What the goal before has done until now; where it was another one meanwhile, nothing is known.
+        work = self._work[index]
+        if former is not None and elapsed < LONG_GAP * interval and not missed:
+            work = self._work[index] = work + work_scale * held * (position - former)
         if work < work_least and self._passive:
             self._judge_work(index)
 
@@ -287,7 +296,8 @@ class Guard:
     def _outside(self, index: int, position: float) -> None:
         low, high = self._limits[index][:2]
         former = self._position[index]
-        if former is None and self._may_start_outside:
+        beyond = max(low - position, position - high)
+        if former is None and self._may_start_outside and beyond <= MOST_OUTSIDE_RAD:
             self._found_outside[index] = position
         found = self._found_outside.get(index)
         was_inside = former is not None and low <= former <= high

@@ -50,7 +50,7 @@ class Lowering:
         self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compiled
 
     def lies(self, state: State) -> bool:
-        """Whether the arm is in its rest pose anyway."""
+        """Whether the arm already lies in its rest pose."""
         away = np.abs(np.array(state.position) - self._rest)
         return bool(away.max() < LYING_RAD)
 
@@ -65,7 +65,7 @@ class Lowering:
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
         self._guard = _guard_of(self._config, self._path.position, velocity)
         self._guard.holding(goal)
-        return count
+        return int(count)
 
     def goals(self, index: int, state: State) -> list[float]:
         """Goals [A or V] of one sample, from the state before; raises SafetyStop."""

@@ -2,6 +2,10 @@
 
 The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated sample by sample: at the end
 of a period only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
+
+The same torque must give the same motion. From the third period on each sample is also compared with the same sample of
+the period before: a joint that is farther from it than `TIMES` the RMS difference of the two periods before, for
+`LASTING_S`, does not repeat its motion (`unlike`).
 """
 
 from array import array
@@ -10,30 +14,61 @@ from math import inf, isnan, sqrt
 
 _EMPTY = float("nan")
 
+TIMES = 10.0
+FLOOR_RAD = 0.05
+"""Deviation from the previous period that is always accepted: stiction may end a little earlier or later."""
+
+LASTING_S = 0.03
+_FEWEST = 2  # samples, however slow the rate
+
 
 class Repetition:
-    """Compares the positions of a period of up to `samples` samples with those of the period before."""
+    """Compares the positions of a period of up to `samples` samples with those of the period before.
 
-    def __init__(self, samples: int, joints: int) -> None:
+    interval: time between samples [s].
+    """
+
+    def __init__(self, samples: int, joints: int, interval: float) -> None:
         self._half = 0
+        self._lasting = max(_FEWEST, round(LASTING_S / interval))
+        self._sums: list[_Sums] = [_Sums() for _ in range(joints)]
         self._former = [array("d", [_EMPTY]) * samples for _ in range(joints)]
         self.begin(samples)
 
     def begin(self, samples: int) -> None:
         """Start a new period of `samples` samples."""
         self._half = samples // 2
+        self._allowed = [TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]
+        self._unlike_for = [0] * len(self._former)
         self._sums = [_Sums() for _ in self._former]
+
+    def forget(self) -> None:
+        """Forget all periods: what follows plays another torque."""
+        self._sums = [_Sums() for _ in self._former]
+        self._former = [array("d", [_EMPTY]) * len(former) for former in self._former]
 
     def add(self, index: int, position: Sequence[float]) -> None:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
         compared = index >= self._half
-        for former, sums, latest in zip(self._former, self._sums, position, strict=True):
+        for joint, (former, sums, latest) in enumerate(zip(self._former, self._sums, position, strict=True)):
             if not isnan(latest):
+                # False where the former sample is missing, as every comparison with NaN is.
+                self._unlike_for[joint] = (
+                    self._unlike_for[joint] + 1 if abs(latest - former[index]) > self._allowed[joint] else 0
+                )
                 sums.lowest = min(sums.lowest, latest)
                 sums.highest = max(sums.highest, latest)
                 if compared:
                     sums.add(former[index], latest)
             former[index] = latest
+
+    @property
+    def unlike(self) -> int | None:
+        """Index of a joint that does not repeat the motion of the period before, or None."""
+        for joint, count in enumerate(self._unlike_for):
+            if count >= self._lasting:
+                return joint
+        return None
 
     @property
     def moved(self) -> list[float]:
@@ -70,6 +105,11 @@ class _Sums:
             change = latest - former
             self._pairs += 1
             self._squared += change * change
+
+    @property
+    def rms_change(self) -> float:
+        """RMS difference from the period before [rad]; infinite if there was none to compare with."""
+        return sqrt(self._squared / self._pairs) if self._pairs else inf
 
     @property
     def relative(self) -> float:

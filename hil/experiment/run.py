@@ -14,11 +14,12 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.estimator.chain.rollout import ChainArms
+from hil.experiment.guard import MOST_OUTSIDE_RAD
 from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
-from hil.plan.chain_plan import plan_of
+from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
@@ -65,6 +66,8 @@ def run_experiment(
         HilError, DriverError: if torque was switched on, the exception carries a note that says whether it is off.
     """
     plan = plan_of(config) if plan is None else plan
+    if config.is_chain and not config.is_fake:
+        check_clearance(config, plan)
     fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
@@ -72,6 +75,8 @@ def run_experiment(
         def note(what: str) -> None:
             log.note(clock.now(), what)
 
+        if config.is_chain and not config.is_fake:
+            note("experiments on real arms in space are not tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
         if has_moved():
@@ -205,6 +210,8 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
 
     After a run that passed this check, friction may hold the arm at up to twice the tolerance.
     """
+    if has_moved():
+        _check_inside(config, bus)
     tolerance = config.arm.rest_tolerance * (_MOVED if has_moved() else 1.0)
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
@@ -213,6 +220,17 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
                 f"{joint} is at {position:.3f} rad; arm.rest_pose is {rest:.3f} and arm.rest_tolerance allows "
                 f"{tolerance:g}. Move it there by hand: friction may hold it away from rest. Only "
                 f"if it is in its rest pose now, set zero_ticks = {ticks}."
+            )
+
+
+def _check_inside(config: Config, bus: ServoBus) -> None:
+    """Refuse an arm that the run before left far beyond its limits: an upright one that fell when torque was cut."""
+    for joint, position, limited in zip(bus.joints, bus.read_positions(), config.joints, strict=True):
+        low, high = limited.position_limit
+        if not low - MOST_OUTSIDE_RAD <= position <= high + MOST_OUTSIDE_RAD:
+            raise ExperimentError(
+                f"{joint} is at {position:.3f} rad, where the stop of the run before left it: its position limit is "
+                f"[{low:g}, {high:g}]. Move it back to arm.rest_pose by hand, then start again."
             )
 
 

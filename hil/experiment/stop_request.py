@@ -76,6 +76,11 @@ class StopRequest:
         """Whether a second signal arrived, which ends braking."""
         return self._count > 1
 
+    def check_again(self, asked: int) -> None:
+        """Raise StopRequested when more than `asked` signals have come."""
+        if self._count > asked:
+            raise StopRequested(self._said())
+
     @property
     def count(self) -> int:
         """How many signals came."""

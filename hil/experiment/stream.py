@@ -19,7 +19,7 @@ from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.rollout import ChainArms
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
@@ -82,8 +82,8 @@ class Stream:
         self._guard = Guard(config, planned, left_by_a_run=self._left_by_a_run)
         self._model: ModelWatch | ChainWatch = (
             ModelWatch(config, planned, arms)
-            if isinstance(arms, Ensemble) or not config.is_chain
-            else ChainWatch(config, planned, arms)
+            if not isinstance(arms, ChainArms) and not config.is_chain
+            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None)
         )
         self._lowering = Lowering(config, plan) if config.is_chain else None
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
@@ -103,7 +103,7 @@ class Stream:
         self._sent_at: float | None = None
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
-        self._repetition = Repetition(longest, len(bus.joints))
+        self._repetition = Repetition(longest, len(bus.joints), self._interval)
 
     @property
     def state(self) -> State | None:
@@ -126,6 +126,7 @@ class Stream:
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
             self._note(f"{segment.role}: ramp in")
+            self._repetition.forget()
             self._play(self._ramps[number][0], Phase.RAMP_IN)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
@@ -189,6 +190,13 @@ class Stream:
         for index, row in enumerate(segment.period_current):
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)
+            if (joint := repetition.unlike) is not None:
+                raise SafetyStop(
+                    f"{self._bus.joints[joint].title} does not repeat its motion: under the same torque it is at "
+                    f"{state.position[joint]:.3f} rad, far from where it was one period ago. Something pushes or holds "
+                    "it, it slips, or its encoder has failed.",
+                    Cause.UNLIKE_BEFORE,
+                )
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")
@@ -222,7 +230,7 @@ class Stream:
             state = self._bus.exchange(self._goal)
             if self._asks_again and any(state.missing):
                 self._guard.look(state)
-                state = self._bus.exchange(self._goal)
+                state = self._bus.exchange(self._goal, hurried=True)
             self._sent_at = state.time_before_write
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
@@ -263,36 +271,34 @@ class Stream:
 
     def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
         """Brake and lower the arm until it lies, anything is wrong, or a second signal comes. Never raises."""
-        state, asked = self._state, max(1, self._stop.count)
+        state = self._state
         if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
             return
         self._note(f"lowering the arm after: {error}")
         try:
-            for index in range(lowering.begin(state, self._goal)):
-                deadline, now, late = self._ticks.wait()
-                if self._stop.count > asked:
-                    raise SafetyStop("A second signal came.", Cause.UNEXPECTED)
-                if late:
-                    self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
-                    lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
-                    continue
-                self._goal = lowering.goals(index, state)
-                former, state = state.time_before_write, self._bus.exchange(self._goal)
-                self._sent_at = state.time_before_write
-                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
-                lowering.look(index, state, state.time_before_write - former)
-        except (SafetyStop, DriverError) as ended:
-            self._told(
-                error, f"Torque was cut while the arm was being lowered, so it fell the rest of the way: {ended}"
-            )
+            state = self._way_down(lowering, state)
+        except (SafetyStop, StopRequested, DriverError) as ended:
+            self._told(error, f"Torque was cut while the arm was being lowered, so it fell from there: {ended}")
             return
-        lies = lowering.lies(state)
-        self._told(
-            error,
-            "The arm was lowered to its rest pose."
-            if lies
-            else "The arm was lowered, but does not lie in its rest pose.",
-        )
+        done = "was lowered to its rest pose" if lowering.lies(state) else "was lowered, but not to its rest pose"
+        self._told(error, f"The arm {done}.")
+
+    def _way_down(self, lowering: Lowering, state: State) -> State:
+        """The last state; raises SafetyStop, StopRequested, DriverError."""
+        asked = max(1, self._stop.count)
+        for index in range(lowering.begin(state, self._goal)):
+            deadline, now, late = self._ticks.wait()
+            self._stop.check_again(asked)
+            if late:
+                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
+                lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
+                continue
+            self._goal = lowering.goals(index, state)
+            former, state = state.time_before_write, self._bus.exchange(self._goal)
+            self._sent_at = state.time_before_write
+            self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
+            lowering.look(index, state, state.time_before_write - former)
+        return state
 
     def _told(self, error: ExperimentError, what: str) -> None:
         error.add_note(what)

@@ -33,7 +33,7 @@ _LINEAR_RANGE = 0.02  # rad, below which displacements are compared linearly, an
 _ERROR = 0.08
 """Relative error of a compared displacement that models of this kind leave."""
 _LEAST_ERROR_STEPS = 1.5
-MOVED_STEPS = 12
+MOVED_STEPS = 26
 """Smallest range of motion of a joint that counts as having moved [encoder steps]."""
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)

@@ -1,8 +1,8 @@
 """Arms in space that could be the real one, and what a run teaches of them.
 
-Torque is linear in base parameters and friction, so each arm is moved by a randomised maximum a posteriori step (Y. Chen
-and D. Oliver, Mathematical Geosciences 44 (2012) 1): drawn again as if it were the prior's mean and the recording had
-other noise. What a motion says nothing of keeps its spread.
+Torque is linear in base parameters and friction, so each arm is moved by a randomised maximum a posteriori step (Y.
+Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1): as if it were the prior's mean and the recording had other
+noise. What a motion says nothing of keeps its spread.
 """
 
 from dataclasses import dataclass
@@ -25,6 +25,9 @@ TAUGHT_HZ = 25.0  # rows a second that a recording is worth
 FREQUENCY, DAMPING_RATIO = 3.0, 0.7
 """Of each joint on the stabiliser's spring [Hz]."""
 
+MOST_DAMPING = 0.2
+"""Of a joint's velocity, with the others free: the most that the damper takes away in a sample."""
+
 _CUT_OFF_TIMES = 6.0  # times the path's highest frequency
 _WIDTH = 0.05  # rad/s
 _LYING_RAD = 0.08
@@ -35,6 +38,7 @@ _RIDGE = 1e-4
 _FEWEST_ROWS = 50
 _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
+_ARMS = 40
 _HALVINGS = 6
 
 
@@ -63,9 +67,14 @@ class ChainBelief:
             return given
         low, high = np.array([joint.position_limit for joint in given.joints]).T
         poses = np.random.default_rng(2).uniform(low, high, (_POSES, len(low)))
-        inertia = np.median(inertias(self.arms.first(20), poses), axis=0)
+        held, free = inertias(self.arms.first(_ARMS), poses)
+        # A damper acts on what it feels a sample later: more than this and a light joint would shake.
         turn = 2.0 * np.pi * FREQUENCY
-        stiffness, damping = turn**2 * inertia, 2.0 * DAMPING_RATIO * turn * inertia
+        damping = 2.0 * DAMPING_RATIO * turn * np.median(held, axis=0)
+        most = MOST_DAMPING * given.experiment.rate * np.maximum(free.min(axis=0), 0.0)
+        share = np.minimum(1.0, most / damping)
+        damping = share * damping
+        stiffness = share * turn**2 * np.median(held, axis=0)
         gains = StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
         return given.model_copy(update={"stabiliser": gains})
 

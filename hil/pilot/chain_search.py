@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
-from hil.dry_run.prediction import GUARDED, QUANTITIES, peaks_of
+from hil.dry_run.chain_summary import unsafe
+from hil.dry_run.prediction import peaks_of
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -42,12 +43,12 @@ RAISED = 1.3
 """Times the share of the run before: for less no step is made between the pilot and the full run."""
 
 MOST_RAISE = 2.5
-"""Times the share of the run before: no step goes farther."""
+"""Largest ratio of a step's share of the amplitude to that of the previous run."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A share of the amplitude that is safe, its plan and what it would do."""
+    """A safe share of the amplitude, with its plan and the predicted motion."""
 
     share: float
     plan: Plan
@@ -136,22 +137,23 @@ class ChainSearch:
         samples = load_samples(folder.samples_path, len(config.joints))
         peaks = peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
         foreseen = found.foreseen.peaks
-        step = Step(
-            name, found.plan.segments[0].peak_torque, foreseen.median, foreseen.quantile, peaks, str(error or "")
-        )
+        torque = found.plan.segments[0].peak_goal * np.array([joint.torque_per_goal for joint in config.joints])
+        step = Step(name, torque, foreseen.median, foreseen.quantile, peaks, str(error or ""))
         self.steps.append(step)
         self.say(f"{name}: {100 * found.share:.0f} % of the path. {step} Least clearance foreseen: {found.foreseen}.")
         if error is not None:
             self.say(f"{name} ended early: {error} {self.torque}")
         elif not step.within:
-            self.say(f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
-                     "assumed.")
+            self.say(
+                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
+                "assumed."
+            )
 
 
 def identify_chain_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
 ) -> tuple[str, SettledResult]:
-    """From a description, limits and the rest pose to the result. Returns the sentence about torque and the result.
+    """Identify a spatial arm from its description, limits and rest pose. Returns the torque state and the result.
 
     Raises what a run raises, and NoSafeTorque.
     """
@@ -168,7 +170,9 @@ def identify_chain_in_steps(
                 break
             number = len(search.steps) + 1
             share = min(wanted.share, MOST_RAISE * last)
-            last = search.step(f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6))).share
+            last = search.step(
+                f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6))
+            ).share
         torque = _full(search)
         result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
     run.write_result(result)
@@ -195,22 +199,6 @@ def _full(search: ChainSearch) -> str:
 
 
 def step_config(config: Config) -> Config:
-    """One path, two periods, settled or not."""
+    """The configuration of a step: one path, played for two periods whether or not it settles."""
     update: dict[str, Any] = {"held_out": False, "max_settling_periods": 1, "periods": 1, "settle_within": 0.99}
     return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
-
-
-def unsafe(config: Config, foreseen: ChainPrediction) -> str:
-    """Why a motion is not safe; nothing where it is."""
-    peaks = foreseen.peaks
-    if not foreseen.is_clear:
-        return f"too near, {foreseen}"
-    touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
-    chance = peaks.limit_chance[:GUARDED]
-    if touched.any() or peaks.stop_chance > config.safety.limit_chance:
-        row, joint = np.unravel_index(int(np.argmax(touched + chance)), chance.shape)
-        return (
-            f"joint {config.joints[int(joint)].name!r} reaches {QUANTITIES[int(row)]} "
-            f"{peaks.quantile[row, joint]:.3g} of {peaks.limits[row, joint]:.3g} in 1 of 100 arms"
-        )
-    return ""

@@ -36,6 +36,12 @@ def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
     return np.asarray(np.array(friction) > _HELD * np.diag(stiffness))
 
 
+def falls_over(config: Config, belief: Belief) -> bool:
+    """Whether gravity drives the median arm away from its rest pose, to which only a person can bring it back."""
+    lowest = float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min())
+    return bool(config.arm.gravity) and lowest <= 0.0
+
+
 def with_stabiliser(config: Config, belief: Belief, springs: NDArray[np.bool_] | None = None) -> Config:
     """Add gains to a configuration that needs a stabiliser and has none.
 

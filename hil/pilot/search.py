@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
 from hil.dry_run.prediction import GUARDED, predict
-from hil.dry_run.waves import designed_plan, roomy_plan
+from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, prior_belief
-from hil.pilot.gains import with_stabiliser
+from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
 from hil.runs.run_folder import RunFolder
@@ -37,6 +37,16 @@ _PILOT_PERIOD_SHARE = 0.5
 _PILOT_SETTLING = 1
 _AFTER_LIMIT = 0.85
 """Cap on further torque, relative to the torque at which a limit was exceeded."""
+_MUCH_ROOM = 0.74
+"""Share of the position range used, of the joint that uses least, below which other waves are tried."""
+_OTHER_WAVES = 7
+"""How many at most: a wave with either sign of each joint, and all of these reversed in time."""
+_FALLING_RAISE = 1.35
+"""Largest ratio of torques of two runs of an arm that falls over when it is stopped."""
+_FALLING_SHARE = 0.85
+"""Share of the limits for an arm that falls over when it is stopped."""
+_LEAST_TORQUE = 0.05
+"""Torque that such an arm may get whatever it got before, as a share of what the current limit allows."""
 _INSIDE = 0.95
 """Share of the limits within which an arm is assumed to start that a stopped run left beyond them."""
 _MOST_RAISE = 1.6
@@ -111,8 +121,14 @@ class Search:
         was not. Raises NoSafeTorque if there was no run yet.
         """
         ensemble = self.belief.ensemble(self._farther)
+        cap = self.cap
+        if falls_over(config, self.belief):
+            share *= _FALLING_SHARE
+            if self.steps:
+                most = np.maximum(_FALLING_RAISE * self.steps[-1].peak_torque, _LEAST_TORQUE * most_torque(config))
+                cap = most if cap is None else np.minimum(cap, most)
         try:
-            return largest_amplitude(config, ensemble, share, plan, self.pose, self.cap)
+            return largest_amplitude(config, ensemble, share, plan, self.pose, cap)
         except NoSafeTorque:
             if not self.steps:
                 raise
@@ -179,7 +195,22 @@ class Search:
             found = self.amplitude(config, 1.0, self.waves(config) if config.stabiliser is not None else plan)
             if (found.peak_torque <= (_MORE if self._shares(found).min() > _FAIR else _LITTLE_MORE) * former).all():
                 break  # the updated belief allows hardly more torque
-        return config, found
+        return config, self._roomiest(config, found)
+
+    def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
+        """The amplitude that leaves least of the range unused, of `found` and of other waves if it leaves much.
+
+        A little more torque may throw some of the arms over: with other waves that comes later, or to the other side.
+        """
+        limited = (found.peak_torque >= _AT_LIMIT * most_torque(config)).all() or self.cap is not None
+        if limited or config.experiment.design == "optimal" or used_range(found).min() >= _MUCH_ROOM:
+            return found
+        for plan in roomy_plans(config, Physics.of(self.belief.middle), 1 + _OTHER_WAVES)[1:]:
+            other = self.amplitude(config, 1.0, plan)
+            found = max(found, other, key=lambda each: float(used_range(each).min()))
+            if used_range(found).min() >= _MUCH_ROOM:
+                break
+        return found
 
     def _play(self, config: Config, folder: str, name: str, found: Amplitude) -> None:
         played_config = with_torque(config, found.peak_torque)
@@ -204,7 +235,8 @@ class Search:
         shares = self._shares(found)
         full = found.peak_torque >= _AT_LIMIT * most_torque(config)
         capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= _AT_LIMIT * self.cap
-        return bool(((shares >= CERTAIN) | full | capped).all())
+        enough = CERTAIN * (_FALLING_SHARE if falls_over(config, self.belief) else 1.0)
+        return bool(((shares >= enough) | full | capped).all())
 
     @staticmethod
     def _shares(found: Amplitude) -> Array:
@@ -221,6 +253,14 @@ class Search:
             f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
             "check the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
         )
+
+
+def used_range(found: Amplitude) -> Array:
+    """Share of its position range that each joint of the median arm uses (joints,)."""
+    lowest, highest = found.prediction.median[:2]
+    low, high = found.prediction.limits[:2]
+    used: Array = (highest - lowest) / (high - low)
+    return used
 
 
 def pilot_config(config: Config) -> Config:

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.estimator.chain.excitation import Path, design_path
@@ -69,7 +70,7 @@ def make_chain_plan(config: Config) -> Plan:
 
 
 def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str, int], Path]) -> Plan:
-    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where they take too much torque."""
+    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where one takes too much."""
 
     def segment(config: Config, role: str, seed: int) -> PathSegment:
         return path_segment(config, thought, role, path(config, role, seed))
@@ -119,6 +120,21 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
     rest = np.array(config.arm.rest_pose)[:, None]
     held: Array = stiffness * (path.position - rest) + damping * path.velocity
     return held + share * thought.of(path)
+
+
+def check_clearance(config: Config, plan: Plan) -> None:
+    """Raise ConfigError where the wanted motion itself comes too near anything; of real arms a dry run tells."""
+    space = Space.of(config)
+    for segment in plan.segments:
+        assert isinstance(segment, PathSegment)
+        for motion, on_the_way in zip(segment.paths, (True, False, True), strict=True):
+            nearest = space.nearest(motion.position, on_the_way)
+            if nearest.room < 0.0:
+                raise ConfigError(
+                    f"{config.path}: the path leads too near: {nearest}, at least {1e3 * nearest.needed:.0f} mm are "
+                    "wanted. Move joint_path.centre, lower joint_path.swing, or correct [clearance] and the URDF's "
+                    "collision geometry; `hil dry-run` shows where."
+                )
 
 
 def _designed(known: KnownChain, config: Config, role: str, seed: int) -> Path:

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -30,6 +31,8 @@ _DASK: dict[str, Any] = {
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.system-monitor.log-length": 240,
 }
+
+_ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d{1,5}")
 
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
@@ -68,7 +71,8 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
 
 def _silence() -> None:
     """Keep Dask's own log off the terminal: whoever asked tells what went wrong."""
-    for name in [each for each in logging.root.manager.loggerDict if each.split(".")[0] == "distributed"]:
+    silent = ("distributed", "tornado", "asyncio")
+    for name in [each for each in logging.root.manager.loggerDict if each.split(".")[0] in silent]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
@@ -80,15 +84,13 @@ def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator
         with _local(count, memory) as cluster:
             yield cluster
     elif scheduler == "slurm":
-        try:
-            from dask_jobqueue import SLURMCluster
-        except ImportError as error:
-            raise MissingExtra("--scheduler slurm needs dask-jobqueue: pip install 'hil[slurm]'.") from error
-        prologue = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
-        with SLURMCluster(cores=1, processes=1, memory=memory, job_script_prologue=prologue) as cluster:
-            cluster.scale(count)
+        from hil.study.slurm import slurm_cluster
+
+        with slurm_cluster(count, memory, ONE_THREAD) as cluster:
             yield cluster
     else:
+        if not _ADDRESS.fullmatch(scheduler):
+            raise ConfigError(f'--scheduler {scheduler}: give its address, such as tcp://HOST:8786, or "slurm".')
         yield scheduler
 
 

@@ -9,7 +9,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -54,9 +54,24 @@ def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Data
         except OSError as error:
             raise RunFolderError(f"{out} cannot be written: {error.strerror}.") from error
         write_json(about, now)
-        yield Dataset(out / "rows")
+        dataset = Dataset(out / "rows")
+        try:
+            yield dataset
+        except BaseException:
+            if not resume and not dataset.done():
+                _discard(out)
+            raise
     finally:
         os.close(lock)
+
+
+def _discard(out: Path) -> None:
+    """A start that failed before the first row leaves nothing in the way of the next one."""
+    for name in ("study.toml", "about.json", ".lock"):
+        (out / name).unlink(missing_ok=True)
+    with suppress(OSError):  # what somebody else put there stays
+        (out / "rows").rmdir()
+        out.rmdir()
 
 
 def _hold(lock: int, out: Path) -> None:

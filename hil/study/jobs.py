@@ -153,7 +153,7 @@ def each(
     Args:
         function: as of `run_jobs`.
         items: its arguments.
-        count: workers; one per core unless given.
+        count: workers; one per core unless given; 0 computes in this process.
         scheduler: as of `hil.study.engine.workers`.
         tell: called with each result as it comes.
 
@@ -162,6 +162,11 @@ def each(
         ConfigError, MissingExtra, SchedulerLost: as of `workers` and `run_jobs`.
     """
     found: dict[int, Any] = {}
+    if count == 0:
+        for number, item in enumerate(items):
+            found[number] = function(item)
+            tell(found[number])
+        return list(found.values())
     with workers(EngineTable(), scheduler, count) as client:
         for ended in run_jobs(client, function, enumerate(items)):
             if ended.error is not None:

@@ -14,6 +14,7 @@ SHARED = (
     "machine",
     "pty",
     "population_arms",
+    "population_others",
     "client_calls",
 )
 SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if path.stem not in SHARED)

@@ -1,6 +1,7 @@
 """Dry runs of fake arms drawn from a prior, compared with the experiments; shared with benchmarks/dry_run.py."""
 
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from hil.experiment.run import run_experiment
 from hil.results.result import Result
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
+from hil.study.jobs import each
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
@@ -96,19 +98,21 @@ def run_on(config: Config, found: Amplitude, folder: Path) -> np.ndarray | None:
     return peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
 
 
-def prior_study(arms: int, seed: int = 1) -> dict[str, Any]:
-    """Play the largest safe experiment of one prior on arms drawn from it."""
+def prior_study(arms: int, seed: int = 1, jobs: int | None = 0) -> dict[str, Any]:
+    """Play the largest safe experiment of one prior on arms drawn from it; jobs: workers, 0 is this process."""
     config = study_config()
     found = largest_amplitude(config, prior_ensemble(config, ARMS_IN_PRIOR))
     quantile = found.prediction.quantile
     random = np.random.default_rng((seed, 21))
-    within = touched = 0
-    for _ in range(arms):
-        with fake_of(drawn_arm(config, random)) as (drawn, folder):
-            seen = run_on(drawn, found, folder)
-        touched += seen is None
-        within += seen is not None and is_within(config, seen, quantile)
-    return {"arms": arms, "within_quantile": within / arms, "limit_touched": touched}
+    peaks = each(partial(_seen_on, found), [drawn_arm(config, random) for _ in range(arms)], count=jobs)
+    within = sum(seen is not None and is_within(config, seen, quantile) for seen in peaks)
+    return {"arms": arms, "within_quantile": within / arms, "limit_touched": sum(seen is None for seen in peaks)}
+
+
+def _seen_on(found: Amplitude, config: Config) -> np.ndarray | None:
+    """Peaks of the experiment on the arm of this configuration; None if the guard stopped it."""
+    with fake_of(config) as (drawn, folder):
+        return run_on(drawn, found, folder)
 
 
 def is_within(config: Config, seen: np.ndarray, quantile: np.ndarray) -> bool:

@@ -23,7 +23,7 @@ def motion(data: RunData) -> Section | None:
                 f"Torque of {name}",
                 "time in the period [s]",
                 "torque [N m]",
-                (Series("", time, period.torque[joint], GREEN, "line"),),
+                (Series("commanded", time, period.torque[joint], GREEN),),
             ),
             f"{name}: commanded torque over the fitted period.",
         )

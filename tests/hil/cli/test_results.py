@@ -38,7 +38,7 @@ def test_a_run_that_is_not_whole_is_one_message_and_code_2(
 ) -> None:
     path = identified / "result.json"
     newer = json.dumps({**json.loads(path.read_text(encoding="utf-8")), "schema": 7})
-    for content, said in ((newer, "a newer version"), ('{"schema": 1,', "incomplete or damaged"), (None, "hil estimate")):
+    for content, said in ((newer, "a newer"), ('{"schema": 1,', "incomplete or damaged"), (None, "hil estimate")):
         path.unlink() if content is None else path.write_text(content, encoding="utf-8")
         assert hil(*command, identified) == 2
         printed = capsys.readouterr()

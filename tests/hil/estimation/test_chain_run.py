@@ -20,7 +20,7 @@ from hil.estimator.chain.dynamics import inverse_dynamics
 from hil.estimator.chain.geometry import Chain, parameter_names
 from hil.experiment.run import run_experiment
 from hil.export.formats import export
-from hil.plan.chain_plan import make_chain_plan, plan_of
+from hil.plan.chain_plan import make_chain_plan
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
@@ -144,10 +144,12 @@ def test_what_is_not_there_yet_is_refused(run: RunFolder) -> None:
             command()
 
 
-def test_no_real_arm_is_moved() -> None:
-    real = TEXT.replace('url = "fake://"', 'url = "/dev/ttyUSB0"')
-    with pytest.raises(ConfigError, match="not supported yet"):
-        plan_of(parse_config(real, FOUR))
+def test_a_path_that_leads_too_near_is_refused_on_a_real_port(tmp_path: Path) -> None:
+    text = TEXT.replace('url = "fake://"', 'url = "/dev/ttyUSB0"').replace('floor = "none"', "floor = 0.0")
+    config = parse_config(text, FOUR)
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(ConfigError, match=r"too near: .*floor"):
+        run_experiment(config, run, config.path, lambda _: None)
 
 
 def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
@@ -169,7 +171,7 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
         ('name = "joint2"', 'name = "elbow"', 'no joint "elbow"'),
         ("swing = [0.9", "swing = [3.9", "outside its position_limit"),
         ("speed = [4.8", "speed = [48.0", "velocity_limit"),
-        ("[experiment]", "[experiment]\npilot = true", "only planar arms support the pilot"),
+        ("[experiment]", "[experiment]\npilot = true", "the path is found"),
         ('friction = "stribeck"', 'friction = "auto"', "only for planar arms so far"),
         ('drive = "lag"', 'drive = "lag"\nripple = true', "model.ripple = true"),
         ("[stabiliser]", "[stabilizer]", "stabili"),

@@ -1,5 +1,6 @@
 """Belief updates from runs with and without motion, stabiliser gains, and when the search gives up."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,20 @@ def test_arms_that_do_not_come_back_are_given_gains_that_hold_them(
     assert np.mean(np.array(away) < 0.5) > 0.95
 
 
+def test_a_joint_that_friction_holds_against_its_weight_gets_a_spring_alone(config: Config) -> None:
+    belief = prior_belief(config, 48)
+    assert with_stabiliser(config, belief) is config
+    rough = dataclasses.replace(belief, coordinates=belief.coordinates.copy())
+    weight = median(belief, "gravity_2")
+    rough.coordinates[:, belief.names.index("coulomb_2")] = np.log(2.0 * weight)
+    held = with_stabiliser(config, rough)
+    assert held.stabiliser is not None
+    assert held.stabiliser.stiffness[0] == held.stabiliser.damping[0] == 0.0
+    assert held.stabiliser.stiffness[1] > weight
+    kept = with_stabiliser(config, belief, np.array([False, True])).stabiliser
+    assert kept is not None and kept.stiffness[0] == 0.0 < kept.stiffness[1], "what had a spring keeps it"
+
+
 def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tmp_path: Path) -> None:
     text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
     path = tmp_path / "held.toml"
@@ -95,7 +110,7 @@ def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tm
     held = load_config(path)
     said: list[str] = []
     with pytest.raises(
-        ExperimentError, match=r"Elbow did not move by 12 encoder steps\. Tried: Pilot .*; Pilot 2 "
+        ExperimentError, match=r"Elbow did not move by 26 encoder steps\. Tried: Pilot .*; Pilot 2 "
     ) as error:
         identify_in_steps(held, RunFolder.create(tmp_path / "run", held), path, lambda _: None, said.append)
     assert "current limits allow" in str(error.value) and "stronger servo" in str(error.value)

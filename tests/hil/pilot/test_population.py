@@ -14,11 +14,7 @@ def test_eight_arms_that_nobody_chose_their_torque_for(tmp_path: Path) -> None:
     measured = figures(outcomes)
     assert measured["failures"] == {}
     assert measured["beyond_limit"] == 0
-    # The back-EMF of a voltage-driven servo acts with a delay that the model does not include, which reduces the
-    # identified rotor inertia by a few percent (docs/benchmarks.md).
-    assert [
-        outcome.seed for outcome in outcomes if outcome.trust == "yes" and outcome.wrong and outcome.has_current
-    ] == []
+    assert [outcome.seed for outcome in outcomes if outcome.trust == "yes" and outcome.wrong] == []
     assert {outcome.name.split("x")[1].split()[0].split("+")[0] for outcome in outcomes} == {
         "XM430-W350",
         "XM540-W270",

@@ -38,15 +38,8 @@ def used_range(result: SettledResult) -> np.ndarray[tuple[int], np.dtype[np.floa
     return np.asarray((high - low) / np.ptp(limits, axis=1))
 
 
-def test_the_full_run_uses_most_of_the_shoulders_room(in_steps: Any) -> None:
-    assert used_range(in_steps[0])[0] >= 0.7
-
-
-@pytest.mark.xfail(
-    strict=True, reason="The elbow uses 66 % of its range: the search's belief leaves arms that go farther"
-)
-def test_the_full_run_uses_most_of_the_elbows_room(in_steps: Any) -> None:
-    assert used_range(in_steps[0])[1] >= 0.7
+def test_the_full_run_uses_most_of_the_room(in_steps: Any) -> None:
+    assert (used_range(in_steps[0]) >= 0.7).all()
 
 
 def test_the_full_run_beats_the_pilot(in_steps: Any) -> None:

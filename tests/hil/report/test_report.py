@@ -48,8 +48,8 @@ def test_words_come_first_then_every_section_and_figure(identified: Path) -> Non
     data = RunData.load(identified)
     made = sections(data)
     assert [section.key for section in made] == [
-        *("verdict", "parameters", "prediction", "friction", "spectra"),
-        *("correlation", "limits", "timing", "provenance"),
+        *("verdict", "parameters", "motion", "prediction", "friction", "spectra"),
+        *("correlation", "limits", "timing", "next", "provenance"),
     ]
     page = make_page(data)
     assert page.index("predicts a held-out motion") < page.index("<table")

@@ -185,3 +185,42 @@ def test_a_scheduler_that_dies_is_told_and_the_study_resumed(
     assert 100 <= len(kept) < 3000
     dataset = run_study(made, out, resume=True, worker_count=1)
     assert dataset.table().column("run").to_pylist() == list(range(3000))
+
+
+@pytest.fixture
+def queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A queue of one machine: an sbatch that starts each job at once, and the scancel that ends it."""
+    pytest.importorskip("dask_jobqueue", reason="pip install 'hil[slurm]'")
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    scripts = {
+        "sbatch": f'setsid bash "$1" > {tmp_path}/job.$$.out 2>&1 < /dev/null &\n'
+        f'echo $! > {tmp_path}/job.$$.pid\necho "Submitted batch job $$"\n',
+        "scancel": f'for n in "$@"; do kill -TERM -- -$(cat {tmp_path}/job.$n.pid); done\n',
+    }
+    for name, text in scripts.items():
+        (folder / name).write_text(f"#!/bin/bash\n{text}", encoding="utf-8")
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    return folder
+
+
+def test_workers_are_jobs_of_a_slurm_queue(tmp_path: Path, queue: Path) -> None:
+    dataset = run_study(study(tmp_path, EMPTY.format(runs=20)), tmp_path / "out", scheduler="slurm", worker_count=1)
+    assert dataset.table().column("run").to_pylist() == list(range(20))
+    jobs = list(tmp_path.glob("job.*.out"))
+    assert len(jobs) == 1
+    assert os.getpid() not in dataset.table().column("worker").to_pylist()
+
+
+def test_a_queue_that_refuses_is_quoted_and_nothing_is_left(tmp_path: Path, queue: Path) -> None:
+    (queue / "sbatch").write_text("#!/bin/bash\necho 'invalid partition: gpu' >&2\nexit 1\n", encoding="utf-8")
+    made, out = study(tmp_path, EMPTY.format(runs=20)), tmp_path / "out"
+    with pytest.raises(ConfigError, match="does not take the workers: invalid partition: gpu"):
+        run_study(made, out, scheduler="slurm", worker_count=1)
+    assert not out.exists()
+
+
+def test_an_address_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="give its address"):
+        run_study(study(tmp_path, EMPTY.format(runs=2)), tmp_path / "out", scheduler="somewhere")
