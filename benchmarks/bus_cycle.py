@@ -98,7 +98,7 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
     given = [config.joints[index % 2] for index in range(servos)]
     joints = [replace(joint.joint, id=index) for index, joint in enumerate(given, 1)]
     safety = config.safety.model_copy(update={"watchdog": PATIENCE_S + 0.5})
-    guard = Guard(config.model_copy(update={"joints": given, "safety": safety}))
+    guard = Guard(config.model_copy(update={"joints": given, "safety": safety}), [STILL_A] * servos)
     model = ModelWatch(config, [STILL_A] * 2) if servos == 2 else None
     port = open_port(name, BAUD)
     port.latency = PATIENCE_S

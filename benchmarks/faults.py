@@ -34,12 +34,24 @@ from hil.study import jobs as study_jobs
 
 INJECTIONS = 5000
 
+_CHEAPNESS = {20: 3, 100: 3, 400: 2, 1000: 1}
+"""Runs per processor time at each rate [Hz], roughly."""
+
 
 def campaign(
-    chosen: Sequence[Setting], injections: int, jobs: int, first: int = 0, period: float = PERIOD_S
+    chosen: Sequence[Setting],
+    injections: int,
+    jobs: int,
+    first: int = 0,
+    period: float = PERIOD_S,
+    *,
+    even: bool = True,
 ) -> tuple[list[Outcome], list[str]]:
-    """Distribute the injections among the settings; return their outcomes, and why settings could not be run."""
-    shares = [injections // len(chosen) + (number < injections % len(chosen)) for number in range(len(chosen))]
+    """Distribute the injections among the settings; return their outcomes, and why settings could not be run.
+
+    even: the same number for every setting; otherwise fewer for high rates, whose runs take longest.
+    """
+    shares = _shares([1 if even else _CHEAPNESS[each.rate] for each in chosen], injections)
     parts = [(setting, share, first, period) for setting, share in zip(chosen, shares, strict=True)]
     done = (
         study_jobs.each(in_this_process, parts, count=0)
@@ -47,6 +59,12 @@ def campaign(
         else study_jobs.each(in_own_process, parts, count=jobs)
     )
     return [outcome for part, _ in done for outcome in part], [why for _, why in done if why]
+
+
+def _shares(weights: Sequence[int], total: int) -> list[int]:
+    """Divide `total` in proportion to the weights."""
+    ends = [round(total * sum(weights[: number + 1]) / sum(weights)) for number in range(len(weights))]
+    return [end - start for start, end in zip([0, *ends], ends, strict=False)]
 
 
 def figures(outcomes: Iterable[Outcome]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ configured. The test runs twice; after installation, the first run compiles Pyth
 lines             of the test, imports of the driver aside
 install_seconds   a fresh environment with hil and pytest: what the index and the disk allow
 first_seconds     the first run of pytest
-seconds           both together: what somebody waits until the first green test; wheel_seconds: what building hil's wheel
+seconds           both together: the wait until the first green test; wheel_seconds: what building the wheel
                   took, which whoever downloads it does not wait for
 again_seconds     the second run of pytest
 passed            whether the test was green
@@ -45,7 +45,7 @@ def source(kind: str, folder: Path) -> tuple[str, float]:
     if kind == "clone":
         return str(ROOT), 0.0
     if kind == "git":
-        return f"hil @ git+file://{ROOT}", 0.0
+        return f"git+file://{ROOT}", 0.0
     seconds, done = timed(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT, cwd=folder)
     if done.returncode:
         sys.exit(done.stderr)

@@ -278,7 +278,7 @@ class ServoBus:
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
         )
 
-    def exchange(self, goals: Sequence[float]) -> State:
+    def exchange(self, goals: Sequence[float], *, hurried: bool = False) -> State:
         """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
         A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
@@ -288,7 +288,7 @@ class ServoBus:
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
         ticks = self._converter.ticks(goals)
         exchange = self._exchange or self.prepared
-        reply = exchange.cycle(ticks)
+        reply = exchange.cycle(ticks, hurried=hurried)
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:

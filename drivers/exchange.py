@@ -100,7 +100,8 @@ class Exchange:
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self._slow_spans = len(spans) - 1
         least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
-        self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
+        self._shortest_timeouts = [self._timeout(read, return_delay) for read in self._reads]
+        self._timeouts = [max(shortest, least) for shortest in self._shortest_timeouts]
         self._soonest = [0.5 * port.wire_time(self._bytes(read)) for read in self._reads]
         self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
@@ -129,7 +130,7 @@ class Exchange:
         if self._status_every < _NEVER:
             self._until_status = min(self._until_status, 1)
 
-    def cycle(self, goal_ticks: Sequence[int]) -> Reply:
+    def cycle(self, goal_ticks: Sequence[int], *, hurried: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
 
         Raises PortLost; ValueError for the wrong number of goals or a goal that does not fit into two bytes.
@@ -146,7 +147,7 @@ class Exchange:
                 goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
-        timeout = self._timeouts[span]
+        timeout = (self._shortest_timeouts if hurried else self._timeouts)[span]
         before = self._now()
         if self._echoes:
             received = self._ask_behind_echo(goals, read, timeout, before)

@@ -54,6 +54,8 @@ class State(NamedTuple):
     error: the ERR bytes, 0 if missing.
     missing: whether the servo returned no values.
     slow, status: values that are only read in some cycles, otherwise None.
+    apart: for each joint, the angles of its further servos minus the first's [rad], NaN if one did not reply; None on
+    an arm with one servo per joint. Horns are mounted at any angle, so only a change means something.
     """
 
     time_before_write: float
@@ -66,6 +68,7 @@ class State(NamedTuple):
     missing: tuple[bool, ...]
     slow: Slow | None = None
     status: tuple[Status | None, ...] | None = None
+    apart: tuple[tuple[float, ...], ...] | None = None
 
 
 _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
@@ -212,7 +215,8 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
     of: the joint index of each servo, in ascending order. count: number of joints.
     Goals and currents are summed; angle, velocity and clock are the first servo's; of the voltages the lowest is taken,
-    of the temperatures the highest; an error or a missing reply of one servo applies to its joint.
+    of the temperatures the highest; an error or a missing reply of one servo applies to its joint. `apart` tells how
+    the servos of one joint disagree.
     """
     servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]
     first = [places[0] for places in servos]
@@ -222,6 +226,9 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
         current=tuple([sum(state.current[place] for place in places) for places in servos]),
         velocity=tuple([state.velocity[place] for place in first]),
         position=tuple([state.position[place] for place in first]),
+        apart=tuple(
+            [tuple([state.position[place] - state.position[places[0]] for place in places[1:]]) for places in servos]
+        ),
         error=tuple([_joined(state.error[place] for place in places) for places in servos]),
         missing=tuple([any(state.missing[place] for place in places) for places in servos]),
         slow=slow

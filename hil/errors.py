@@ -42,6 +42,7 @@ class Cause(Enum):
     FROZEN = "position and velocity disagree"
     UNEXPECTED = "motion unlike the model"
     UNLIKE_BEFORE = "motion unlike the period before"
+    APART = "servos of one joint disagree"
     WRONG_SIGN = "wrong sign of response"
     EARLY_MOTION = "motion before the start"
     TEMPERATURE = "temperature"

@@ -48,7 +48,7 @@ TO_BE_SEEN = (
     "is beyond a limit",
     "is not where it would be",
 )
-"""What nobody can know before it shows in what the program is told."""
+"""Deviations that no program can detect before they show in the replies it receives."""
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
 _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229

@@ -28,7 +28,7 @@ class Killed(BaseException):
 
 
 def prepare(attack: Attack, port: "Middle") -> None:
-    """What has to be known before the program begins."""
+    """Prepare the plant for attacks that must be set up before the program starts."""
     if attack.kind in ON_MOTORS:
         witness = port.bus.plant
         assert isinstance(witness, Witness)
@@ -73,9 +73,9 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
                 goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
                 servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
         case Kind.WATCHDOG_OFF:
-            return _change(servo, "Bus Watchdog", 0)
+            _change(servo, "Bus Watchdog", 0)
         case Kind.WATCHDOG_LONG:
-            return _change(servo, "Bus Watchdog", 127)
+            return _change(servo, "Bus Watchdog", 127, 0)
         case Kind.LOWERED_LIMIT if "Current Limit" in servo.memory:
             return _change(servo, "Current Limit", round(attack.amount * servo.value("Current Limit")))
         case Kind.RAISED_LIMIT if "Current Limit" in servo.memory:
@@ -95,9 +95,12 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
     return None
 
 
-def _change(servo: EmulatedServo, register: str, value: int) -> Undo:
-    """Another program writes a register: the program under test is not to be blamed where that value stays."""
-    before = servo.value(register)
+def _change(servo: EmulatedServo, register: str, value: int, before: int | None = None) -> Undo:
+    """Another program writes a register: the program under test is not to be blamed where that value stays.
+
+    before: what it then becomes again, by default what it was.
+    """
+    before = servo.value(register) if before is None else before
     servo.memory.set(register, value)
     servo._derive()
 

@@ -50,6 +50,7 @@ _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in vari
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
 _MOST_WEIGHT = 4.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
+_OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at slow rates
 _WARM_S = 3 * FILTER_S
 _LONGEST_GAP = 3.0  # number of intervals between two samples after which the observer restarts
 
@@ -203,7 +204,9 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
         return False
     single[_HELD + j] += dt * min(share, _MOST_WEIGHT)
     single[_SAMPLES + j] += 1.0
-    return bool(single[_HELD + j] >= HOLD_S and single[_SAMPLES + j] >= 2.0)
+    # Where samples are far apart, a sudden fault may show in a single one.
+    enough = single[_SAMPLES + j] >= 2.0 or (dt >= HOLD_S and share >= _OBVIOUS)
+    return bool(single[_HELD + j] >= HOLD_S and enough)
 
 
 def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> None:

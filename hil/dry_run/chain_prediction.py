@@ -23,7 +23,7 @@ Tell = Callable[[int, int], None]
 PERIODS = 2
 SHOWN = 30
 LOOKED_AT_HZ = 100.0
-"""Poses a second whose clearance is computed."""
+"""Rate at which the clearance of a motion is computed [Hz]."""
 
 RAN_AWAY = 1e3
 """Times its limit, which stands for the peaks of an arm that runs away."""

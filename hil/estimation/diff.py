@@ -7,13 +7,16 @@ noise only, and two runs of an arm with some unmodelled friction differ by a lit
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from hil.arm_model import ArmModel
 from hil.errors import ResultError
-from hil.model_file import read_model
+from hil.estimation.friction_rows import FrictionRow, friction_rows
+from hil.model_file import read_model, read_result
+from hil.results.parts import Covariance
 
 FALSE_ALARMS = 0.05
 LEAST_SHARE = 0.01
@@ -72,7 +75,16 @@ def diff_runs(
     counts = [len(model.joints) for model in models]
     if counts[0] != counts[1]:
         raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
-    return diff_models(*models, str(before), str(after), false_alarms, least_share)
+    rows = friction_rows(models, (_covariance(before), _covariance(after)))
+    return diff_models(*models, str(before), str(after), false_alarms, least_share, rows)
+
+
+def _covariance(path: Path) -> Covariance | None:
+    """Of a run's result; None for a model that was exported without one."""
+    try:
+        return read_result(path).covariance
+    except ResultError:
+        return None
 
 
 def diff_models(
@@ -82,10 +94,12 @@ def diff_models(
     name_after: str = "after",
     false_alarms: float = FALSE_ALARMS,
     least_share: float = LEAST_SHARE,
+    friction: Sequence[FrictionRow] = (),
 ) -> Difference:
     """Compare two models of one arm parameter by parameter, in the order of the first."""
     common = [name for name in before.values if name in after.values and not name.startswith("ripple_cycles")]
     z = {name: _z(before, after, name) for name in common}
+    z |= {row.name: _deviation(row.value, row.std) for row in friction}
     p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()}
     significant = _holm(p, false_alarms)
     changes = [
@@ -99,6 +113,16 @@ def diff_models(
         )
         for name in common
     ]
+    changes += [
+        Change(
+            row.name,
+            *(row.value[0], row.std[0], row.value[1], row.std[1]),
+            z[row.name],
+            p[row.name],
+            row.name in significant and abs(row.value[1] - row.value[0]) > least_share * max(map(abs, row.value)),
+        )
+        for row in friction
+    ]
     return Difference(
         name_before,
         name_after,
@@ -109,8 +133,13 @@ def diff_models(
 
 
 def _z(before: ArmModel, after: ArmModel, name: str) -> float:
-    difference = after.values[name] - before.values[name]
-    std = math.hypot(before.stds[name], after.stds[name])
+    return _deviation((before.values[name], after.values[name]), (before.stds[name], after.stds[name]))
+
+
+def _deviation(value: tuple[float, float], stds: tuple[float, float]) -> float:
+    """Difference of two values in their combined standard errors."""
+    difference = value[1] - value[0]
+    std = math.hypot(*stds)
     if not math.isfinite(std):
         return 0.0
     if std == 0.0:

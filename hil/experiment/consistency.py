@@ -7,11 +7,17 @@ velocity must equal the change in position. The difference,
 
 is tracked with an exponential memory of `MEMORY_S`. Rounding and encoder noise do not accumulate in it, and a velocity
 that lags by tau, because the servo filters it, contributes at most tau times the change of velocity. The tolerance
-allows for a lag of `LAG_S`, a scale error of `SCALE` and the interval between samples.
+allows for a lag of `LAG_S`, a scale error of `SCALE` and the interval between samples. Once the joint has moved fast
+for `LEARNT_S`, it allows for twice the lag seen so far and `MORE_LAG_S`, if that is less: a lag does not grow.
 """
 
 MEMORY_S = 0.3
 LAG_S = 0.03
+LEARNT_S = 1.5
+MORE_LAG_S = 0.008
+_FAST_RAD_S = 2.0
+"""Range of velocities within the memory from which on it shows how large the lag is."""
+
 SCALE = 0.06
 UNSURE_RAD = 0.02
 """Allowance [rad] for rounding, encoder noise, and a velocity bias of half a tick over MEMORY_S."""
@@ -32,11 +38,14 @@ class Consistency:
         self._apart = 0.0
         self._open = 0.0
         self._highest = self._lowest = 0.0
+        self._lag_seen = 0.0
+        self._learnt_for = 0.0
+        self._lag = LAG_S
 
     def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
         """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
 
-        unsure: by how much longer than usual its exchange took [s]: when in it the servo measured is not known.
+        unsure: excess duration of its exchange [s], in which the time of the measurement is not known.
         """
         former, self._position = self._position, position
         before, self._velocity = self._velocity, velocity
@@ -53,8 +62,19 @@ class Consistency:
         highest, lowest = kept * self._highest + (1 - kept) * velocity, kept * self._lowest + (1 - kept) * velocity
         self._highest = highest = velocity if velocity > highest else highest
         self._lowest = lowest = velocity if velocity < lowest else lowest
-        allowed = UNSURE_RAD + LAG_S * (highest - lowest) + self._open
-        return not -allowed <= self._apart <= allowed
+        span = highest - lowest
+        allowed = UNSURE_RAD + self._lag * span + self._open
+        if not -allowed <= self._apart <= allowed:
+            return True
+        if span > _FAST_RAD_S and not unsure > seconds:
+            self._learn_lag(abs(self._apart) / span, seconds)
+        return False
+
+    def _learn_lag(self, lag: float, seconds: float) -> None:
+        self._lag_seen = max(self._lag_seen, lag)
+        self._learnt_for += seconds
+        if self._learnt_for >= LEARNT_S:
+            self._lag = min(LAG_S, 2.0 * self._lag_seen + MORE_LAG_S)
 
     def lost(self) -> None:
         """Restart with the next reply, because one is missing."""

@@ -16,6 +16,7 @@ from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
+from hil.experiment.apart import Apart
 from hil.experiment.consistency import Consistency
 from hil.experiment.following import Following, Unfollowed
 from hil.experiment.status_check import StatusCheck
@@ -82,6 +83,7 @@ class Guard:
     def __init__(self, config: Config, planned: Sequence[float] | None = None, *, left_by_a_run: bool = False) -> None:
         rate = config.experiment.rate
         safety = config.safety
+        self._seconds = [[second.id for second in joint.joint.seconds] for joint in config.joints]
         self._names = [str(joint.joint) for joint in config.joints]
         self._limits = [
             _Limits(
@@ -90,7 +92,7 @@ class Guard:
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit,
                 joint.goal_limit,
-                joint.torque_per_goal / rate,
+                joint.torque_per_goal,
                 -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
             for joint in config.joints
@@ -106,6 +108,7 @@ class Guard:
             None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
             for joint, peak in zip(config.joints, planned or _planned(config), strict=True)
         ]
+        self._apart = Apart()
         self._consistency = [Consistency() for _ in config.joints]
         self._status = StatusCheck(config)
         self._former_goal = [0.0] * count
@@ -113,6 +116,7 @@ class Guard:
         self._seen_at = [0.0] * count
         self._missing = [0] * count
         self._work = [0.0] * count
+        self._held_goal = [0.0] * count
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
@@ -197,6 +201,8 @@ class Guard:
                 self._count_missing(index, state.error[index], now)
             else:
                 self._look_at_joint(index, limits, state, now)
+        if state.apart is not None and (turned := self._apart.look(state.apart)) is not None:
+            self._not_together(*turned)
         if state.slow is not None:
             self._look_slow(state.slow)
             self._look_at_clocks(state.slow, now)
@@ -226,6 +232,7 @@ class Guard:
             self._too_fast(index, velocity)
         self._position[index] = position
         self._seen_at[index] = now
+        missed = self._missing[index]
         self._missing[index] = 0
         following = self._following[index]
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
@@ -235,7 +242,11 @@ class Guard:
             consistency.lost()
         if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
-        work = self._work[index] = self._work[index] + work_scale * goal * velocity
+        held, self._held_goal[index] = self._held_goal[index], goal
+        # What the goal before has done until now; where it was another one meanwhile, nothing is known.
+        work = self._work[index]
+        if former is not None and elapsed < LONG_GAP * interval and not missed:
+            work = self._work[index] = work + work_scale * held * (position - former)
         if work < work_least and self._passive:
             self._judge_work(index)
 
@@ -321,6 +332,15 @@ class Guard:
             f"carries {off.carried:.3f} where {off.goal:.3f} is commanded, for {1e3 * off.seconds:.0f} ms. Its torque "
             "is off, it was rebooted, its watchdog acted, or it cannot deliver this much at its speed and supply "
             "voltage (safety.follow_share).",
+        )
+
+    def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:
+        ids = self._seconds[index]
+        self._stop(
+            index,
+            Cause.APART,
+            f"has servos that no longer turn together: ID {ids[servo]} has turned {turned:+.3f} rad relative to the "
+            "first one since the start. Its horn slips, a screw is loose, or one of their encoders is wrong.",
         )
 
     def _disagree(self, index: int, position: float, velocity: float) -> NoReturn:

@@ -50,7 +50,7 @@ class Lowering:
         self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compiled
 
     def lies(self, state: State) -> bool:
-        """Whether the arm is in its rest pose anyway."""
+        """Whether the arm already lies in its rest pose."""
         away = np.abs(np.array(state.position) - self._rest)
         return bool(away.max() < LYING_RAD)
 

@@ -32,8 +32,11 @@ _WAY_POSES = 40
 
 @dataclass(frozen=True)
 class Paths:
-    """identify: optimised; held_out: about the same centre with random phases. plain: worst relative standard errors
-    of random paths within the same limits."""
+    """The designed paths.
+
+    identify: optimised; held_out: around the same centre, with random phases; plain: worst relative standard errors of
+    random paths within the same limits.
+    """
 
     config: Config
     designer: PathDesigner
@@ -42,7 +45,7 @@ class Paths:
 
     @classmethod
     def of(cls, config: Config, thought: ChainTorque) -> "Paths":
-        """Raises NoSafeTorque where no path is safe, ConfigError, ArmFileError."""
+        """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError."""
         known, space = known_chain(config), Space.of(config)
         most, rest = TORQUE_SHARE * torque_limits(config), np.array(config.arm.rest_pose)
         low, high = np.array([joint.position_limit for joint in config.joints]).T

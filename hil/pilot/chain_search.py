@@ -43,12 +43,12 @@ RAISED = 1.3
 """Times the share of the run before: for less no step is made between the pilot and the full run."""
 
 MOST_RAISE = 2.5
-"""Times the share of the run before: no step goes farther."""
+"""Largest ratio of a step's share of the amplitude to that of the previous run."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A share of the amplitude that is safe, its plan and what it would do."""
+    """A safe share of the amplitude, with its plan and the predicted motion."""
 
     share: float
     plan: Plan
@@ -153,7 +153,7 @@ class ChainSearch:
 def identify_chain_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
 ) -> tuple[str, SettledResult]:
-    """From a description, limits and the rest pose to the result. Returns the sentence about torque and the result.
+    """Identify a spatial arm from its description, limits and rest pose. Returns the torque state and the result.
 
     Raises what a run raises, and NoSafeTorque.
     """
@@ -199,6 +199,6 @@ def _full(search: ChainSearch) -> str:
 
 
 def step_config(config: Config) -> Config:
-    """One path, two periods, settled or not."""
+    """The configuration of a step: one path, played for two periods whether or not it settles."""
     update: dict[str, Any] = {"held_out": False, "max_settling_periods": 1, "periods": 1, "settle_within": 0.99}
     return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})

@@ -137,3 +137,49 @@
 
   document.querySelectorAll("svg[data-x]").forEach(enliven);
 })();
+
+// The arm: played in real time, or placed by the slider or by dragging across it.
+for (const figure of document.querySelectorAll("figure.motion")) {
+  const angles = JSON.parse(figure.dataset.angles), lengths = JSON.parse(figure.dataset.lengths);
+  const interval = Number(figure.dataset.interval), frames = angles[0].length;
+  const svg = figure.querySelector("svg"), links = figure.querySelector(".links"), joints = figure.querySelector(".joints");
+  const [button, slider, shown] = ["button", "input", "output"].map((name) => figure.querySelector(name));
+  const scale = 100 / lengths.reduce((sum, length) => sum + length, 0);
+  let started = null;
+
+  function show(frame) {
+    let x = 0, y = 0, angle = 0;
+    const points = [[0, 0]];
+    lengths.forEach((length, joint) => {
+      angle += angles[joint][frame];
+      x += scale * length * Math.cos(angle);
+      y -= scale * length * Math.sin(angle);
+      points.push([x, y]);
+    });
+    links.setAttribute("points", points.map((point) => point.map((one) => one.toFixed(1)).join(",")).join(" "));
+    joints.innerHTML = points.slice(0, -1).map(([cx, cy]) => `<circle cx="${cx.toFixed(1)}" cy="${cy.toFixed(1)}" r="5"/>`).join("");
+    slider.value = frame;
+    shown.textContent = `${(frame * interval).toFixed(2)} s`;
+  }
+  function play(now) {
+    if (started === null) return;
+    show(Math.floor((now - started) / 1000 / interval) % frames);
+    requestAnimationFrame(play);
+  }
+  function stop() { started = null; button.textContent = "Play"; }
+  button.addEventListener("click", () => {
+    if (started !== null) { stop(); return; }
+    started = performance.now() - 1000 * interval * Number(slider.value);
+    button.textContent = "Pause";
+    requestAnimationFrame(play);
+  });
+  slider.addEventListener("input", () => { stop(); show(Number(slider.value)); });
+  svg.addEventListener("pointermove", (event) => {
+    if (!event.buttons) return;
+    stop();
+    const box = svg.getBoundingClientRect();
+    const part = Math.min(1, Math.max(0, (event.clientX - box.left) / box.width));
+    show(Math.round(part * (frames - 1)));
+  });
+  show(0);
+}

@@ -16,6 +16,7 @@ from hil.report.section import Section
 from hil.report.sections.correlation import correlation
 from hil.report.sections.friction import friction
 from hil.report.sections.limits import limits
+from hil.report.sections.motion import motion, next_commands
 from hil.report.sections.parameters import parameters
 from hil.report.sections.prediction import prediction
 from hil.report.sections.provenance import provenance
@@ -30,6 +31,7 @@ FILE_NAME = "report.html"
 SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     verdict,
     parameters,
+    motion,
     prediction,
     friction,
     spectra,
@@ -38,6 +40,7 @@ SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     stabiliser,
     steps,
     timing,
+    next_commands,
     provenance,
 )
 

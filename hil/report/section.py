@@ -37,6 +37,19 @@ class Folded:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """A planar arm to be played. interval: between frames [s]; angles: of each joint, frame by frame [rad].
+
+    lengths: of the links, in any unit; hangs: whether gravity acts in the plane, downwards.
+    """
+
+    interval: float
+    angles: tuple[tuple[float, ...], ...]
+    lengths: tuple[float, ...]
+    hangs: bool
+
+
+@dataclass(frozen=True)
 class Section:
     """One section: text, tables, figures, then folded text. `tone` sets the colour of the verdict."""
 
@@ -48,3 +61,4 @@ class Section:
     folded: tuple[Folded, ...] = ()
     bullets: tuple[str, ...] = field(default=())
     tone: str = ""
+    motion: Motion | None = None

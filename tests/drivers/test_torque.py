@@ -1,5 +1,6 @@
 """Switching torque on and off, as seen by the emulated servos."""
 
+import contextlib
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -171,3 +172,64 @@ def test_an_interrupt_before_the_shield_is_up_is_met_by_a_second_attempt(
         with pytest.raises(KeyboardInterrupt), bus.torque(watchdog=0.1):
             pass
         assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
+def refuse_everything(bus: ServoBus) -> None:
+    fake_bus(bus).faults.add(Fault(kind=FaultKind.STATUS_ERROR, at=fake_bus(bus).time, servo=2))
+
+
+def take_another_id(bus: ServoBus) -> None:
+    servo = servos(bus)[2]
+    servo.memory.set("ID", 77)
+    servo._derive()
+
+
+@pytest.mark.parametrize("happens", [refuse_everything, take_another_id])
+def test_a_servo_that_hears_and_does_not_obey_is_stopped_by_its_watchdog(
+    fake_config: Make, happens: Callable[[ServoBus], None]
+) -> None:
+    """Every question feeds its watchdog: whoever did not answer the last exchange is left in silence."""
+    with ServoBus.open(fake_config()) as bus:
+        with contextlib.suppress(TorqueNotOff), bus.torque(watchdog=0.08):
+            bus.exchange([0.3, 0.3])
+            driven = servos(bus)
+            happens(bus)
+            bus.exchange([0.3, 0.3])
+            begun = bus.port.clock.now()
+            disobedient = driven[2]
+            trip = disobedient.trip_watchdog
+            when: list[float] = []
+
+            def tripping() -> None:
+                when.append(disobedient.heard_at + disobedient.watchdog_s - begun)
+                trip()
+
+            disobedient.trip_watchdog = tripping
+        assert when and when[0] <= 0.08 + 0.015
+        assert not driven[1].torque_enabled and disobedient.watchdog_tripped
+        assert bus.torque_off_report is not None
+        assert [joint.id for joint, _ in bus.torque_off_report.unconfirmed] == [2]
+
+
+def test_torque_off_that_meets_a_reply_on_the_wire_is_sent_again(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        with contextlib.suppress(TorqueNotOff), bus.torque(watchdog=0.08):
+            bus.exchange([0.3, 0.3])
+            driven = servos(bus)
+            fake_bus(bus).faults.add(Fault(kind=FaultKind.LOST_REPLY, at=fake_bus(bus).time))
+            bus.exchange([0.3, 0.3])
+            begun = bus.port.clock.now()
+            seen = [written(bus, servo_id, pytest.MonkeyPatch()) for servo_id in (1, 2)]
+            lost = Fault(kind=FaultKind.LOST_INSTRUCTION, at=fake_bus(bus).time, duration=2e-3)
+            fake_bus(bus).faults.add(lost)
+        for each in seen:
+            assert next(time for address, value, time in each if (address, value) == (TORQUE, 0)) - begun < 0.01
+        assert not any(servo.torque_enabled for servo in driven.values())
+
+
+def test_all_servos_confirmed_takes_no_silence(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        with bus.torque(watchdog=0.08):
+            bus.exchange([0.3, 0.3])
+            begun = bus.port.clock.now()
+        assert bus.port.clock.now() - begun < 0.03

@@ -13,7 +13,7 @@ TITLES = {
 
 
 def verdict(data: RunData) -> Section:
-    """The section, always present."""
+    """Return the section, which every report has."""
     judged = data.result.verdict
     tone, title = TITLES[judged.trust]
     warnings = [f"Warning: {warning}" for warning in data.result.warnings]

@@ -9,6 +9,8 @@ import pytest
 from hil.arm_model import ArmModel, JointFacts
 from hil.errors import ResultError
 from hil.estimation.diff import diff_models, diff_runs
+from hil.estimation.friction_rows import friction_rows
+from hil.results.parts import Covariance
 
 FACTS = JointFacts("shoulder", "XM430-W350", "current", 1.8, 0.1, 1.2, (-3.0, 0.5), 10.0)
 VALUES = {
@@ -64,3 +66,47 @@ def test_arms_of_other_joint_count_are_refused(tmp_path: object, monkeypatch: py
     monkeypatch.setattr("hil.estimation.diff.read_model", lambda path: one if "one" in str(path) else MODEL)
     with pytest.raises(ResultError, match="one has 1 joints and two 2"):
         diff_runs("one", "two")  # type: ignore[arg-type]
+
+
+def friction_of(level: float, rise: float, velocity: float, speed: np.ndarray) -> np.ndarray:
+    return np.asarray(level * (1.0 + rise * np.exp(-((speed / velocity) ** 2))))
+
+
+def confounded() -> np.ndarray:
+    """Covariance of Coulomb level, rise and its velocity, seen together at speeds that do not leave the rise."""
+    at = np.array([0.055, 0.4, 0.3])
+    speed = np.linspace(0.02, 0.25, 40)
+    steps = 1e-6 * at
+    slopes = [
+        (friction_of(*(at + step * one), speed) - friction_of(*at, speed)) / step
+        for step, one in zip(steps, np.eye(3), strict=True)
+    ]
+    return np.asarray(np.linalg.inv(np.array(slopes) @ np.array(slopes).T) * 2.5e-4**2)
+
+
+def test_a_rise_that_no_parameter_shows_alone_is_found_in_the_curve() -> None:
+    names = ("coulomb_1", "stribeck_rise_1", "stribeck_velocity_1")
+    covariance = confounded()
+    std = np.sqrt(np.diag(covariance))
+    assert std[1] > 0.03, "a rise of 10 % is hardly a standard error"
+    kept = Covariance(names, tuple(map(tuple, covariance.tolist())))
+    stds = {**dict.fromkeys(VALUES, 1e-6), **dict(zip(names, std.tolist(), strict=True))}
+    root = np.linalg.cholesky(covariance)
+    rng = np.random.default_rng(3)
+
+    def changed(factor: float) -> tuple[bool, bool]:
+        """Whether the curve, and whether a parameter, shows a change."""
+        drawn_models = []
+        for rise in (0.4, 0.4 * factor):
+            values = np.array([0.055, rise, 0.3]) + root @ rng.standard_normal(3)
+            own = dict(zip(names, values.tolist(), strict=True))
+            drawn_models.append(replace(MODEL, values={**VALUES, **own}, stds=stds))
+        pair = (drawn_models[0], drawn_models[1])
+        found = {change.name for change in diff_models(*pair, friction=friction_rows(pair, (kept, kept))).changed}
+        in_curve = any(name.startswith("friction_1 at") for name in found)
+        return in_curve, bool(found & set(names))
+
+    rises = [changed(1.1) for _ in range(100)]
+    assert sum(curve for curve, _ in rises) >= 95
+    assert sum(parameter for _, parameter in rises) <= 20
+    assert sum(any(changed(1.0)) for _ in range(100)) <= 5

@@ -1,7 +1,7 @@
 """The guard alone: each cause of a stop, and the computing time of a check."""
 
 from collections.abc import Callable
-from math import inf, nan
+from math import inf, nan, sin, tau
 from timeit import timeit
 from typing import Any
 
@@ -13,6 +13,7 @@ from hil.errors import Cause, SafetyStop
 from hil.experiment.guard import Guard
 
 Arm = Callable[..., Config]
+AT_20_HZ = ("rate = 400.0", "rate = 20.0"), ("band = [0.5, 6.0]", "band = [0.5, 4.0]")
 STILL = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (-1.57, 0.0), (0, 0), (False, False))
 MISSING = STILL._replace(current=(0.0, nan), velocity=(0.0, nan), position=(-1.57, nan), missing=(False, True))
 NOTHING_SLOW = Slow((nan, nan), (nan, nan), (nan, nan))
@@ -79,7 +80,7 @@ def at(number: int, state: State) -> State:
 
 def test_a_motor_that_only_takes_work_out_turns_the_wrong_way(arm: Arm) -> None:
     braking = STILL._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0))
-    falling = [at(n, braking._replace(position=(-1.57 - 0.0075 * n, 0.0))) for n in range(12)]
+    falling = [at(n, braking._replace(position=(-1.57 - 0.0075 * n, 0.0))) for n in range(13)]
     assert look(Guard(arm()), *falling) is Cause.WRONG_SIGN
 
 
@@ -113,7 +114,30 @@ def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> No
     guard = Guard(arm())
     for state in alone[:11]:
         guard.look(state)
-    assert look(guard, alone[11]._replace(goal_current=(0.45, 0.0), current=(0.45, 0.0))) is Cause.WRONG_SIGN
+    guard.look(alone[11]._replace(goal_current=(0.45, 0.0), current=(0.45, 0.0)))
+    assert look(guard, alone[12]) is Cause.WRONG_SIGN
+
+
+@pytest.mark.parametrize("hertz", [1.0, 4.0])
+def test_work_is_what_a_goal_has_done_until_the_next_one(arm: Arm, hertz: float) -> None:
+    """At 20 Hz half a period passes in two samples: a motor that drives an arm forth and back only puts work in."""
+    guard = Guard(arm(*AT_20_HZ))
+    position, velocity = -1.57, 0.0
+    for n in range(200):
+        goal = 0.2 * sin(tau * hertz * n / 20)
+        told = STILL._replace(position=(position, 0.0), velocity=(velocity, 0.0), time_before_write=n / 20)
+        guard.look(told._replace(time_after_read=n / 20 + 1e-3, goal_current=(goal, 0.0), current=(goal, 0.0)))
+        velocity = 2.0 * goal  # much friction: it follows its motor at once
+        position += velocity / 20
+
+
+def test_a_refusal_needs_no_second_one_at_a_slow_rate(arm: Arm) -> None:
+    slow = arm(*AT_20_HZ)
+    refused = at(20, MISSING._replace(error=(0, 1)))
+    assert look(Guard(slow), STILL, refused) is Cause.MISSING
+    guard = Guard(slow)
+    for state in (STILL, at(20, MISSING._replace(error=(0, 3))), at(40, STILL), at(60, MISSING)):
+        guard.look(state)  # a damaged question, and a lost reply
 
 
 def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:

@@ -30,10 +30,17 @@ addEventListener("load", () => {
   seen.seconds = performance.now() / 1000;
   const loaded = performance.getEntriesByType("resource").map((entry) => entry.name);
   seen.requests = loaded.filter((name) => !name.startsWith("data:"));
-  const visible = [...document.querySelectorAll("figure svg")].filter((svg) => svg.getBoundingClientRect().width > 0);
+  const drawn = [...document.querySelectorAll("figure:not(.motion) svg")];
+  const visible = drawn.filter((svg) => svg.getBoundingClientRect().width > 0);
+  const slider = document.querySelector(".motion input");
+  const links = () => document.querySelector(".links").getAttribute("points");
+  const first = links();
+  slider.value = Math.floor(slider.max / 2);
+  slider.dispatchEvent(new Event("input"));
+  seen.moved = links() !== first && document.querySelector(".motion output").textContent !== "0.00 s";
   seen.figures = visible.map((svg) => [svg.getAttribute("aria-label"), svg.getBoundingClientRect().width]);
   seen.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-  const svg = visible[0];
+  const svg = visible.find((one) => one.closest("figure").id.startsWith("figure-position"));
   const box = svg.getBoundingClientRect();
   const at = (type, part) => svg.dispatchEvent(new PointerEvent(type, {
     clientX: box.left + part * box.width, clientY: box.top + 0.5 * box.height, pointerType: "mouse", pointerId: 1 }));
@@ -81,7 +88,8 @@ def test_a_visit(identified: Path, width: int) -> None:
     assert seen["requests"] == []
     assert seen["seconds"] < MOST_SECONDS
     assert seen["overflow"] <= 0
-    assert len(seen["figures"]) == 14
+    assert seen["moved"], "the slider moves the arm"
+    assert len(seen["figures"]) == 16
     assert all(drawn > 0.5 * min(width, 600) for _, drawn in seen["figures"])
     assert "measured: " in seen["reading"] and "predicted: " in seen["reading"]
     assert seen["zoomed"] != seen["before"] == seen["after"]

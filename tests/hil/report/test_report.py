@@ -48,8 +48,8 @@ def test_words_come_first_then_every_section_and_figure(identified: Path) -> Non
     data = RunData.load(identified)
     made = sections(data)
     assert [section.key for section in made] == [
-        *("verdict", "parameters", "prediction", "friction", "spectra"),
-        *("correlation", "limits", "timing", "provenance"),
+        *("verdict", "parameters", "motion", "prediction", "friction", "spectra"),
+        *("correlation", "limits", "timing", "next", "provenance"),
     ]
     page = make_page(data)
     assert page.index("predicts a held-out motion") < page.index("<table")
@@ -91,7 +91,7 @@ def test_a_run_without_held_out_or_period_leaves_those_sections_out(identified: 
     path.write_text(json.dumps(result), encoding="utf-8")
     data = RunData.load(identified)
     keys = [section.key for section in sections(data)]
-    assert keys == ["verdict", "parameters", "correlation", "limits", "timing", "provenance"]
+    assert keys == ["verdict", "parameters", "correlation", "limits", "timing", "next", "provenance"]
     page = make_page(data)
     assert "held-out" not in page and "truth" not in page
 
