@@ -38,7 +38,7 @@ WORDS = {
     SIGN: r"sign of|against its command|wrong way|turned? round",
     PROGRAM: r"deadlines?\b|(the|this) computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
     SIGNAL: r"Ctrl-C|SIGINT|SIGTERM|SIGHUP",
-    MODEL: r"any arm|than (the )?model|predicted|not as planned|foreseen|the dry run",
+    MODEL: r"any arm|repeat its motion|than (the )?model|predicted|not as planned|foreseen|the dry run",
     REFUSED: r"refus|alert, hardware error: none|answers? with an? error",
     STRANGER: r"another (program|master)|somebody else|not asked for|collision|other master",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
@@ -123,6 +123,7 @@ UNHEARD = _INSTRUCTIONS | {
     Kind.KILLED,
     Kind.NEW_ID,
     Kind.NEW_BAUD,
+    Kind.TURNED_ROUND,  # with a reboot
     FaultKind.CABLE_PULLED,
     FaultKind.SILENT_SERVO,
     FaultKind.REBOOT,

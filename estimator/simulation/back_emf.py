@@ -9,7 +9,7 @@ written as a voltage that lags and a brake that does not,
 exactly so for a joint of inertia J and brake b: the same motion as that of a command with the lag lag' on a joint whose
 inertia is less by b lag'. That is how it is simulated: `Physics.of` takes back_emf viscous (lag + delay) off the
 inertia that only this joint feels. On an XL430 that is 5 to 10 % of it. The lag found is lag', a little more than the
-winding's. What friction does to the motor's current comes too late by lag' - lag, about a tenth of a millisecond.
+winding's. What friction does to the motor's current comes too late by lag' - lag (`neglected`).
 
 Ripple, saturation and friction under load belong to the motor's torque, so to the voltage's less what is generated
 (`hil.estimator.simulation.arm`).
@@ -61,6 +61,20 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
         if share in names:
             full[:, :, names.index(share)] = viscous * by_generated
     return full
+
+
+def neglected(physics: Physics) -> dict[str, float]:
+    """Standard deviations of the joints' own inertias by what this description neglects, by name [kg m^2].
+
+    Friction reaches the motor's current by lag' - lag too late, which is to second order in b lag' / J: nothing on most
+    arms, but 5 % of the inertia of an XL430 that carries next to nothing.
+    """
+    found = {}
+    for joint in _generating(physics):
+        place = OWN_INERTIA[joint]
+        lost = float(physics.vector[GENERATED + joint] * physics.late[joint])
+        found[CONSTANTS[place]] = lost**2 / (float(physics.vector[place]) + lost)
+    return found
 
 
 def _generating(physics: Physics) -> list[int]:

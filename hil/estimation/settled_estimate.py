@@ -19,11 +19,13 @@ from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
+from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
 from hil.estimator.selection.drift import Drift, friction_change
 from hil.estimator.selection.settled import Choice, choose, predict_period
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
+from hil.estimator.simulation.back_emf import neglected
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.plan.stabiliser import stabiliser_share
 from hil.results.parts import RunTiming
@@ -51,7 +53,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     estimate, choice = _estimate(config, period, other, run.load_starts(), executor)
     left_out = candidates(period, estimate, {})
-    estimate = replace(estimate, covariance=considered(period, estimate))
+    estimate = replace(estimate, covariance=_with_neglected(considered(period, estimate), estimate))
     drift = None if other is None else _drift(facts, samples, other, estimate)
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if other is not None:
@@ -84,6 +86,15 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     save_periods(run.path, played)
     run.write_result(result)
     return result
+
+
+def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:
+    """Add what the description of back-EMF neglects."""
+    wider = covariance.copy()
+    for name, std in neglected(Physics.of(estimate.parameters)).items():
+        place = estimate.names.index(name)
+        wider[place, place] += std**2
+    return wider
 
 
 def _drift(facts: RunFacts, samples: NDArray[np.void], other: SettledPeriod, estimate: Estimate) -> Drift:

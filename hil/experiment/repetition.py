@@ -33,19 +33,18 @@ class Repetition:
         self._lasting = max(_FEWEST, round(LASTING_S / interval))
         self._sums: list[_Sums] = [_Sums() for _ in range(joints)]
         self._former = [array("d", [_EMPTY]) * samples for _ in range(joints)]
-        self.begin(samples)
+        self.begin(samples, anew=True)
 
-    def begin(self, samples: int) -> None:
-        """Start a new period of `samples` samples."""
+    def begin(self, samples: int, *, anew: bool = False) -> None:
+        """Start a new period of `samples` samples. anew: its torque is not that of the period before.
+
+        The buffer is not cleared, which would take too long between two samples.
+        """
+        self._anew = anew
         self._half = samples // 2
-        self._allowed = [TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]
+        self._allowed = [inf if anew else TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]
         self._unlike_for = [0] * len(self._former)
         self._sums = [_Sums() for _ in self._former]
-
-    def forget(self) -> None:
-        """Forget all periods: what follows plays another torque."""
-        self._sums = [_Sums() for _ in self._former]
-        self._former = [array("d", [_EMPTY]) * len(former) for former in self._former]
 
     def add(self, index: int, position: Sequence[float]) -> None:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
@@ -59,7 +58,7 @@ class Repetition:
                 sums.lowest = min(sums.lowest, latest)
                 sums.highest = max(sums.highest, latest)
                 if compared:
-                    sums.add(former[index], latest)
+                    sums.add(_EMPTY if self._anew else former[index], latest)
             former[index] = latest
 
     @property

@@ -126,7 +126,6 @@ class Stream:
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
             self._note(f"{segment.role}: ramp in")
-            self._repetition.forget()
             self._play(self._ramps[number][0], Phase.RAMP_IN)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
@@ -186,7 +185,7 @@ class Stream:
     def _play_period(self, segment: Segment, period: int) -> None:
         """Play one period and compare each sample with the one in the period before."""
         repetition = self._repetition
-        repetition.begin(len(segment.period_current))
+        repetition.begin(len(segment.period_current), anew=period == 0)
         for index, row in enumerate(segment.period_current):
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)

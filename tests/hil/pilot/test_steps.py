@@ -1,5 +1,7 @@
 """Pilot and full run from joint limits and link lengths only, and arms that need a stabiliser."""
 
+from collections import Counter
+from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ from hil.cli.views.result_table import print_result
 from hil.config.schema import load_config
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
+from hil.fakes.servo.registers import Register
+from hil.fakes.servo.servo import EmulatedServo
 from hil.pilot import identify_in_steps
 from hil.report.page import make_page
 from hil.report.run_data import RunData
@@ -22,13 +26,41 @@ from tests.support.paths import CONFIGS
 
 
 @pytest.fixture(scope="module")
-def in_steps(tmp_path_factory: pytest.TempPathFactory) -> tuple[SettledResult, Path, list[str]]:
+def eeprom_writes() -> Iterator[Counter[tuple[int, str]]]:
+    """Writes of each servo's EEPROM registers by instructions, counted by ID and register."""
+    written: Counter[tuple[int, str]] = Counter()
+    write = EmulatedServo._write
+
+    def counting(servo: EmulatedServo, register: Register, value: int) -> None:
+        if register.eeprom:
+            written[servo.id, register.name] += 1
+        write(servo, register, value)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EmulatedServo, "_write", counting)
+        yield written
+
+
+@pytest.fixture(scope="module")
+def in_steps(
+    tmp_path_factory: pytest.TempPathFactory, eeprom_writes: Counter[tuple[int, str]]
+) -> tuple[SettledResult, Path, list[str]]:
     config = load_config(CONFIGS / "first_time.toml")
     assert config.experiment.peak_torque is None and config.arm.prior is None
     run = RunFolder.create(tmp_path_factory.mktemp("steps") / "run", config)
     said: list[str] = []
     _, result = identify_in_steps(config, run, config.path, lambda _: None, said.append)
     return result, run.path, said
+
+
+def test_a_whole_identification_writes_four_eeprom_registers_a_joint_at_most(
+    in_steps: Any, eeprom_writes: Counter[tuple[int, str]]
+) -> None:
+    """Mode and current limit, set once and put back once, whatever the number of steps."""
+    assert len(in_steps[0].steps) >= 2
+    assert {servo_id for servo_id, _ in eeprom_writes} == {1, 2}
+    for servo_id in (1, 2):
+        assert sum(count for (owner, _), count in eeprom_writes.items() if owner == servo_id) <= 4, eeprom_writes
 
 
 def used_range(result: SettledResult) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
