@@ -14,14 +14,16 @@ from hil.study.fleet import fleet
 
 FILE_NAME = "study.html"
 _BINS = 24
+_MANY = 100
+"""Values from which on the outermost hundredths are left out of a histogram."""
 
 
 def write_page(table: pa.Table, title: str, path: Path) -> Figures:
     """Write the page and return the figures on it. Raises RunFolderError if it cannot be written."""
     found = figures(table)
-    template = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).from_string((files("hil.study") / "page.html.j2").read_text(encoding="utf-8"))
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.tests["single"] = lambda rates: len(rates) == 1
+    template = environment.from_string((files("hil.study") / "page.html.j2").read_text(encoding="utf-8"))
     histograms = {spread.name: _histogram(table, spread.name) for spread in found.spreads}
     text = template.render(
         title=title,
@@ -43,7 +45,7 @@ def _histogram(table: pa.Table, name: str) -> list[float]:
     """Heights (0 to 1) of equally wide bins between the 1 % and the 99 % quantile."""
     values = np.array([float(each) for each in table.column(name).to_pylist() if each is not None])
     values = values[np.isfinite(values)]
-    low, high = np.quantile(values, [0.01, 0.99])
+    low, high = np.quantile(values, [0.01, 0.99] if values.size >= _MANY else [0.0, 1.0])
     if high <= low:
         return [1.0 if index == _BINS // 2 else 0.0 for index in range(_BINS)]
     counted, _ = np.histogram(values, _BINS, (low, high))
