@@ -34,9 +34,8 @@ SHAPES = {
 """Shape of friction near standstill: what is likely [its unit] and the standard deviation of its logarithm. A joint
 that is never slow says nothing of it, and without that would let it go anywhere."""
 RESHAPING = 1.0  # of their logarithms, in one step
-NARROWING, WIDENING = 0.8, 2.0  # of a width, in one step
+NARROWING, WIDENING = 1.6, 1.1  # of a width's logarithm, in one step
 LONGEST = 2.0  # of any coordinate, in one step
-NEAREST = 1e-3  # of the floor: what a width always stays above it
 
 
 @dataclass(frozen=True)
@@ -47,44 +46,32 @@ class ChainCoordinates:
     scales: Array
     """Of base parameters, in their place; ignored for others (parameters,)."""
     width_floor: float
-    """What every Coulomb step's width stays above [rad/s]."""
+    """The least width of every Coulomb step [rad/s]."""
 
     def values(self, x: Array) -> Array:
         """Parameters (parameters,) at the coordinates `x`."""
-        positive = np.exp(np.where(self._positive, x, 0.0)) + self._floors
-        value: Array = np.where(self._positive, positive, x * self._scales)
+        value: Array = np.where(self._positive, np.exp(np.where(self._positive, x, 0.0)), x * self._scales)
         return value
 
     def coordinates(self, value: Array) -> Array:
         """Coordinates of `value` (parameters,), moved into the physical range."""
-        above = np.maximum(value - self._floors, np.maximum(self._least, NEAREST * self._floors))
-        x: Array = np.where(self._positive, np.log(np.where(self._positive, above, 1.0)), value / self._scales)
+        positive = np.log(np.where(self._positive, np.maximum(value, self._least), 1.0))
+        x: Array = np.where(self._positive, positive, value / self._scales)
         return x
 
     def slopes(self, x: Array) -> Array:
         """Derivative of each parameter by its coordinate (parameters,)."""
-        slope: Array = np.where(self._positive, self.values(x) - self._floors, self._scales)
+        slope: Array = np.where(self._positive, self.values(x), self._scales)
         return slope
 
     def limit(self, x: Array, least: Array, most: Array) -> None:
-        """Lower in place what coordinates may change by in one step from `x`."""
+        """Lower in place what coordinates may change by in one step from `x`: a width that has come to its floor stays
+        there as long as the others' steps would narrow it."""
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], RESHAPING, LONGEST)
         least[:count], most[:count] = -bound, bound
-        widths = np.flatnonzero(self._floors)
-        share = 1.0 + self.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
-        least[widths], most[widths] = np.maximum(-1.0, -NARROWING * share), WIDENING * share
-
-    def moved(self, x: Array, step: Array) -> Array:
-        """Where `step` leads from `x`, both with coordinates of something else at their end.
-
-        The motion follows a width and not its logarithm: by the exponential of the step it would never arrive at its
-        floor.
-        """
-        y: Array = x + step
-        widths = np.flatnonzero(self._floors)
-        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), NEAREST * self.width_floor))
-        return y
+        widths = self._widths
+        least[widths], most[widths] = np.clip(np.log(self.width_floor) - x[widths], -NARROWING, 0.0), WIDENING
 
     @cached_property
     def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
@@ -102,12 +89,14 @@ class ChainCoordinates:
         return np.array([kind in POSITIVE for kind in self._kinds])
 
     @cached_property
-    def _floors(self) -> Array:
-        return np.array([self.width_floor if kind == "coulomb_width" else 0.0 for kind in self._kinds])
+    def _widths(self) -> npt.NDArray[np.int64]:
+        return np.flatnonzero([kind == "coulomb_width" for kind in self._kinds])
 
     @cached_property
     def _least(self) -> Array:
-        return np.array([POSITIVE.get(kind, 0.0) for kind in self._kinds])
+        return np.array(
+            [self.width_floor if kind == "coulomb_width" else POSITIVE.get(kind, 0.0) for kind in self._kinds]
+        )
 
     @cached_property
     def _scales(self) -> Array:

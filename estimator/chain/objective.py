@@ -109,7 +109,7 @@ class ChainProblem:
             self.coordinates.limit(point[: self.count], least, most)
             return least, most
 
-        return minimise(self.evaluate, x, ftol, damping, move=self.coordinates.moved, limits=limits)
+        return minimise(self.evaluate, x, ftol, damping, limits=limits)
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Predicted positions of each period (joints, samples) [rad]; None where a motion diverges."""

@@ -42,18 +42,20 @@ class ChainOptions:
     """Where a softer observer leaves so many times more than its softness explains, the one before is kept."""
     coarse_step: float = 2.6e-3
     """Of integration [s]."""
-    fine_step: float = 0.85e-3
-    finer: int = 4
-    """Steps in place of one of those near standstill."""
-    width_floor: float = 1e-3
-    """What the width of every Coulomb step stays above [rad/s]: friction that sticks is not told from this."""
+    fine_step: float = 1.3e-3
+    """[s] Of the last iterations."""
+    finer: int = 16
+    """Steps in place of one of those near standstill, where friction changes fast."""
+    width_floor: float = 3e-4
+    """Least width of every Coulomb step [rad/s]: friction that sticks is hardly told from this."""
     initial_width: float = 0.03
     """[rad/s]"""
     min_initial_lag: float = 5e-4
     """[s]"""
     ftol_coarse: float = 1e-2
     ftol_near: float = 3e-3
-    ftol: float = 1e-5
+    ftol_nearer: float = 1e-3
+    ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
     """Shares of the way from the prior to stage 1 at which to begin, the first at which the arm can be simulated."""
     angle_scale: float = 0.1
@@ -63,6 +65,7 @@ class ChainOptions:
 
 
 DEFAULTS = ChainOptions()
+REPEATED = 4  # equal readings in a row that still count as that many: a joint in motion gives as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 
 
@@ -118,14 +121,16 @@ def fit_periods(
             break
         found, softness = trial, frequency
     assert found is not None
-    fine = replace(problem, softness=softness, finer=options.finer)
-    near = fine.minimise(found.x, options.ftol_near)
-    positions = fine.positions(near.x)
+    sticking = replace(coarse, softness=softness, finer=options.finer)
+    near = sticking.minimise(found.x, options.ftol_near)
+    positions = sticking.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
     weights, outliers = _weights(periods, positions, options.outlier_threshold)
-    last = replace(fine, weights=weights)
-    minimum = last.minimise(near.x, options.ftol, MINIMISER.min_damping)
-    return _fit(last, minimum, outliers, COVARIANCE, spent + near.iterations + minimum.iterations)
+    nearer = replace(sticking, weights=weights).minimise(near.x, options.ftol_nearer)
+    last = replace(sticking, weights=weights, steps=problem.steps)
+    minimum = last.minimise(nearer.x, options.ftol, MINIMISER.min_damping)
+    spent += near.iterations + nearer.iterations + minimum.iterations
+    return _fit(last, minimum, outliers, COVARIANCE, spent)
 
 
 def _problem(
@@ -144,7 +149,9 @@ def _problem(
     start = START | {"coulomb_width": options.initial_width}
     value = np.array([known.get(name, start.get(kind_of(name), 0.0)) for name in model.names])
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
-    weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0).T for period in periods)
+    weights = tuple(
+        np.where(period.valid, _repeated(period) / period.noise[:, None], 0.0).T for period in periods
+    )
     steps = _steps(periods, options.fine_step)
     problem = ChainProblem(
         tuple(periods), model, coordinates, prior, state_scale, weights, steps, softness=options.softness[0]
@@ -183,11 +190,26 @@ def _weights(
         typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
         spread = np.maximum(typical, period.noise)[:, None]
         far = error > outlier * spread
-        weight = np.where(far, np.sqrt(outlier * spread / np.where(far, error, 1.0)), 1.0)
+        weight = np.where(far, np.sqrt(outlier * spread / np.where(far, error, 1.0)), 1.0) * _repeated(period)
         rms = np.sqrt(np.nanmean(np.where(far | ~period.valid, np.nan, error) ** 2, axis=1))[:, None]
         weights.append(np.where(period.valid, weight / np.maximum(rms, period.noise[:, None]), 0.0).T)
         outliers += int(far.sum())
     return tuple(weights), outliers
+
+
+def _repeated(period: SettledPeriod) -> Array:
+    """Weight of each sample (joints, samples) for what it shares with those beside it, 1 where they are independent.
+
+    While a joint sticks, its encoder repeats one reading with one rounding error. Counted as often as it is repeated,
+    that error would have the simulated joint creep towards it, through friction softened near standstill: a stretch of
+    equal readings counts as one reading.
+    """
+    weight = np.ones_like(period.position)
+    for row, position in zip(weight, period.position, strict=True):
+        first = np.flatnonzero(np.concatenate(([True], np.diff(position) != 0.0)))  # NaN differs from itself
+        length = np.diff(np.concatenate((first, [position.size])))
+        row[:] = np.repeat(np.minimum(1.0, np.sqrt(REPEATED / length)), length)
+    return weight
 
 
 def _fit(
@@ -203,7 +225,9 @@ def _fit(
     lags = correlation_time(residuals, options)
     longest = max(period.samples for period in problem.periods)
     window = max(lags, min(options.max_lag, int(options.min_window_share * longest)))
-    samples = int(sum(period.valid.sum() for period in problem.periods))
+    samples = int(
+        sum(float(np.sum(np.where(period.valid, _repeated(period) ** 2, 0.0))) for period in problem.periods)
+    )
     slopes = np.diag(problem.coordinates.slopes(x[:count]))
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
     robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
