@@ -21,7 +21,10 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise
 from hil.estimator.fit.normal_equations import normal_equations
+from hil.estimator.options import MinimiserOptions
 from hil.estimator.simulation.drive import torque_and_slopes
+
+MINIMISER = MinimiserOptions()
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,9 @@ class ChainProblem:
             return Quadratic(np.inf, np.zeros_like(normal), np.zeros_like(gradient))
         return Quadratic(cost, normal, gradient)
 
-    def minimise(self, x: Array, ftol: float, damping: float | None = None) -> Minimum:
+    def minimise(
+        self, x: Array, ftol: float, damping: float | None = None, options: MinimiserOptions = MINIMISER
+    ) -> Minimum:
         """Minimise the sum of squares from `x`, until its relative decrease is less than `ftol`."""
 
         def limits(point: Array) -> tuple[Array, Array]:
@@ -109,7 +114,7 @@ class ChainProblem:
             self.coordinates.limit(point[: self.count], least, most)
             return least, most
 
-        return minimise(self.evaluate, x, ftol, damping, limits=limits)
+        return minimise(self.evaluate, x, ftol, damping, limits=limits, options=options)
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Predicted positions of each period (joints, samples) [rad]; None where a motion diverges."""
@@ -136,6 +141,24 @@ class ChainProblem:
                 scatter.add(np.einsum("sj,sjc->sc", weight[part] ** 2 * r, J))
             total[np.ix_(where, where)] += scatter.sum() * np.outer(slopes, slopes)
         return total
+
+    def weighted(self, x: Array, index: int, most: int) -> Iterator[tuple[Array, Array]]:
+        """Of each joint, at most `most` samples of a period's weighted residual (samples,) and its Jacobian by all
+        coordinates (samples, coordinates)."""
+        period, weight = self.periods[index], self.weights[index]
+        where, slopes = self._where(x, index)
+        residuals, jacobians = [], []
+        for part, r, J in self._pieces(x, index, period, self.parameters(x)):
+            assert r is not None  # the minimum's motion is finite
+            residuals.append(weight[part] * r)
+            jacobians.append(weight[part][:, :, None] * J * slopes)
+            if part.stop >= most:
+                break
+        residual, jacobian = np.concatenate(residuals), np.concatenate(jacobians)
+        for joint in range(period.joints):
+            every = np.zeros((len(residual), x.size))
+            every[:, where] = jacobian[:, joint]
+            yield residual[:, joint], every
 
     def softer(self, softness: float) -> "ChainProblem":
         """The same with another observer."""

@@ -16,11 +16,13 @@ from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.objective import ChainProblem
 from hil.estimator.chain.prior import Prior
 from hil.estimator.chain.stage1 import ChainLinear
+from hil.estimator.chain.uncertainty import level_covariance, noise_levels
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import (
     by_parameters,
     correlation_time,
+    larger_covariance,
     robust_covariance,
     structured_share,
 )
@@ -67,6 +69,9 @@ class ChainOptions:
 DEFAULTS = ChainOptions()
 REPEATED = 4  # equal readings in a row that still count as that many: a joint in motion gives as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
+LAST = MinimiserOptions(max_damping=0.1)
+"""Of the last iterations. Where a joint just sticks or just does not, the sum of squares has small steps: what only
+heavily damped steps gain is such a step."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ def fit_periods(
     weights, outliers = _weights(periods, positions, options.outlier_threshold)
     nearer = replace(sticking, weights=weights).minimise(near.x, options.ftol_nearer)
     last = replace(sticking, weights=weights, steps=problem.steps)
-    minimum = last.minimise(nearer.x, options.ftol, MINIMISER.min_damping)
+    minimum = last.minimise(nearer.x, options.ftol, MINIMISER.min_damping, LAST)
     spent += near.iterations + nearer.iterations + minimum.iterations
     return _fit(last, minimum, outliers, COVARIANCE, spent)
 
@@ -230,12 +235,15 @@ def _fit(
     )
     slopes = np.diag(problem.coordinates.slopes(x[:count]))
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
-    robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
     white = robust_covariance(minimum.at, None, samples, count)
+    covariance = level_covariance(minimum.at.normal, *noise_levels(problem, x, minimum.at.normal))[:count, :count]
+    if structured > 0.0:  # a model's error repeats itself: it may also be larger at some times than at others
+        robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
+        covariance = _larger(covariance, robust)
     value = problem.coordinates.values(x[:count])
     return ChainFit(
         value,
-        by_parameters(robust, slopes, value),
+        by_parameters(covariance, slopes, value),
         by_parameters(white, slopes, value),
         tuple(problem.start(x, index) for index in range(len(problem.periods))),
         positions,
@@ -244,3 +252,13 @@ def _fit(
         iterations,
         problem.softness,
     )
+
+
+def _larger(one: Array, other: Array) -> Array:
+    """A covariance at least as large as both; infinite where one is."""
+    length = np.sqrt(np.maximum(np.diag(one), np.diag(other)))
+    known = np.flatnonzero(np.isfinite(length) & (length > 0.0))
+    at, lengths = np.ix_(known, known), np.outer(length[known], length[known])
+    covariance = np.where(np.isfinite(one), other, one)
+    covariance[at] = larger_covariance(other[at] / lengths, one[at] / lengths) * lengths
+    return covariance

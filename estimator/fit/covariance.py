@@ -120,7 +120,7 @@ def robust_covariance(
     if scatter is not None:
         scores = (scatter - np.diag(prior))[np.ix_(seen, seen)] / lengths
         robust = inverse @ scores @ inverse * (samples / freedom)
-        found = _larger(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
+        found = larger_covariance(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
         found = found + 0.5 * structured * inverse
     if prior.any():
         expected = np.diag(np.sqrt(prior[seen]) / norm[seen])
@@ -133,7 +133,7 @@ def robust_covariance(
     return covariance[:count, :count]
 
 
-def _larger(robust: Array, white: Array) -> Array:
+def larger_covariance(robust: Array, white: Array) -> Array:
     """A covariance at least as large as both along the directions in which they differ."""
     size, directions = np.linalg.eigh(white)
     root = directions * np.sqrt(np.maximum(size, 1e-300))
