@@ -64,14 +64,15 @@ class ChainCoordinates:
         slope: Array = np.where(self._positive, self.values(x), self._scales)
         return slope
 
-    def limit(self, x: Array, least: Array, most: Array) -> None:
-        """Lower in place what coordinates may change by in one step from `x`: a width that has come to its floor stays
-        there as long as the others' steps would narrow it."""
+    def limit(self, x: Array, reach: float, least: Array, most: Array) -> None:
+        """Lower in place what coordinates may change by in one step from `x`, those of friction's shape to `reach` of
+        what they ever may: a width that has come to its floor stays there as long as the others' steps would narrow it.
+        """
         count = len(self.names)
-        bound = np.where([kind in SHAPES for kind in self._kinds], RESHAPING, LONGEST)
+        bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)
         least[:count], most[:count] = -bound, bound
         widths = self._widths
-        least[widths], most[widths] = np.clip(np.log(self.width_floor) - x[widths], -NARROWING, 0.0), WIDENING
+        least[widths], most[widths] = np.clip(np.log(self.width_floor) - x[widths], -reach * NARROWING, 0.0), reach * WIDENING
 
     @cached_property
     def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:

@@ -45,6 +45,8 @@ class ChainProblem:
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
     """Integration steps in place of one where a joint may be near standstill."""
+    reach: float = 1.0
+    """Of one step in the shapes of friction, over what they may change by far from the minimum."""
 
     @property
     def count(self) -> int:
@@ -105,16 +107,22 @@ class ChainProblem:
         return Quadratic(cost, normal, gradient)
 
     def minimise(
-        self, x: Array, ftol: float, damping: float | None = None, options: MinimiserOptions = MINIMISER
+        self,
+        x: Array,
+        ftol: float,
+        damping: float | None = None,
+        options: MinimiserOptions = MINIMISER,
+        at: Quadratic | None = None,
     ) -> Minimum:
-        """Minimise the sum of squares from `x`, until its relative decrease is less than `ftol`."""
+        """Minimise the sum of squares from `x`, until its relative decrease is less than `ftol`; `at`: the sum there,
+        where it is known."""
 
         def limits(point: Array) -> tuple[Array, Array]:
             least, most = np.full(point.size, -LONGEST), np.full(point.size, LONGEST)
-            self.coordinates.limit(point[: self.count], least, most)
+            self.coordinates.limit(point[: self.count], self.reach, least, most)
             return least, most
 
-        return minimise(self.evaluate, x, ftol, damping, limits=limits, options=options)
+        return minimise(self.evaluate, x, ftol, damping, at, limits=limits, options=options)
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Predicted positions of each period (joints, samples) [rad]; None where a motion diverges."""

@@ -54,6 +54,8 @@ class ChainOptions:
     """[rad/s]"""
     min_initial_lag: float = 5e-4
     """[s]"""
+    reach: float = 0.3
+    """Of the last steps in friction's shapes, in which the sum is far from quadratic."""
     ftol_coarse: float = 1e-2
     ftol_near: float = 3e-3
     ftol_nearer: float = 1e-3
@@ -69,7 +71,7 @@ class ChainOptions:
 DEFAULTS = ChainOptions()
 REPEATED = 4  # equal readings in a row that still count as that many: a joint in motion gives as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
-LAST = MinimiserOptions(max_damping=0.1)
+LAST = MinimiserOptions(max_damping=10.0)
 """Of the last iterations. Where a joint just sticks or just does not, the sum of squares has small steps: what only
 heavily damped steps gain is such a step."""
 
@@ -131,10 +133,12 @@ def fit_periods(
     positions = sticking.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
     weights, outliers = _weights(periods, positions, options.outlier_threshold)
-    nearer = replace(sticking, weights=weights).minimise(near.x, options.ftol_nearer)
-    last = replace(sticking, weights=weights, steps=problem.steps)
-    minimum = last.minimise(nearer.x, options.ftol, MINIMISER.min_damping, LAST)
-    spent += near.iterations + nearer.iterations + minimum.iterations
+    nearer = replace(sticking, weights=weights, reach=options.reach).minimise(near.x, options.ftol_nearer)
+    last = replace(sticking, weights=weights, steps=problem.steps, reach=options.reach)
+    damped = last.minimise(nearer.x, options.ftol, options=LAST)
+    # Damping holds back what is hardly determined; without it before, many limits of steps would stop the rest.
+    minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
+    spent += near.iterations + nearer.iterations + damped.iterations + minimum.iterations
     return _fit(last, minimum, outliers, COVARIANCE, spent)
 
 
