@@ -72,7 +72,10 @@ class ChainCoordinates:
         bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)
         least[:count], most[:count] = -bound, bound
         widths = self._widths
-        least[widths], most[widths] = np.clip(np.log(self.width_floor) - x[widths], -reach * NARROWING, 0.0), reach * WIDENING
+        least[widths], most[widths] = (
+            np.clip(np.log(self.width_floor) - x[widths], -reach * NARROWING, 0.0),
+            reach * WIDENING,
+        )
 
     @cached_property
     def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:

@@ -57,9 +57,7 @@ class Box:
         spectrum = np.zeros((self.centre.size, samples // 2 + 1), dtype=np.complex128)
         spectrum[:, 1 : self.harmonics + 1] = lines
         turn = 2j * np.pi * np.arange(spectrum.shape[1]) / self.period
-        position, velocity, acceleration = (
-            np.fft.irfft(spectrum * turn**order, samples, axis=1) for order in range(3)
-        )
+        position, velocity, acceleration = (np.fft.irfft(spectrum * turn**order, samples, axis=1) for order in range(3))
         most = np.abs(position).max(axis=1), np.abs(velocity).max(axis=1)
         scale = np.minimum(self.swing / most[0], self.speed / most[1])[:, None]
         return Path(self.centre[:, None] + scale * position, scale * velocity, scale * acceleration)

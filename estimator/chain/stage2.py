@@ -158,9 +158,7 @@ def _problem(
     start = START | {"coulomb_width": options.initial_width}
     value = np.array([known.get(name, start.get(kind_of(name), 0.0)) for name in model.names])
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
-    weights = tuple(
-        np.where(period.valid, _repeated(period) / period.noise[:, None], 0.0).T for period in periods
-    )
+    weights = tuple(np.where(period.valid, _repeated(period) / period.noise[:, None], 0.0).T for period in periods)
     steps = _steps(periods, options.fine_step)
     problem = ChainProblem(
         tuple(periods), model, coordinates, prior, state_scale, weights, steps, softness=options.softness[0]
@@ -234,9 +232,7 @@ def _fit(
     lags = correlation_time(residuals, options)
     longest = max(period.samples for period in problem.periods)
     window = max(lags, min(options.max_lag, int(options.min_window_share * longest)))
-    samples = int(
-        sum(float(np.sum(np.where(period.valid, _repeated(period) ** 2, 0.0))) for period in problem.periods)
-    )
+    samples = int(sum(float(np.sum(np.where(period.valid, _repeated(period) ** 2, 0.0))) for period in problem.periods))
     slopes = np.diag(problem.coordinates.slopes(x[:count]))
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
     white = robust_covariance(minimum.at, None, samples, count)

@@ -20,7 +20,7 @@ from pydantic import (
 
 from hil import fakes
 from hil.config.bundled import find_config
-from hil.config.chain import MOST_JOINTS, chain_slips
+from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
@@ -222,8 +222,8 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether a URDF describes the arm."""
-        return self.arm.urdf is not None
+        """Whether the arm is one in space: described by a file, unless that describes a planar arm without a path."""
+        return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
     def url(self) -> str:

@@ -11,9 +11,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.chain import described_arm
+from hil.config.chain import base_gravity, described_arm
 from hil.config.schema import Config
-from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 from hil.estimator.chain.base_parameters import BaseParameters
 from hil.estimator.chain.dynamics import inverse_dynamics
@@ -60,8 +59,7 @@ class KnownChain:
 def known_chain(config: Config) -> KnownChain:
     """From the configuration's URDF; raises ArmFileError."""
     arm = described_arm(config)
-    gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
-    base = BaseParameters.of(Chain(*arm.geometry, gravity))
+    base = BaseParameters.of(Chain(*arm.geometry, base_gravity(config)))
     rotors = np.full(len(arm.joints), ARMATURE)
     return KnownChain(base, Prior.of(base, arm.parameters), np.column_stack((arm.parameters, rotors)).reshape(-1))
 
