@@ -67,7 +67,8 @@ class Box:
         others fast ones."""
         shape = self.centre.size, self.harmonics
         slower = np.arange(1, self.harmonics + 1) ** -rng.uniform(0.0, STEEPEST, (self.centre.size, 1))
-        return slower * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+        lines = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+        return (slower * lines).astype(np.complex128)
 
 
 def design_path(
@@ -170,11 +171,13 @@ class Goal:
     @cached_property
     def _level_of_joint(self) -> Array:
         """RMS torque of those (joints,) [N m]."""
-        return np.sqrt(np.mean((self._motions @ self.prior.value) ** 2, axis=1)) + 1e-9
+        level: Array = np.sqrt(np.mean((self._motions @ self.prior.value) ** 2, axis=1)) + 1e-9
+        return level
 
     @cached_property
     def _level(self) -> Array:
-        return self._level_of_joint * np.sqrt(self._motions.shape[1])
+        level: Array = self._level_of_joint * np.sqrt(self._motions.shape[1])
+        return level
 
     @cached_property
     def _others(self) -> Array:

@@ -16,7 +16,7 @@ from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.objective import ChainProblem
 from hil.estimator.chain.prior import Prior
 from hil.estimator.chain.stage1 import ChainLinear
-from hil.estimator.chain.uncertainty import level_covariance, noise_levels
+from hil.estimator.chain.uncertainty import coloured_covariance
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import (
@@ -236,7 +236,7 @@ def _fit(
     slopes = np.diag(problem.coordinates.slopes(x[:count]))
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
     white = robust_covariance(minimum.at, None, samples, count)
-    covariance = level_covariance(minimum.at.normal, *noise_levels(problem, x, minimum.at.normal))[:count, :count]
+    covariance = coloured_covariance(problem, x, minimum.at.normal)[:count, :count]
     if structured > 0.0:  # a model's error repeats itself: it may also be larger at some times than at others
         robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
         covariance = _larger(covariance, robust)

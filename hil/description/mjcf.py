@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body
+from hil.description.motion import rotation_about
 from hil.description.urdf import check_units
 
 WORLD = 0
@@ -39,7 +40,7 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
                 f'{path}: body "{tree.name(body)}", moved by joint "{name}", has no mass: give it an <inertial>'
             )
         held += stiff
-        back = rotation @ _rotation_about(axis, -float(tree.model.qpos0[tree.model.jnt_qposadr[joint]]))
+        back = rotation @ rotation_about(axis, -float(tree.model.qpos0[tree.model.jnt_qposadr[joint]]))
         arm.append(ArmJoint(name, tree.name(body), back, translation, axis, tree.limits(joint), merged, tuple(fixed)))
         before = body
     check_units(arm, path)
@@ -196,10 +197,3 @@ def _rotation(quaternion: Array) -> Array:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def _rotation_about(axis: Array, angle: float) -> Array:
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return turned

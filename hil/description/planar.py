@@ -42,4 +42,4 @@ def _level(axis: Array, link: Array, down: Array) -> bool:
     if length == 0.0:
         return False
     lifted = np.cross(axis, across / length)
-    return float(lifted @ down) < -np.cos(ALIGNED)
+    return bool(float(lifted @ down) < -np.cos(ALIGNED))

@@ -9,7 +9,10 @@ from hil.errors import ConfigError
 from tests.support.paths import CONFIGS
 
 TOML = (CONFIGS / "fake_two_link.toml").read_text(encoding="utf-8")
-LINK = '<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="0.2"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+LINK = (
+    '<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="0.2"/>'
+    '<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
 
 
 def urdf(axis: str = "0 -1 0", second: str = "0 -1 0", turned: str = "0 0 0", elbow: str = "elbow") -> str:

@@ -14,7 +14,8 @@ from tests.support.chains import random_urdf
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="upper" pos="0 0 0.1" euler="0 0.3 0">
-<joint name="one" axis="0 0 2" pos="0.01 0.02 0" ref="0.4"/><inertial pos="0 0 0.1" mass="0.3" diaginertia="1e-3 2e-3 2e-3"/>
+<joint name="one" axis="0 0 2" pos="0.01 0.02 0" ref="0.4"/>
+<inertial pos="0 0 0.1" mass="0.3" diaginertia="1e-3 2e-3 2e-3"/>
 <body name="lower" pos="0.2 0 0" quat="0.9 0.1 0.2 0"><joint name="two" axis="0 1 0" pos="0 0 -0.03" range="-1 1"/>
 <inertial pos="0.1 0 0" mass="0.2" diaginertia="1e-3 1e-3 1e-3"/>
 <body name="jaw" pos="0.1 0 0"><joint name="gripper" type="slide" axis="1 0 0"/>
