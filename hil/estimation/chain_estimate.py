@@ -26,6 +26,7 @@ from hil.runs.timing import timing
 
 EXPLAINED = 1.2  # times the encoder's rounding: a residual up to here leaves nothing to explain
 PREDICTED = 0.01  # of the motion: a held-out path foretold this well says that the model is right
+UNMOVED = 0.03  # rad: joints that move less show no friction and no inertia
 WRONG = 0.05  # and beyond this, that it is not
 
 
@@ -68,7 +69,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             held_out_rms=None if held_out is None else tuple(map(float, held_out)),
             residual_over_floor=tuple(over_floor.tolist()),
         ),
-        verdict=_verdict(config, estimate, known, held_out),
+        verdict=_verdict(config, estimate, known, held_out, unmoved(config, period.position)),
         warnings=tuple(warnings_of(config, facts, samples, period)),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
@@ -122,8 +123,18 @@ def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quan
     }
 
 
+def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
+    """Names of the joints whose motion (joints, samples) [rad] says nothing of them."""
+    reach = np.ptp(np.where(np.isnan(position), np.nanmean(position, axis=1, keepdims=True), position), axis=1)
+    return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
+
+
 def _verdict(
-    config: Config, estimate: ChainEstimate, known: KnownChain, held_out: NDArray[np.float64] | None
+    config: Config,
+    estimate: ChainEstimate,
+    known: KnownChain,
+    held_out: NDArray[np.float64] | None,
+    still: list[str],
 ) -> Verdict:
     """Whether to trust it, the least well identified base parameter, and why."""
     count = known.base.count
@@ -144,6 +155,12 @@ def _verdict(
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
+    if still:
+        trust = "no"
+        sentences.append(
+            f"{', '.join(still)} hardly moved, which tells nothing of its inertia and friction: widen joint_path.swing "
+            "and speed there, and check that nothing blocks it."
+        )
     if estimate.from_prior:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
