@@ -1,9 +1,9 @@
-"""What play in the gears costs an estimator that has none: the realistic fake arm with more and more of it.
+"""Effect of gear backlash on an estimator that does not model it, on the realistic fake arm.
 
     python benchmarks/backlash.py [--json] [--play 0 0.0005 0.0015 0.004] [--presliding]
 
-Play [rad] is from flank to flank, on both joints, between a rotor of its own and the output shaft with the encoder.
---presliding gives the model friction that yields before it slides, which might take play's place.
+The play [rad] is measured from flank to flank and applies to both joints, between the rotor and the output shaft, which
+carries the encoder. --presliding adds presliding friction to the model, which might mimic play.
 """
 
 import argparse

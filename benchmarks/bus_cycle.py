@@ -3,11 +3,11 @@
     python benchmarks/bus_cycle.py            prints tables and ratios
     python benchmarks/bus_cycle.py --json     one JSON object on standard output and nothing else
 
-Each cycle is a Sync Write of 2 bytes and a Sync Read of 10 bytes with 2 servos (`--servos`). The clients take turns, a
-short round each, so that variations of the machine's speed affect all of them: medians of the rounds, and for the
-ratios the median of each round's own ratio. A pty has no wire: "answered at once"
-shows what the client costs by itself, "1 Mbaud" has the responder wait as long as the bytes take at 1 Mbaud.
-Absolute figures are this machine's; compare the ratios.
+Each cycle is a Sync Write of 2 bytes and a Sync Read of 10 bytes with 2 servos (`--servos`). The clients alternate in
+short rounds, so that variations of the machine's speed affect all of them. The results are medians over the rounds; the
+ratios are medians of the ratios of each round. A pty has no wire: "answered at once" shows the cost of the client
+alone; for "1 Mbaud", the responder waits as long as the bytes would take at 1 Mbaud. Absolute figures depend on the
+machine; compare the ratios.
 
 rustypot is optional (`pip install ".[bench]"`); its ratios are null without it.
 """
@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,19 +32,21 @@ from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHand
 
 from benchmarks.machine import machine
 from benchmarks.pty import responder_binary, served_pty
-from hil.config.schema import Config, load_config
+from hil.config.schema import load_config
 from hil.drivers.control_table import load_control_table
 from hil.drivers.exchange import Exchange
-from hil.drivers.joint import Joint
 from hil.drivers.port import open_port
-from hil.drivers.servo_model import Mode, servo_model
+from hil.drivers.servo_model import Mode
 from hil.drivers.state import Converter, spans
 
 BAUD = 1_000_000
 BYTE_NS = 10_000
 PARTS = 3
-PATIENCE_S = 0.5
-"""How long an answer may take here: a busy machine must not make lost replies of late ones."""
+PATIENCE_S = 2.0
+"""Reply timeout [s], long enough that late replies on a busy machine do not count as lost."""
+
+STILL_A = 0.01
+"""A current that dry friction resists."""
 
 GOAL_CURRENT, PRESENT = (102, 2), (126, 10)
 
@@ -51,7 +54,7 @@ Cycle = Callable[[], object]
 
 
 class Round(NamedTuple):
-    """One client's round: us of CPU per cycle, median round trip [us], cycles per second."""
+    """One client's round: CPU time per cycle [us], median round trip [us], cycles per second."""
 
     cpu_us: float
     p50_us: float
@@ -60,7 +63,7 @@ class Round(NamedTuple):
 
 @contextmanager
 def ours(name: str, servos: int, *, fast: bool = False) -> Iterator[Cycle]:
-    """The driver's exchange: raw ticks out and in, as the others do it."""
+    """The driver's exchange with raw ticks, for comparison with the other clients."""
     port = open_port(name, BAUD)
     port.latency = PATIENCE_S
     exchange = make_exchange(port, servos, fast=fast)
@@ -82,17 +85,26 @@ def make_exchange(port: Any, servos: int, *, fast: bool = False) -> Exchange:
 
 @contextmanager
 def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
-    """Everything that the experiment does for one sample: exchange in SI units, guard, recorder."""
+    """The complete work of an experiment for one sample: exchange in SI units, recorder, guard, and the model that
+    runs beside the experiment, which exists for up to two joints.
+
+    The responder's arm hangs still, under currents too small to move it: nothing that the guard has to stop.
+    """
     from hil.experiment.guard import Guard
+    from hil.experiment.model_watch import ModelWatch
     from hil.runs.recording import Phase, Recorder
 
-    joints = [Joint(f"joint{index}", index + 1, servo_model("XM430-W350")) for index in range(servos)]
-    guard = Guard(_without_limits(servos))
+    config = load_config(Path(__file__).parents[1] / "configs" / "fake_two_link.toml")
+    given = [config.joints[index % 2] for index in range(servos)]
+    joints = [replace(joint.joint, id=index) for index, joint in enumerate(given, 1)]
+    safety = config.safety.model_copy(update={"watchdog": PATIENCE_S + 0.5})
+    guard = Guard(config.model_copy(update={"joints": given, "safety": safety}))
+    model = ModelWatch(config, [STILL_A] * 2) if servos == 2 else None
     port = open_port(name, BAUD)
     port.latency = PATIENCE_S
     exchange = make_exchange(port, servos)
     converter = Converter(joints, [joint.drive_unit(12.0) for joint in joints])
-    goals = [0.25] * servos
+    goals = [STILL_A] * servos
     with ExitStack() as stack:
         folder = stack.enter_context(_temporary_folder())
         recorder = stack.enter_context(Recorder(folder / "samples.npy", servos, 1_000_000))
@@ -102,18 +114,11 @@ def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
             state = converter.state(ticks, exchange.cycle(ticks))
             recorder.keep(state.time_before_write, Phase.PERIODIC, 0, 0, state)
             guard.look(state)
+            if model is not None:
+                model.look(state)
 
         yield cycle
     port.close()
-
-
-def _without_limits(servos: int) -> Config:
-    """A configuration whose guard looks at everything and stops nothing: the responder's arm follows no command."""
-    config = load_config(Path(__file__).parents[1] / "configs" / "fake_two_link.toml")
-    free = {"position_limit": [-1e9, 1e9], "velocity_limit": 1e9}
-    joints = [config.joints[0].model_copy(update=free)] * servos
-    safety = config.safety.model_copy(update={"follow_time": 1e6})
-    return config.model_copy(update={"joints": joints, "safety": safety})
 
 
 @contextmanager
@@ -126,7 +131,7 @@ def _temporary_folder() -> Iterator[Path]:
 
 @contextmanager
 def sdk(name: str, servos: int) -> Iterator[Cycle]:
-    """dynamixel-sdk as its examples use it: GroupSyncWrite, then GroupSyncRead."""
+    """dynamixel-sdk as in its examples: GroupSyncWrite, then GroupSyncRead."""
     port = PortHandler(name)
     assert port.openPort() and port.setBaudRate(BAUD)
     packets = PacketHandler(2.0)
@@ -168,7 +173,7 @@ def rustypot(name: str, servos: int) -> Iterator[Cycle]:
 
 
 def play(cycle: Cycle, count: int) -> Round:
-    """One round of a client in this process."""
+    """Run one round of a client in this process."""
     trips = np.empty(count)
     clock = time.perf_counter
     cpu, start = time.process_time(), clock()
@@ -181,7 +186,7 @@ def play(cycle: Cycle, count: int) -> Round:
 
 
 def play_c(binary: Path, name: str, servos: int, count: int, writes: int) -> Round:
-    """One round of the client in C."""
+    """Run one round of the client written in C."""
     words = [binary, "client", name, str(servos), str(count), str(writes)]
     text = subprocess.run(words, check=True, capture_output=True, text=True).stdout
     cpu, p50, each = map(int, text.split())
@@ -202,7 +207,7 @@ Rounds = dict[str, list[Round]]
 
 
 def measure(binary: Path, servos: int, byte_ns: int, rounds: int, count: int) -> Rounds:
-    """All clients by turns, every round beginning with another."""
+    """Run all clients in turn; every round starts with a different one."""
     results: Rounds = {}
     with ExitStack() as stack:
         cycles = {}
@@ -231,7 +236,7 @@ def medians(results: Rounds) -> dict[str, Round]:
 
 
 def report(at_once: Rounds, wired: Rounds, samples_cpu: dict[str, float]) -> dict[str, Any]:
-    """The figures that are held against the targets."""
+    """The figures that are compared with the targets."""
 
     def compare(results: Rounds, other: str, figure: Callable[[Round, Round], float]) -> float | None:
         if other not in results:
@@ -280,11 +285,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="one JSON object and nothing else")
     parser.add_argument("--servos", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=42, help="at 1 Mbaud; twice as many at once")
-    parser.add_argument("--cycles", type=int, default=100, help="a round at 1 Mbaud; three times as many at once")
+    parser.add_argument("--rounds", type=int, default=42, help="rounds at 1 Mbaud; twice as many without delay")
+    parser.add_argument(
+        "--cycles", type=int, default=100, help="cycles per round at 1 Mbaud; three times as many without delay"
+    )
     options = parser.parse_args()
     with responder_binary() as binary:
-        # At once and at 1 Mbaud by turns as well: a virtual machine's neighbours come and go within half a minute.
+        # Alternate between both cases too: the load from other virtual machines changes within half a minute.
         at_once: Rounds = {}
         wired: Rounds = {}
         for _ in range(PARTS):

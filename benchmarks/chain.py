@@ -1,19 +1,19 @@
-"""Spatial arms of four and six joints: what the estimator finds, against filtered least squares on the same recordings.
+"""Spatial arms with four and six joints: accuracy of the estimator and of filtered least squares on the same data.
 
     python benchmarks/chain.py [--json] [--seeds N] [--joints 4 6]
 
-The arms are configs/open_manipulator_x_like.urdf and configs/viperx_300_like.urdf. The truth has masses 20 % above or
-below these (link by link at random), centres of mass up to 1 cm aside, and drives drawn at random: friction that sticks
-with a Stribeck rise, a current loop's lag of 1 ms. Each follows a finite Fourier path of 10 s at 400 Hz by feed-forward
-of the wrong model and a spring and damper in software; angles are rounded to 4096 steps a turn and currents to the
-servo's. One settled period is the recording; a second path is held out.
+The arms are configs/open_manipulator_x_like.urdf and configs/viperx_300_like.urdf. The true arms have masses 20 %
+above or below these (at random for each link), centres of mass shifted by up to 1 cm, and randomly drawn drives: static
+friction with a Stribeck rise, and a current-loop lag of 1 ms. Each follows a finite Fourier path of 10 s at 400 Hz by
+feed-forward from the inaccurate model and a software spring and damper; angles are rounded to 4096 steps per turn and
+currents to the servo's ticks. One settled period is recorded; a second path is held out.
 
-Of each number of joints, the worst of the seeds:
+Figures for each number of joints, worst of all seeds:
 
 torque_error_percent   rigid-body torque on the held-out path: RMS error over RMS, worst joint
 base_median_percent    median error of the base parameters that make up a tenth of some joint's torque, or more
-residual_ticks         what stage 2 leaves, worst joint; rounding alone leaves 0.289
-held_out_percent       free prediction of the held-out motion under its feedback: RMS error over motion RMS, worst joint
+residual_ticks         residual of stage 2, worst joint; rounding alone leaves 0.289
+held_out_percent       closed-loop prediction of the held-out motion: RMS error over motion RMS, worst joint
 coverage_95            share of base parameters within their 95 % intervals, over all seeds
 seconds                both stages, compiled, one core; processor_seconds the same where other work shares it
 iterations             simulations with all sensitivities
@@ -29,6 +29,7 @@ import argparse
 import json
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,20 +54,21 @@ from hil.estimator.simulation.closed_loop import Feedback, Stabilised
 from hil.fakes.plants.arm import Drive, armature
 from hil.fakes.plants.chain import SpatialChain
 from hil.fakes.plants.chain_arm import ChainArm
+from hil.study.jobs import each
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RATE, PERIOD = 400.0, 10.0
 TICK, CURRENT_TICK = 2 * np.pi / 4096, 2.69e-3
 HIGHEST = 1.5  # Hz
-SPRING, DAMPING = 3.0, 0.7  # Hz, of the software's spring on the described inertia; of critical damping
+SPRING, DAMPING = 3.0, 0.7  # Hz, natural frequency of the software spring with the described inertia; damping ratio
 CUTOFFS = (4.0, 8.0, 16.0)  # Hz
 LARGE = 0.1
-ARMATURE = 0.01  # kg m^2: what the feed-forward supposes
+ARMATURE = 0.01  # kg m^2, assumed by the feed-forward
 
 
 @dataclass(frozen=True)
 class Bench:
-    """An arm as its servos make it: torque constants [N m/A], limits [A], typical Coulomb friction [N m]."""
+    """An arm's path and drives: torque constants [N m/A], current limits [A], typical Coulomb friction [N m]."""
 
     urdf: str
     centre: tuple[float, ...]
@@ -101,7 +103,7 @@ BENCHES = {
 
 @dataclass(frozen=True)
 class Setup:
-    """A true arm and what is known of it before."""
+    """A true arm and the prior knowledge about it."""
 
     arm: ChainArm
     base: BaseParameters
@@ -110,14 +112,14 @@ class Setup:
 
     @property
     def truth(self) -> np.ndarray:
-        """Base parameters [SI]."""
+        """True base parameters [SI]."""
         links = np.stack([body.parameters for body in self.arm.bodies])
         rotors = [armature(drive) for drive in self.arm.drives]
         return self.base.of_all(np.column_stack((links, rotors)).reshape(-1))
 
 
 def set_up(bench: Bench, seed: int) -> Setup:
-    """An arm drawn at random around the description."""
+    """Draw an arm at random around the description."""
     rng = np.random.default_rng(seed)
     path = CONFIGS / f"{bench.urdf}.urdf"
     names = [joint.name for joint in read_urdf(path).joints]
@@ -156,7 +158,7 @@ def path_of(bench: Bench, setup: Setup, seed: int) -> Motion:
 
 
 def record(bench: Bench, setup: Setup, path: Motion) -> SettledPeriod:
-    """The second period of the true arm following `path`."""
+    """Simulate the true arm on `path` and return its second period."""
     chain = setup.base.chain
     constant, limit, coulomb = (np.array(each) for each in (bench.torque_constant, bench.limit, bench.coulomb))
     stiffness = np.diag(mass_matrix(chain, setup.described, np.array(bench.centre, dtype=float)))
@@ -184,7 +186,7 @@ def record(bench: Bench, setup: Setup, path: Motion) -> SettledPeriod:
 
 
 def errors(setup: Setup, value: np.ndarray, path: Motion) -> dict[str, float]:
-    """Of base parameters `value`, on the held-out path."""
+    """Errors of the base parameters `value`, evaluated on the held-out path."""
     Y = setup.base.regressor(path.position, path.velocity, path.acceleration)
     truth = setup.truth
     right = Y @ truth
@@ -254,6 +256,17 @@ def measure(joints: int, seed: int) -> dict[str, Any]:
     }
 
 
+_COMPILED: set[int] = set()
+
+
+def _compiled(joints: int, seed: int) -> dict[str, Any]:
+    """`measure`, which a worker does once before its first for everything to be compiled."""
+    if joints not in _COMPILED:
+        measure(joints, 1)
+        _COMPILED.add(joints)
+    return measure(joints, seed)
+
+
 def worst(found: list[dict[str, Any]]) -> dict[str, Any]:
     """The worst of the seeds, None where one has none; coverage over all of them."""
     result: dict[str, Any] = {}
@@ -277,12 +290,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--jobs", type=int, default=1, help="workers; more than one disturb each other's times")
     parser.add_argument("--joints", type=int, nargs="+", default=[4, 6], choices=sorted(BENCHES))
     given = parser.parse_args()
     result: dict[str, Any] = {"arms": {}}
     for joints in given.joints:
-        measure(joints, 1)  # compiles
-        result["arms"][str(joints)] = worst([measure(joints, seed) for seed in range(1, given.seeds + 1)])
+        seeds = range(1, given.seeds + 1)
+        result["arms"][str(joints)] = worst(each(partial(_compiled, joints), seeds, count=given.jobs))
     if given.json:
         print(json.dumps(result))
         return

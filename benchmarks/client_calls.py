@@ -1,7 +1,7 @@
-"""What one client can do with a fake arm, each call with its result, as one JSON line: CLIENT DEVICE.
+"""Calls of one client against a fake arm, with their results as one JSON line; arguments: CLIENT DEVICE.
 
-Runs in any environment that has the client; it needs nothing of hil. `benchmarks/clients.py` calls it. A call that
-raises, or whose result is not what a real servo would give, is wrong.
+This script runs in any environment that has the client and needs nothing of hil; `benchmarks/clients.py` calls it. A
+call is wrong if it raises or if its result differs from that of a real servo.
 """
 
 import builtins
@@ -17,7 +17,7 @@ from typing import Any
 
 BAUD = 1_000_000
 Call = tuple[str, Callable[[], Any], Any]
-"""A name, what to do, and what must come of it; a function of the result where that is no single value."""
+"""Name, call, and expected result: a value, or a predicate if several values are correct."""
 
 
 def near(wanted: float, off: float) -> Callable[[Any], bool]:
@@ -29,7 +29,7 @@ def anything(_: Any) -> bool:
 
 
 def dynamixel_sdk(device: str) -> Iterator[Call]:
-    """fake_two_link: two XM430-W350, IDs 1 and 2."""
+    """Calls of dynamixel-sdk on fake_two_link: two XM430-W350, IDs 1 and 2."""
     import dynamixel_sdk as sdk
 
     port, handler = sdk.PortHandler(device), sdk.PacketHandler(2.0)
@@ -67,7 +67,7 @@ def dynamixel_sdk(device: str) -> Iterator[Call]:
 
 
 def dynamixel_easy_sdk(device: str) -> Iterator[Call]:
-    """koch: XL430-W250 and XL330-M288."""
+    """Calls of dynamixel_easy_sdk on koch: XL430-W250 and XL330-M288."""
     from dynamixel_easy_sdk.connector import Connector
     from dynamixel_easy_sdk.data_types import OperatingMode
 
@@ -122,7 +122,7 @@ def dynamixel_easy_sdk(device: str) -> Iterator[Call]:
 
 
 def rustypot(device: str) -> Iterator[Call]:
-    """fake_two_link, through the controller of an XL430, whose registers stand at the same addresses."""
+    """Calls of rustypot on fake_two_link, through its XL430 controller, whose registers have the same addresses."""
     import rustypot as library
 
     client = library.Xl430PyController(device, BAUD, 0.5)
@@ -143,7 +143,7 @@ def rustypot(device: str) -> Iterator[Call]:
 
 
 def dxl2(device: str) -> Iterator[Call]:
-    """fake_two_link, through dynamixel-python."""
+    """Calls of dynamixel-python on fake_two_link."""
     library = importlib.import_module("dxl2")
     bus = library.v2.MotorBus(device, BAUD, timeout=0.3)
     yield "connect", bus.connect, anything
@@ -173,10 +173,10 @@ def dxl2(device: str) -> Iterator[Call]:
 
 
 def pypot(device: str) -> Iterator[Call]:
-    """xl320: two XL-320; pypot speaks Protocol 2.0 to no other servo."""
+    """Calls of pypot on xl320: two XL-320, the only servos with which pypot uses Protocol 2.0."""
     from pypot.dynamixel import Dxl320IO
 
-    # It drops what was sent and not yet taken before each packet: on a terminal a Sync Write that nobody has read yet.
+    # It flushes unsent output before each packet, which on a pty would drop a Sync Write that has not been read yet.
     importlib.import_module("serial").Serial.flushOutput = lambda _: None
     io = Dxl320IO(device, baudrate=BAUD, timeout=0.3)
     yield "ping", lambda: io.ping(1), True
@@ -193,7 +193,7 @@ def pypot(device: str) -> Iterator[Call]:
 
 
 def lerobot_bus(device: str) -> Iterator[Call]:
-    """koch, through LeRobot's DynamixelMotorsBus."""
+    """Calls of LeRobot's DynamixelMotorsBus on koch."""
     from lerobot.motors import Motor, MotorNormMode
     from lerobot.motors.dynamixel import DynamixelMotorsBus
 
@@ -230,7 +230,7 @@ def lerobot_bus(device: str) -> Iterator[Call]:
 
 
 def lerobot_koch(device: str) -> Iterator[Call]:
-    """koch, through LeRobot's KochFollower as it is; the person is `hil hand`."""
+    """Calls of LeRobot's unmodified KochFollower on koch; `hil hand` takes the place of the person."""
     import tempfile
     from pathlib import Path
 
@@ -284,7 +284,7 @@ def lerobot_koch(device: str) -> Iterator[Call]:
 
 
 def lerobot_shadows(device: str) -> Iterator[Call]:
-    """viperx_300: an arm as in ALOHA, whose shadow servos follow through their Secondary ID."""
+    """Calls of LeRobot on viperx_300: an arm as in ALOHA, with shadow servos that follow through their Secondary ID."""
     from lerobot.motors import Motor, MotorNormMode
     from lerobot.motors.dynamixel import DynamixelMotorsBus
 
@@ -322,11 +322,11 @@ CLIENTS: dict[str, tuple[Callable[[str], Iterator[Call]], str]] = {
     "lerobot_koch": (lerobot_koch, "lerobot"),
     "lerobot_shadows": (lerobot_shadows, "lerobot"),
 }
-"""By name: the calls, and the package on PyPI."""
+"""By client name: its calls, and its package on PyPI."""
 
 
 def run(name: str, device: str) -> dict[str, Any]:
-    """The results of one client's calls; `missing` where it is not installed here."""
+    """Results of one client's calls; `missing` if it is not installed here."""
     calls, package = CLIENTS[name]
     try:
         version = importlib.metadata.version(package)
@@ -343,7 +343,7 @@ def run(name: str, device: str) -> dict[str, Any]:
 
 
 def _be_patient() -> None:
-    """dynamixel-sdk gives a reply 34 ms on the wall clock, which a busy machine sometimes sleeps through."""
+    """Extend dynamixel-sdk's reply timeout of 34 ms, which a busy machine sometimes exceeds."""
     try:
         importlib.import_module("dynamixel_sdk.port_handler").LATENCY_TIMER = 200
     except ImportError:
@@ -351,7 +351,7 @@ def _be_patient() -> None:
 
 
 def _wrong(act: Callable[[], Any], wanted: Any) -> str:
-    """What is wrong with a call's result; nothing where it is right."""
+    """Describe what is wrong with a call's result; empty if it is correct."""
     try:
         got = act()
         right = wanted(got) if callable(wanted) else got == wanted

@@ -1,11 +1,11 @@
-"""Clients that nobody here wrote, each let loose on the fake bus over a terminal; every call with its result.
+"""Independent clients on the fake bus over a pseudo-terminal, with the result of every call.
 
-    python benchmarks/clients.py                                    those that are installed here
-    python benchmarks/clients.py --python /path/to/venv/bin/python  and there (LeRobot needs an environment of its own)
-    python benchmarks/clients.py --write                            remakes the table in docs/fake-bus.md
+    python benchmarks/clients.py                                    runs those installed in this environment
+    python benchmarks/clients.py --python /path/to/venv/bin/python  and those there (LeRobot needs its own)
+    python benchmarks/clients.py --write                            updates the table in docs/fake-bus.md
     python benchmarks/clients.py --json                             one JSON object, with every call
 
-The clients' calls stand in `client_calls.py`, which needs nothing of hil.
+The clients' calls are in `client_calls.py`, which needs nothing of hil.
 """
 
 import argparse
@@ -36,7 +36,7 @@ ARMS = {
     "pypot": "xl320",
     "lerobot_shadows": "viperx_300",
 }
-"""Of the clients that do not drive the arm `koch`."""
+"""Fake arms of the clients that do not use `koch`."""
 
 XL320 = """[fake]
 plant = "hil.fakes.plants.independent:make_plant"
@@ -63,7 +63,7 @@ drives = [{ mass = 0.017, rotor_inertia = 1e-8, gear_ratio = 238.0, torque_const
 
 @contextmanager
 def served(arm: str) -> Iterator[str]:
-    """The path of a terminal behind which this arm is served."""
+    """Serve this arm on a pseudo-terminal; yields the terminal's path."""
     with tempfile.TemporaryDirectory() as folder:
         if arm == "xl320":
             arm = str(Path(folder) / "xl320.toml")
@@ -83,7 +83,7 @@ def served(arm: str) -> Iterator[str]:
 
 
 def run(name: str, pythons: Sequence[str]) -> dict[str, Any]:
-    """One client in the first of these environments that has it."""
+    """Run one client in the first of these environments that has it."""
     outcome: dict[str, Any] = {"client": name, "missing": CLIENTS[name][1]}
     hil = [sys.executable, "-m", "hil"]
     environment = {**os.environ, "HIL": json.dumps(["env", f"PYTHONPATH={ROOT}", *hil])}
@@ -124,7 +124,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--python", action="append", default=[], help="another environment's interpreter")
     parser.add_argument("--only", action="append", choices=sorted(CLIENTS), help="this client; may be repeated")
-    parser.add_argument("--write", action="store_true", help="remake the table in docs/fake-bus.md")
+    parser.add_argument("--write", action="store_true", help="update the table in docs/fake-bus.md")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     pythons = [sys.executable, *options.python]

@@ -1,20 +1,20 @@
-"""A real arm recorded by others, DFKI double pendulum C.1: link 1's length, and predictions of swing-ups.
+"""A real arm recorded by others, the DFKI double pendulum C.1: length of link 1 and predictions of swing-ups.
 
     python benchmarks/dfki.py DIR [--json] [--torque con|meas] [--floor]
 
 DIR holds c1_sinusoids_*.csv and c1_swing_up_*.csv. Multiple shooting and filtered inverse-dynamics least squares
-(IDIM-LS) get the sinusoids; `length` = 9.81 coupling / gravity_2 must be 0.2 m. The swing-ups are not fitted: both
-predict them for half a second at a time from the same measured states. IDIM-LS gets the delay of the torque that leaves
-it the least residual. Its cut-offs no rule tells in advance: `customary` is five times the highest tone (8 Hz),
-`chosen` predicts the sinusoids best, `best` predicts the swing-ups best, which nobody could have known.
+(IDIM-LS) are fitted to the sinusoids; `length` = 9.81 coupling / gravity_2 should be 0.2 m. The swing-ups are held out:
+both predict them for half a second at a time from the same measured states. IDIM-LS uses the torque delay with the
+smallest residual. No rule gives its cut-off in advance: `customary` is five times the highest tone (8 Hz),
+`chosen` predicts the sinusoids best, `best` predicts the swing-ups best, which cannot be known in advance.
 
-The encoders are zeroed anew at every start, while dry friction holds the arm off its rest: by up to 0.07 rad here, and
-half a second beside the upright multiplies that by ten. So two comparisons: `swing_up` takes the zeros as 0, as a
-reader of the file would; for `swing_up_zeroed` each half of a swing-up gets its two zeros from the other half, the
-parameters kept, and IDIM-LS counts with the better of the two.
+The encoders are zeroed at every start, when dry friction may hold the arm away from rest: by up to 0.07 rad here, and
+half a second near the upright pose multiplies that by ten. Hence two comparisons: `swing_up` takes the zeros as 0, as a
+reader of the file would; for `swing_up_zeroed`, the two zeros of each half of a swing-up are fitted to the other half
+with fixed parameters, and the better of the two results counts for IDIM-LS.
 
---floor asks what stands between these predictions and none at all, and for that alone looks at what is predicted: zeros
-from the very swing-up, parameters fitted to the swing-ups, and to all recordings together.
+--floor estimates how much of the error is unavoidable, using the predicted data themselves: encoder zeros
+fitted to each swing-up, and parameters fitted to the swing-ups or to all recordings together.
 """
 
 import argparse
@@ -29,16 +29,17 @@ from machine import machine
 from scipy.optimize import minimize
 from scipy.signal import savgol_filter
 
-from hil.config.csv_columns import load_csv_config
+from hil.config.csv_columns import load_recording_config
 from hil.estimation.model_from_config import wanted_model
-from hil.estimation.unsettled.csv_recording import read_csv
 from hil.estimator.baselines.idim import fit_inverse_dynamics, uniform
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.selection.prediction import prediction_errors, prediction_rms
+from hil.recordings.convert import convert
+from hil.recordings.csv_file import read_csv_table
 
 CONFIG = Path(__file__).parents[1] / "configs" / "recordings" / "dfki_double_pendulum.toml"
-SEPARATE = 30.0  # Hz, of positions where regressors and torques have a cut-off of their own
+SEPARATE = 30.0  # Hz, cut-off of positions if regressors and torques have a separate one
 CUTOFFS = {f"{each:g} Hz": (each, each) for each in (3.0, 4.0, 5.0, 8.0, 15.0, 30.0)} | {
     f"{each:g} Hz, positions {SEPARATE:g} Hz": (each, SEPARATE) for each in (2.0, 3.0, 4.0, 8.0)
 }
@@ -52,14 +53,14 @@ GRAVITY = 9.81
 
 
 def load(folder: Path, pattern: str, torque: str) -> list[Recording]:
-    columns = load_csv_config(CONFIG).columns
+    columns = load_recording_config(CONFIG).columns
     between = "linear" if torque == "meas" else "held"
     columns = columns.model_copy(update={"torque": [f"tau_{torque}1", f"tau_{torque}2"], "between": between})
-    return [read_csv(path, columns) for path in sorted(folder.glob(pattern))]
+    return [convert(read_csv_table(path), columns).recordings[0] for path in sorted(folder.glob(pattern))]
 
 
 def idle_inertia(folder: Path) -> list[float]:
-    """What the measured torque of a joint that nothing drives holds per acceleration [kg m^2], joint by joint."""
+    """Regression of the measured torque of an undriven joint on its acceleration [kg m^2], for each joint."""
     pairs = list(zip(*(load(folder, "c1_sinusoids_*.csv", torque) for torque in ("con", "meas")), strict=True))
     found = []
     for joint in range(2):
@@ -128,14 +129,14 @@ def filtered_fit(sines: list[Recording], swings: list[Recording], cutoffs: tuple
 
 
 def shooting_fit(recordings: list[Recording]) -> ShootingEstimate:
-    config = load_csv_config(CONFIG)
+    config = load_recording_config(CONFIG)
     model = wanted_model(config.model, 2).without("zeros")
     start = fit_inverse_dynamics(recordings, START_CUTOFF, WIDTH).value
     return estimate_by_shooting(recordings, model, start, length=config.columns.segment, zeros=True)
 
 
 def floor(sines: list[Recording], swings: list[Recording], parameters: dict[str, float]) -> dict[str, Any]:
-    """RMS over the swing-ups [rad] of what was fitted to them, in part or in whole."""
+    """RMS prediction errors of the swing-ups [rad] for fits that use the swing-ups in part or completely."""
     errors, _ = prediction_errors(swings, parameters, HORIZON, 2)
     squares = np.sort(np.sum(errors**2, axis=1))[::-1]
     hindsight = np.concatenate([zeros_of(swing, parameters) for swing in swings])
@@ -194,7 +195,7 @@ def measure(folder: Path, torque: str, with_floor: bool) -> dict[str, Any]:
 
 def show(found: dict[str, Any]) -> None:
     print(f"length {found['length']:.4f} +- {found['length_std']:.4f} m, {found['model']}, {found['seconds']:.1f} s")
-    print("measured torque of a joint that nothing drives, per acceleration:", found["idle_inertia"], "kg m^2")
+    print("measured torque of an undriven joint per acceleration:", found["idle_inertia"], "kg m^2")
     print(f"{'':28s} {'length':>7s} {'sinusoids':>10s} {'swing-ups':>10s} {'zeros from the other half':>26s}")
     rows = {"shooting": found} | {f"IDIM-LS {name}": entry for name, entry in found["filtered"].items()}
     for name, entry in rows.items():

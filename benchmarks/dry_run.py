@@ -1,205 +1,53 @@
-"""What dry runs foresee against what then happens, on realistic fake arms.
+"""Predictions of dry runs compared with the subsequent experiments, on realistic fake arms.
 
     python benchmarks/dry_run.py [--json] [--arms N] [--pilots N]
 
 `--arms` arms are drawn from a prior with 30 % spread; each plays, in virtual time, the largest experiment that a dry
-run of that prior allows. The arm of configs/first_time.toml then goes the whole way, from joint limits and link lengths
-only: pilot, full; with --pilots N, so do N - 1 more arms drawn from the prior, and the least of all counts.
+run of that prior allows. The arm of configs/first_time.toml is then identified from joint limits and link lengths
+only, with pilot and full run; with --pilots N, so are N - 1 more arms drawn from the prior; the smallest value counts.
 
-within_quantile       share of arms whose seen peaks all stay within the predicted 99 %
+within_quantile       share of arms whose measured peaks all stay within the predicted 99 %
 limit_touched         arms that the guard had to stop
-range_used            of the allowed positions, by the full run's worse joint; the least of the pilot arms
-std_ratio_pilot_full  worst relative standard error (offsets against dry friction) of the pilot over the full run's; the
-                      least of the pilot arms
-std_ratio_least       the same parameter by parameter: the least of all
-predicted_over_seen   after the pilot: largest relative distance of predicted from seen peak
+range_used            share of the position range used by the full run's worse joint; smallest of the pilot arms
+std_ratio_pilot_full  worst relative standard error (offsets relative to dry friction) of the pilot over the full run's;
+                      smallest of the pilot arms
+std_ratio_least       the same ratio per parameter, smallest of all
+predicted_over_seen   after the pilot: largest relative deviation of a predicted from a measured peak
 worst_std_ratio       designed over plain multisine, same limits and duration: worst relative standard error
 """
 
 import argparse
 import json
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hil.config.schema import Config, parse_config
-from hil.dry_run.amplitude import Amplitude, largest_amplitude, with_peaks
-from hil.dry_run.ensemble import prior_ensemble
-from hil.dry_run.prediction import GUARDED, peaks_of
-from hil.dry_run.prior import quantities
+from hil.dry_run.amplitude import with_peaks
 from hil.dry_run.waves import design_problem
-from hil.errors import NotSettled, SafetyStop
+from hil.errors import SafetyStop
 from hil.estimation.settled_estimate import estimate_run
-from hil.experiment.run import run_experiment
 from hil.pilot import identify_in_steps
-from hil.results.result import Result, SettledResult
-from hil.runs.recording import load_samples
+from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
+from hil.study.jobs import each
+from tests.support.dry_runs import drawn_arm, fake_of, prior_study, study_config, worst_relative_std
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-PRIOR = """[arm.prior]
-spread = 0.3
-rough_spread = 0.3
-link_mass = [0.180, 0.200]
-link_centre = [0.081, 0.112]
-link_inertia = [7.0e-4, 2.9e-4]
-servo_mass = [0.082, 0.082]
-armature = [0.010, 0.010]
-viscous = [0.045, 0.040]
-coulomb = [0.055, 0.050]
-"""
-ARMS_IN_PRIOR = 192
-"""Size of the predicting ensemble, which contains none of the arms that are run."""
 
 
-def study_config() -> Config:
-    """A short experiment on the realistic arm, known to 30 %."""
-    text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
-    for old, new in (
-        ("[experiment]\n", f"{PRIOR}\n[experiment]\nheld_out = false\nsettle_within = 0.2\n"),
-        ("rate = 400.0 ", "rate = 200.0 "),
-        ("period = 10.0 ", "period = 2.0 "),
-        ("band = [0.1, 5.0]", "band = [0.5, 5.0]"),
-        ("ramp = 1.0 ", "rest = 0.1\nramp = 0.5 "),
-    ):
-        assert old in text, old
-        text = text.replace(old, new, 1)
-    return parse_config(text, CONFIGS / "first_time.toml")
-
-
-def drawn_arm(config: Config, random: np.random.Generator) -> Config:
-    """The configuration with a fake arm drawn from its prior, torque constants included."""
-    assert config.fake is not None and config.arm.link_lengths is not None
-    drawn = {
-        name: quantity.draw(random, 1)[0]
-        for name, quantity in quantities(config, np.array(config.arm.link_lengths)).items()
-    }
-    arm = config.fake.arm
-    links = tuple(
-        link.model_copy(
-            update={
-                "mass": float(drawn["link_mass"][i]),
-                "centre": float(drawn["link_centre"][i]),
-                "inertia": float(drawn["link_inertia"][i]),
-            }
-        )
-        for i, link in enumerate(arm.links)
-    )
-    drives = tuple(
-        drive.model_copy(
-            update={
-                "mass": float(drawn["servo_mass"][i]),
-                "rotor_inertia": float(drawn["armature"][i]) / drive.gear_ratio**2,
-                "viscous": float(drawn["viscous"][i]),
-                "coulomb": float(drawn["coulomb"][i]),
-                "stribeck_rise": float(drawn["stribeck_rise"][i]),
-                "torque_constant": drive.torque_constant * float(np.exp(0.083 * random.standard_normal())),
-            }
-        )
-        for i, drive in enumerate(arm.drives)
-    )
-    changed = arm.model_copy(update={"links": links, "drives": drives})
-    return config.model_copy(update={"fake": config.fake.model_copy(update={"arm": changed})})
-
-
-def run_on(config: Config, found: Amplitude, folder: Path) -> np.ndarray | None:
-    """Seen peaks (quantities, joints); None when the guard stopped the arm."""
-    run = RunFolder.create(folder / "run", config)
-    try:
-        run_experiment(config, run, config.path, lambda _: None, found.plan)
-    except SafetyStop:
-        return None
-    except NotSettled:
-        pass  # an odd arm; its peaks count all the same
-    samples = load_samples(run.samples_path, len(config.joints))
-    return peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
-
-
-def prior_study(arms: int, seed: int = 1) -> dict[str, Any]:
-    """The largest safe experiment of one prior, on arms drawn from it."""
-    config = study_config()
-    found = largest_amplitude(config, prior_ensemble(config, ARMS_IN_PRIOR))
-    quantile = found.prediction.quantile
-    random = np.random.default_rng((seed, 21))
-    within = touched = 0
-    for _ in range(arms):
-        with fake_of(drawn_arm(config, random)) as (drawn, folder):
-            seen = run_on(drawn, found, folder)
-        touched += seen is None
-        within += seen is not None and is_within(config, seen, quantile)
-    return {"arms": arms, "within_quantile": within / arms, "limit_touched": touched}
-
-
-def is_within(config: Config, seen: np.ndarray, quantile: np.ndarray) -> bool:
-    """Whether all seen peaks stay within the predicted ones, an encoder step and a tick of velocity aside."""
-    low, high, velocity = seen[:GUARDED]
-    return bool(
-        (low >= quantile[0] - 0.0016).all()
-        and (high <= quantile[1] + 0.0016).all()
-        and (velocity <= quantile[2] + 0.024).all()
-    )
-
-
-class fake_of:  # noqa: N801  (a context manager that reads like a function)
-    """A configuration file of its own for a drawn arm, since fake:// reads the arm from a file."""
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._folder = tempfile.TemporaryDirectory()
-
-    def __enter__(self) -> tuple[Config, Path]:
-        folder = Path(self._folder.name)
-        path = folder / "arm.toml"
-        path.write_text(with_fake(self._config), encoding="utf-8")
-        return self._config.model_copy(update={"path": path}), folder
-
-    def __exit__(self, *_: object) -> None:
-        self._folder.cleanup()
-
-
-def with_fake(config: Config) -> str:
-    """The configuration's text with its fake arm's numbers in place of the file's."""
-    text = config.path.read_text(encoding="utf-8")
-    assert config.fake is not None
-    head, _, _ = text.partition("[[fake.arm.links]]")
-    arm = config.fake.arm
-    lines = [head]
-    for table, parts in (("links", arm.links), ("drives", arm.drives)):
-        for part in parts:
-            values = "\n".join(f"{k} = {v}" for k, v in part.model_dump(exclude_defaults=True).items() if v is not None)
-            lines.append(f"[[fake.arm.{table}]]\n{values}\n")
-    return "\n".join(lines)
-
-
-def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
-    """The whole way from joint limits and link lengths, on arms drawn from the prior."""
+def pilot_study(pilots: int, seed: int = 2, jobs: int | None = None) -> dict[str, Any]:
+    """Identify arms drawn from the prior, starting from joint limits and link lengths only."""
     plain = parse_config((CONFIGS / "first_time.toml").read_text(encoding="utf-8"), CONFIGS / "first_time.toml")
     random = np.random.default_rng((seed, 22))
-    used, ratios, least, distances, touched = [], [], [], [], 0
-    for number in range(pilots):
-        config = plain if number == 0 else plain.model_copy(update={"fake": drawn_arm(study_config(), random).fake})
-        with fake_of(config) as (drawn, folder):
-            run = RunFolder.create(folder / "run", drawn)
-            try:
-                _, result = identify_in_steps(drawn, run, drawn.path, lambda _: None, lambda _: None)
-            except SafetyStop:
-                touched += 1
-                continue
-            pilot = first_estimate(folder / "run")
-        seen, median = map(np.array, (result.steps[-1].seen, result.steps[-1].predicted_median))
-        allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
-        used.append(float(((seen[1] - seen[0]) / allowed).min()))
-        ratios.append(worst_relative_std(pilot) / worst_relative_std(result))
-        least.append(min(pilot.parameters[n].std / e.std for n, e in result.parameters.items()))
-        rest = np.array(config.arm.rest_pose)
-        moved = np.stack((seen[0] - rest, seen[1] - rest, seen[2]))
-        foreseen = np.stack((median[0] - rest, median[1] - rest, median[2]))
-        distances.append(float(np.abs(foreseen / moved - 1).max()))
+    drawn = [plain.model_copy(update={"fake": drawn_arm(study_config(), random).fake}) for _ in range(pilots - 1)]
+    done = each(_pilot, [plain, *drawn][:pilots], count=jobs)
+    found = [outcome for outcome in done if outcome is not None]
+    used, ratios, least, distances = zip(*found, strict=True) if found else ((), (), (), ())
     return {
         "pilots": pilots,
-        "pilot_limit_touched": touched,
+        "pilot_limit_touched": len(done) - len(found),
         "range_used": min(used, default=0.0),
         "std_ratio_pilot_full": min(ratios, default=0.0),
         "std_ratio_least": min(least, default=0.0),
@@ -207,21 +55,36 @@ def pilot_study(pilots: int, seed: int = 2) -> dict[str, Any]:
     }
 
 
+def _pilot(config: Config) -> tuple[float, float, float, float] | None:
+    """Range used, ratios of standard deviations, and distance of the prediction of one arm; None if it was stopped."""
+    with fake_of(config) as (drawn, folder):
+        run = RunFolder.create(folder / "run", drawn)
+        try:
+            _, result = identify_in_steps(drawn, run, drawn.path, lambda _: None, lambda _: None)
+        except SafetyStop:
+            return None
+        pilot = first_estimate(folder / "run")
+    seen, median = map(np.array, (result.steps[-1].seen, result.steps[-1].predicted_median))
+    allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
+    rest = np.array(config.arm.rest_pose)
+    moved = np.stack((seen[0] - rest, seen[1] - rest, seen[2]))
+    foreseen = np.stack((median[0] - rest, median[1] - rest, median[2]))
+    return (
+        float(((seen[1] - seen[0]) / allowed).min()),
+        worst_relative_std(pilot) / worst_relative_std(result),
+        min(pilot.parameters[n].std / e.std for n, e in result.parameters.items()),
+        float(np.abs(foreseen / moved - 1).max()),
+    )
+
+
 def first_estimate(run: Path) -> SettledResult:
-    """Of the first pilot in which every joint moved: the last one below the run."""
+    """Estimate from the last pilot, the first one in which every joint moved."""
     last = sorted(run.glob("pilot-*"), key=lambda path: int(path.name.removeprefix("pilot-")))[-1]
     return estimate_run(RunFolder.open(last))
 
 
-def worst_relative_std(result: Result) -> float:
-    """Over the base parameters; an offset counts against its joint's dry friction, since it may be zero."""
-    entries = result.parameters
-    against = {name: entries[name.replace("offset", "coulomb")].value for name in entries}
-    return max(entry.std / abs(against[name]) for name, entry in entries.items())
-
-
 def design_study(seeds: int = 2) -> dict[str, Any]:
-    """Designed against plain, both scaled to the same limits, judged on the true arm's nominal model."""
+    """Compare designed and plain multisines, both scaled to the same limits, on the nominal model of the true arm."""
     from hil.estimator.excitation.optimal_design import design_optimal
     from hil.estimator.models.parameters import Physics
     from hil.fakes.plants.arm import base_parameters
@@ -250,8 +113,13 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=200)
     parser.add_argument("--pilots", type=int, default=6)
+    parser.add_argument("--jobs", type=int, help="workers; one per core unless given")
     options = parser.parse_args()
-    measured = {**prior_study(options.arms), **pilot_study(options.pilots), **design_study()}
+    measured = {
+        **prior_study(options.arms, jobs=options.jobs),
+        **pilot_study(options.pilots, jobs=options.jobs),
+        **design_study(),
+    }
     if options.json:
         print(json.dumps(measured))
         return

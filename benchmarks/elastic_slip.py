@@ -1,18 +1,18 @@
-"""Presliding by another law than the estimator's: springs in parallel, each of which slips at a load of its own.
+"""Presliding friction with a law other than the estimator's: parallel springs, each of which slips at its own load.
 
 Iwan, "On a class of models for the yielding behavior of continuous and composite systems", Journal of Applied Mechanics
-34 (1967) 612. Unlike bristles it remembers every reversal that no later one has wiped out, and knows no rate.
+34 (1967) 612. Unlike bristles, it remembers every reversal until a larger one erases it, and is rate-independent.
 """
 
 from hil.fakes.plants.arm import Drive
 from hil.fakes.plants.motor import Motor
 
-STIFFNESS = (3.0, 1.5, 0.8, 0.4)  # of each spring, times its share of the whole
-SHARE = 1.0 / len(STIFFNESS)  # of the level at which all have slipped
+STIFFNESS = (3.0, 1.5, 0.8, 0.4)  # relative stiffness of each spring
+SHARE = 1.0 / len(STIFFNESS)  # slip load of each spring, relative to the load at which all slip
 
 
 class SlippingMotor(Motor):
-    """A drive whose dry friction is four such springs in the place of its bristles."""
+    """A drive whose dry friction consists of four such springs instead of bristles."""
 
     def __init__(self, drive: Drive) -> None:
         super().__init__(drive)

@@ -1,12 +1,12 @@
-"""What the fake bus costs: virtual time against real time, more servos, and a program on the pty.
+"""Computing time of the fake bus: in virtual time, with more servos, and with a program on the pty.
 
     python benchmarks/fake_bus.py [--json] [--seconds S] [--config CONFIG]
 
 - `times_real_time`: hil's own stream (guard, recorder, drivers) on the realistic two-link arm at 400 Hz, in virtual
-  time: arm time over CPU time, best of five runs. `bus_share_us` and `plant_share_us` are bus's and plant's of a cycle.
-- `servos_us`: one control cycle of the bus alone, a plant that costs nothing, for one to six servos.
-- `pty_*`: `hil fake --pty` in its own process, a client here that writes goals and reads states 1000 times a second for
-  S seconds at 4 Mbaud (at 1 Mbaud the bytes of a cycle and their handing over take more than a millisecond).
+  time: arm time over CPU time, best of five runs. `bus_share_us`, `plant_share_us`: time of bus and plant per cycle.
+- `servos_us`: one control cycle of the bus alone, with a trivial plant, for one to six servos.
+- `pty_*`: `hil fake --pty` in a separate process, and a client here that writes goals and reads states 1000 times a
+  second for S seconds at 4 Mbaud (at 1 Mbaud, transferring the bytes of a cycle takes more than a millisecond).
 """
 
 import argparse
@@ -33,7 +33,7 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.plants.two_link import TwoLink
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
@@ -41,7 +41,7 @@ RATE = 1000
 
 
 def streams(config_path: Path, runs: int) -> dict[str, float]:
-    """Play the configuration's experiment so many times; the best."""
+    """Play the configuration's experiment `runs` times; return the best figures."""
     config = load_config(config_path)
     best: dict[str, float] = {}
     for _ in range(runs):
@@ -63,7 +63,7 @@ def streams(config_path: Path, runs: int) -> dict[str, float]:
 
 
 def _shares(config_path: Path) -> dict[str, float]:
-    """What of a cycle bus and plant take, from one more run with clocks around them (which cost 0.3 us each)."""
+    """Time of bus and plant per cycle, from one more run with clocks around them (which take 0.3 us each)."""
     config = load_config(config_path)
     spent = {"stream": 0.0, "write": 0.0, "read": 0.0, "plant": 0.0}
     arm_seconds: list[float] = []
@@ -105,7 +105,7 @@ def _timed(
 
 
 class Free:
-    """Joints that cost nothing."""
+    """Joints that take no computing time."""
 
     def __init__(self, joints: int) -> None:
         self.joints = joints
@@ -116,10 +116,11 @@ class Free:
 
 
 def cycle_us(servos: int, cycles: int = 4000, repeats: int = 5) -> float:
-    """One control cycle of the bus with so many servos, plant aside; the median of some repeats [us]."""
+    """One control cycle of the bus with this many servos and a trivial plant; median over the repeats [us]."""
     clock = VirtualClock()
     members = [
-        Servo(load_model("XM430-W350"), number, registers={"Operating Mode": 0}) for number in range(1, servos + 1)
+        EmulatedServo(load_model("XM430-W350"), number, registers={"Operating Mode": 0})
+        for number in range(1, servos + 1)
     ]
     bus = FakeBus(members, Free(servos), clock)
     ids = range(1, servos + 1)
@@ -137,7 +138,7 @@ def cycle_us(servos: int, cycles: int = 4000, repeats: int = 5) -> float:
 
 
 def pty(seconds: float) -> dict[str, float]:
-    """A client at 1 kHz against `hil fake --pty` in another process."""
+    """Run a client at 1 kHz against `hil fake --pty` in another process."""
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder) / "arm.toml"
         text = CONFIG.read_text(encoding="utf-8")
@@ -202,12 +203,12 @@ def main() -> None:
         print(json.dumps(figures))
         return
     print(machine())
-    print(f"stream in virtual time: {figures['cycle_us']:.1f} us a cycle")
+    print(f"stream in virtual time: {figures['cycle_us']:.1f} us per cycle")
     print(f"  {figures['times_real_time']:.0f} times real time")
     print(f"  of it bus {figures['bus_share_us']:.1f} us, plant {figures['plant_share_us']:.1f} us")
     print("bus alone: " + ", ".join(f"{count}: {us:.1f} us" for count, us in figures["servos_us"].items()))
     print(f"pty: {figures['pty_rate']:.0f} cycles/s for {options.seconds:g} s, {figures['pty_wrong']} wrong replies")
-    print(f"  {figures['pty_late_cycles']} cycles late by a period and more (the client's lateness included)")
+    print(f"  {figures['pty_late_cycles']} cycles late by at least one period (including the client's own lateness)")
     print(f"  p50 {figures['pty_p50_us']:.0f} us, p99 {figures['pty_p99_us']:.0f} us")
     print(f"  CPU of the fake {100 * figures['pty_cpu_share']:.0f} % of a core")
 

@@ -1,9 +1,9 @@
-"""Random bytes and mutated packets on the fake bus: nothing may raise or hang, and the next good packet is answered.
+"""Random bytes and mutated packets on the fake bus: nothing may raise or hang, and the next valid packet is answered.
 
     python benchmarks/fake_noise.py [--json] [--packets N] [--seed N]
 
-After every tenth piece of noise, and a pause that ends what it began, a servo is pinged wherever the noise may have
-set its ID and baud rate to.
+After every tenth piece of noise, and a pause that ends anything it started, a servo is pinged at whatever ID and baud
+rate the noise may have set.
 """
 
 import argparse
@@ -17,10 +17,10 @@ from hil.drivers.packet import BROADCAST_ID, Framer, Instruction, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 ASK_EVERY = 10
-PAUSE_S = 3.0  # then boots are over, and the longest reply at the slowest baud
+PAUSE_S = 3.0  # longer than a reboot or the longest reply at the lowest baud rate
 IDS = (1, 2, 7, BROADCAST_ID)
 
 
@@ -35,17 +35,19 @@ class Still:
 
 
 class NoiseRun:
-    """A bus of two servos under noise; `asked` and `answered` count the pings between."""
+    """A bus of two servos under noise; `asked` and `answered` count the pings in between."""
 
     def __init__(self, seed: int) -> None:
         self.random = Random(seed)
         self.clock = VirtualClock()
-        self.servos = [Servo(load_model(name), number) for number, name in ((1, "XM430-W350"), (2, "XL330-M288"))]
+        self.servos = [
+            EmulatedServo(load_model(name), number) for number, name in ((1, "XM430-W350"), (2, "XL330-M288"))
+        ]
         self.bus = FakeBus(self.servos, Still(), self.clock)
         self.sent = self.asked = self.answered = 0
 
     def run(self, packets: int) -> None:
-        """Send so many pieces of noise."""
+        """Send this many pieces of noise."""
         while self.sent < packets:
             self.bus.write(self._piece())
             self.bus.read(4096, 0.0005)
@@ -58,7 +60,7 @@ class NoiseRun:
         kind = random.randrange(4)
         if kind == 0:
             return random.randbytes(random.randrange(40))
-        if kind == 1:  # rich in what headers are made of
+        if kind == 1:  # mostly header bytes
             return bytes(random.choices((0xFF, 0xFD, 0x00, 0x01, 0xFE, 0x03, 0x55, 0x82), k=random.randrange(40)))
         instruction = random.choice(list(Instruction)) if random.random() < 0.8 else random.randrange(256)
         body = random.randbytes(random.randrange(20))
@@ -86,7 +88,7 @@ class NoiseRun:
                 del packet[at + 1 :]
 
     def _ask(self) -> None:
-        """Ping a servo where it is now. Two on one ID and baud cannot answer: they are told apart first."""
+        """Ping a servo at its current ID and baud rate; servos with the same ID are given different ones first."""
         for number, servo in enumerate(self.servos, start=1):
             if servo.id == self.servos[2 - number].id:
                 servo.memory.set("ID", number)
@@ -101,7 +103,7 @@ class NoiseRun:
         self.answered += [reply.id for reply in replies] == [servo.id]
 
 
-_LED = (65, b"\x00")  # any write makes a servo take note of what its table says
+_LED = (65, b"\x00")  # any write makes a servo apply the contents of its control table
 
 
 def main() -> None:

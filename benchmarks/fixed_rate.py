@@ -1,11 +1,11 @@
-"""How late a loop at a fixed rate runs: ours against `time.sleep(dt)`.
+"""Lateness of a loop at a fixed rate: ours compared with `time.sleep(dt)`.
 
     python benchmarks/fixed_rate.py                  10 s of each loop at 500 Hz and at 1 kHz
     python benchmarks/fixed_rate.py --seconds 60 --json
 
-Lateness is the time from a deadline to the moment at which its work could begin. Drift is how much more the last
-deadlines of a run are late than the first. The top level of the JSON object holds our loop's worst over both rates.
-Then our loop is stalled on purpose, ten and a half periods long: nine deadlines must be counted as missed.
+Lateness is the time from a deadline to the moment at which its work can begin. Drift is the difference in lateness
+between the last and the first deadlines of a run. The top level of the JSON object holds our loop's worst values over
+both rates. Our loop is also stalled deliberately for ten and a half periods: it must count nine missed deadlines.
 """
 
 import argparse
@@ -33,7 +33,7 @@ Lateness = NDArray[np.float64]
 
 
 def sleep_dt(rate: float, count: int) -> tuple[Lateness, int]:
-    """What most control loops do: work, then `time.sleep(dt - elapsed)`."""
+    """The usual control loop: work, then `time.sleep(dt - elapsed)`."""
     interval = 1 / rate
     late = np.empty(count)
     start = time.perf_counter() + interval
@@ -42,12 +42,12 @@ def sleep_dt(rate: float, count: int) -> tuple[Lateness, int]:
         began = time.perf_counter()
         late[index] = began - (start + index * interval)
         time.sleep(max(0.0, interval - (time.perf_counter() - began)))
-    # Of a loop that drifts, a period counts as missed where it starts a whole one later than the one before it.
+    # In a drifting loop, a period counts as missed if its lateness grew by at least one interval.
     return late, int((np.diff(late) >= interval).sum())
 
 
 def absolute_sleep(rate: float, count: int) -> tuple[Lateness, int]:
-    """Absolute deadlines, sleeping all the way to them."""
+    """Absolute deadlines, with a plain sleep until each of them."""
     interval = 1 / rate
     late = np.empty(count)
     start = time.perf_counter() + interval
@@ -59,7 +59,7 @@ def absolute_sleep(rate: float, count: int) -> tuple[Lateness, int]:
 
 
 def ours(rate: float, count: int) -> tuple[Lateness, int]:
-    """The driver's FixedRate, with what the system permits of hil.experiment.realtime."""
+    """The driver's FixedRate with the real-time settings that the system permits."""
     late = np.empty(count)
     with real_time():
         ticks = FixedRate(WallClock(), rate)
@@ -70,7 +70,7 @@ def ours(rate: float, count: int) -> tuple[Lateness, int]:
 
 
 def ours_ordinary(rate: float, count: int) -> tuple[Lateness, int]:
-    """The driver's FixedRate as an ordinary process."""
+    """The driver's FixedRate in an ordinary process."""
     late = np.empty(count)
     ticks = FixedRate(WallClock(), rate)
     for index in range(count):
@@ -101,7 +101,7 @@ def figures(late: Lateness, missed: int) -> dict[str, Any]:
 
 
 def stalled(rate: float) -> int:
-    """Deadlines that our loop counts as missed when the work at one of them takes ten and a half periods."""
+    """Number of deadlines counted as missed when the work at one of them takes ten and a half periods."""
     ticks = FixedRate(WallClock(), rate)
     for index in range(100):
         deadline = ticks.wait().deadline
@@ -130,7 +130,7 @@ def show(result: dict[str, Any]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="one JSON object and nothing else")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each loop at each rate")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each loop at each rate")
     parser.add_argument("--rates", type=float, nargs="+", default=[500.0, 1000.0], metavar="HZ")
     options = parser.parse_args()
     with real_time() as granted:

@@ -1,11 +1,11 @@
-"""A realistic arm whose friction the tool has to find out: Stribeck, load-dependent, current lag; then with more.
+"""Automatic choice of the friction model on realistic arms: Stribeck, load dependence, current lag, and more effects.
 
     python benchmarks/friction_models.py [--json] [--seeds N]
 
 The arm of configs/fake_two_link.toml with dry friction that grows by 5 % of the motor's torque; `ripple` adds 2 % of
-torque ripple over the angle, `presliding` lets dry friction yield before it slides, by some 3 mrad. The model is chosen
-by the tool (`friction = "auto"`). The worst of N seeds; those in which the guard stops the arm are counted and passed
-over.
+torque ripple over the angle, and `presliding` adds presliding friction of about 3 mrad. The model is chosen by hil
+(`friction = "auto"`). The figures are the worst of N seeds; seeds for which the guard stops the arm are counted and
+skipped.
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""Time and memory of both stages as the period grows, and stage 1 at the usual size.
+"""Computing time and memory of both estimation stages for periods of increasing length.
 
     python benchmarks/growth.py [--json] [--most N]
 
-One settled period of the ideal arm, 4,000 to 1,000,000 samples at 400 Hz with the same lines, each size in a process
-of its own. The motion comes from the estimator's own simulation, rounded to encoder steps: only time is measured here.
+One settled period of the ideal arm, 4,000 to 1,000,000 samples at 400 Hz with the same number of lines, each size in a
+separate process. The motion comes from the estimator's own simulation, rounded to encoder steps: only time is measured.
 """
 
 import argparse
@@ -15,7 +15,6 @@ import time
 
 import numpy as np
 from machine import machine
-from recorded_arm import COMMAND_TO_SAMPLE, RATE, STEP, servo_arm
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import design_multisine
@@ -26,16 +25,17 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
 from hil.fakes.plants.arm import base_parameters
+from tests.support.recorded_arm import COMMAND_TO_SAMPLE, RATE, STEP, servo_arm
 
 SIZES = (4_000, 16_000, 62_500, 250_000, 1_000_000)
 LINES = 25  # per joint
-PEAK = (0.50, 0.30)  # N m: never past the upright, where a long motion would be chaotic
+PEAK = (0.50, 0.30)  # N m; never beyond the upright pose, where a long motion would be chaotic
 
 
 def period_of(samples: int) -> SettledPeriod:
     """A period with LINES lines per joint up to 5 Hz, whatever its length."""
     period = samples / RATE
-    # Drawn, not evenly spaced: lines with a common factor would repeat one short period, rounding and all.
+    # Random lines: evenly spaced ones have a common factor and would repeat one short period, including rounding.
     drawn = np.random.default_rng(1).choice(np.arange(1, round(5.0 * period)), 2 * LINES - 1, replace=False)
     lines = [sorted(drawn[:LINES].tolist()), sorted(drawn[LINES:].tolist())]
     wave = design_multisine(RATE, period, lines, PEAK, 2)

@@ -1,10 +1,10 @@
-"""What the guard costs a sample: its clamp before the exchange and its look after it, two joints.
+"""Computing time of the guard per sample, for two joints: `clamp` before and `look` after the exchange.
 
     python benchmarks/guard.py [--json]
 
-The samples are those of a run of the fake arm, played to the guard again and again, without bus and recorder. The
-figure is the median over rounds of the mean over a round's samples; the fastest round is printed beside it, because
-other programs can only add to it.
+The samples of a run of the fake arm are repeatedly passed to the guard, without bus and recorder. The figure is the
+median over rounds of the mean over a round's samples; the fastest round is printed too, because other programs can only
+add to the time.
 """
 
 import argparse
@@ -14,19 +14,19 @@ import time
 from pathlib import Path
 from statistics import median
 
-from benchmarks.short_experiment import CONFIG, short_config
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.experiment.guard import Guard
 from hil.experiment.run import run_experiment
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.short_experiment import CONFIG, short_config
 
 ROUNDS = 200
 
 
 def guard_cost(rounds: int = ROUNDS) -> list[float]:
-    """Seconds a sample, one mean for each round."""
+    """Mean time per sample [s] of each round."""
     config = short_config(CONFIG.read_text(encoding="utf-8"))
     states = recorded_states(config)
     costs = []
@@ -41,7 +41,7 @@ def guard_cost(rounds: int = ROUNDS) -> list[float]:
 
 
 def recorded_states(config: Config) -> list[State]:
-    """The samples of an undisturbed run in motion, as the stream saw them; slow readings aside."""
+    """The samples of an undisturbed run in motion, as the stream received them, without the slow reads."""
     with tempfile.TemporaryDirectory() as folder:
         run = RunFolder.create(Path(folder) / "run", config)
         run_experiment(config, run, CONFIG, lambda _: None)

@@ -1,9 +1,9 @@
-"""The main job's figures: errors against the fake arms' truth, residual, held-out prediction, and time.
+"""Accuracy of `hil identify` on fake arms: parameter errors, residual, held-out prediction, and computing time.
 
     python benchmarks/identify.py [--json] [--seeds N]
 
-Each arm is identified with N seeds (other phases of the multisine); the worst seed is printed, and how many more the
-guard stopped, because their phases swing the arm past a limit. `demo_seconds` is
+Each arm is identified with N seeds (different phases of the multisine). The worst seed is printed, and the number of
+further seeds that the guard stopped because their phases swing the arm beyond a limit. `demo_seconds` is the time of
 `hil identify configs/fake_two_link.toml` in a new process with an empty numba cache.
 """
 
@@ -60,7 +60,7 @@ def figures(result: SettledResult) -> dict[str, float]:
 
 
 def worst_of_seeds(name: str, seeds: int) -> dict[str, float]:
-    """The worst of the seeds that the guard lets play: some phases swing the arm past its position limits."""
+    """The worst figures of N seeds, not counting those that the guard stops at a position limit."""
     config = load_config(CONFIGS / f"{name}.toml")
     runs: list[dict[str, float]] = []
     stopped = 0

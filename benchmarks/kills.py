@@ -1,184 +1,23 @@
-"""SIGKILL at random moments of an experiment on a pty, whose fake servos live in another process.
+"""SIGKILL at random moments of an experiment on a pty, with the fake servos in another process.
 
     python benchmarks/kills.py [--kills N] [--json]
 
-105 ms after each kill, the servos are asked over the same terminal: each Bus Watchdog must have tripped and each Goal
-Current be 0. The 5 ms are for this computer's own scheduling; a question that came earlier would feed the watchdog.
+105 ms after each kill, the servos are read over the same terminal: each Bus Watchdog must have tripped and each Goal
+Current must be 0. The 5 ms allow for this computer's scheduling; an earlier read would restart the watchdog.
 
-Every kill meets an arm of its own that hangs at rest: dry friction may hold one that was killed in mid-motion so far
-from its rest pose that the next experiment rightly refuses to start. A kill tells nothing where the experiment had
-ended by itself (a busy computer kept it from its deadlines) or where the question came later than 120 ms after it; it
-is then repeated, and the campaign fails when that happens again and again. Where it is permitted, the fake has
-real-time priority: real servos do not wait for this computer's other programs.
+Each kill uses a new arm that hangs at rest, because friction may hold an arm that was killed in motion so far from
+its rest pose that the next experiment refuses to start. A kill does not count if the experiment had already ended by
+itself (a busy computer missed its deadlines) or if the servos answered later than 120 ms after it. It is then
+repeated, and the campaign fails if that happens too often. The fake arm gets real-time priority if permitted: real
+servos do not wait for this computer's other programs.
 """
 
 import argparse
 import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
-import time
-import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from random import Random
 
-from hil.config.schema import Config, parse_config
-from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError
-from hil.experiment.run import run_experiment
-from hil.runs.run_folder import RunFolder
-
-CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
-ASKED_AFTER_S = 0.105
-ANSWERED_BEFORE_S = 0.120
-LONGEST_S = 2.6
-"""From torque on to a kill: rest, ramp in, settling and used period, ramp out."""
-START_UP_S = 60.0
-PATIENCE = 50
-PRIORITY = 30
-"""SCHED_FIFO's, above hil's own."""
-
-
-@dataclass(frozen=True)
-class Kill:
-    """watchdogs, torque, goals: what the servos' registers read. answered_after: seconds from the kill to the
-    answer about the watchdogs. ended: what the run had ended with by itself before the kill.
-    """
-
-    watchdogs: list[int]
-    torque: list[int]
-    goals: list[int]
-    answered_after: float
-    ended: str = ""
-
-    @property
-    def counts(self) -> bool:
-        return not self.ended and self.answered_after <= ANSWERED_BEFORE_S
-
-    @property
-    def safe(self) -> bool:
-        """Torque was on when the kill came; then only a tripped watchdog will do."""
-        stopped = [
-            watchdog in {-1, 255} or not torque for watchdog, torque in zip(self.watchdogs, self.torque, strict=True)
-        ]
-        return all(stopped) and not any(self.goals)
-
-
-def kill_campaign(kills: int, folder: Path, seed: int = 1) -> list[Kill]:
-    """Kill child processes that run an experiment on the pty until `kills` of them count; those that do not are among
-    the result. Raises RuntimeError when too few kills count, with what the experiments ended with.
-    """
-    random = Random(seed)
-    done: list[Kill] = []
-    for number in range(3 * kills):
-        place = folder / f"kill-{number}"
-        place.mkdir()
-        with fake_arm(place / "arm"):
-            done.append(_kill_once(pty_config(place / "arm"), place, random.uniform(0.0, LONGEST_S)))
-        if sum(kill.counts for kill in done) == kills:
-            return done
-    ended = [kill.ended for kill in done if kill.ended]
-    raise RuntimeError(
-        f"{sum(kill.counts for kill in done)} of {len(done)} kills count, {kills} are wanted; is the computer busy? "
-        f"Answered {max(1e3 * kill.answered_after for kill in done):.0f} ms after a kill at the latest; {len(ended)} "
-        "runs ended by themselves, with:\n" + "\n".join(sorted(set(ended)))
-    )
-
-
-@contextmanager
-def fake_arm(link: Path) -> Iterator[None]:
-    """A fake arm on a pty, served by another process."""
-    server = subprocess.Popen(
-        [sys.executable, "-m", "hil", "fake", str(CONFIG), "--pty", "--link", str(link), "--quiet"],
-        stdout=subprocess.PIPE,
-        cwd=Path(__file__).parents[1],
-    )
-    try:
-        assert server.stdout is not None
-        server.stdout.readline()
-        with suppress(PermissionError):
-            os.sched_setscheduler(server.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        yield
-    finally:
-        server.send_signal(signal.SIGTERM)
-        server.wait(timeout=10)
-        if server.stdout is not None:
-            server.stdout.close()
-
-
-def pty_config(link: Path) -> Config:
-    """The fake arm on that terminal, with an experiment of some three seconds."""
-    text = CONFIG.read_text(encoding="utf-8")
-    for old, new in (
-        ('url = "fake://" ', f'url = "{link}" '),
-        ("rate = 400.0 ", "rate = 200.0 "),
-        ("period = 10.0 ", "period = 1.0 "),
-        ("band = [0.1, 5.0]", "band = [1.0, 6.0]"),
-        ("ramp = 1.0 ", "held_out = false\nsettle_within = 0.5\nrest = 0.2\nramp = 0.2 "),
-        ("[experiment]", "[safety]\nmax_late = 15\nmax_missing = 15\n\n[experiment]"),
-    ):
-        assert old in text, old
-        text = text.replace(old, new, 1)
-    return parse_config(text, CONFIG)
-
-
-def _kill_once(config: Config, folder: Path, wait: float) -> Kill:
-    """Start an experiment, kill it `wait` seconds after torque came on, and ask the servos."""
-    run = RunFolder.create(folder / "run", config)
-    ending = folder / "ending.txt"
-    child = _start(config, run, ending)
-    started = _torque_came_on(run, ending)
-    if started:
-        time.sleep(wait)
-    ended = ending.is_file()
-    killed = time.monotonic()
-    if not ended:
-        os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    time.sleep(max(0.0, killed + ASKED_AFTER_S - time.monotonic()))
-    with ServoBus.connect(config.bus) as bus:
-        watchdogs = _ask(bus, "Bus Watchdog")
-        answered = time.monotonic()
-        torque, goals = _ask(bus, "Torque Enable"), _ask(bus, "Goal Current")
-    why = ending.read_text(encoding="utf-8") if ended else "" if started else "Torque did not come on."
-    return Kill(watchdogs, torque, goals, answered - killed, why)
-
-
-def _ask(bus: ServoBus, register: str) -> list[int]:
-    """What a register reads, per joint; a busy computer may need some time to hear it."""
-    for _ in range(PATIENCE):
-        with suppress(DriverError):
-            return [bus.servo(joint).read(register) for joint in bus.joints]
-    raise RuntimeError(f"The servos on the pty do not tell their {register}.")
-
-
-def _start(config: Config, run: RunFolder, ending: Path) -> int:
-    """The process id of a child that runs the experiment, and leaves in `ending` what it ended with."""
-    child = os.fork()
-    if child == 0:
-        try:
-            said = run_experiment(config, run, CONFIG, lambda _: None)
-        except BaseException:
-            said = traceback.format_exc()
-        ending.write_text(said, encoding="utf-8")
-        os._exit(0)
-    return child
-
-
-def _torque_came_on(run: RunFolder, ending: Path) -> bool:
-    """Wait for it; False when the run ended before."""
-    events = run.path / "events.jsonl"
-    give_up = time.monotonic() + START_UP_S
-    while time.monotonic() < give_up and not ending.is_file():
-        if events.is_file() and "torque on" in events.read_text(encoding="utf-8"):
-            return True
-        time.sleep(0.005)
-    return False
+from tests.support.kills import ANSWERED_BEFORE_S, kill_campaign
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""One line that says when and on what a figure was measured."""
+"""The date and machine of a measurement on one line."""
 
 import os
 import platform

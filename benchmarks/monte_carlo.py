@@ -1,12 +1,12 @@
-"""Errors of many identifications against the Cramer-Rao bound, and how often the error bars cover the truth.
+"""Errors of many identifications relative to the Cramer-Rao bound, and coverage of the confidence intervals.
 
     python benchmarks/monte_carlo.py [--json] [--seeds N]
 
 The ideal fake arm (smooth Coulomb and viscous friction, written in masses and lengths, not in the estimator's
 equations), one settled period of 10 s at 400 Hz, 0.80 and 0.42 N m. Each seed draws new errors of position:
-normal ones of half an encoder step, then rounding to steps whose zero lies anywhere. The bound is that of white
-errors with the variance of both. WAVES multisines take turns. `rounding_only` is the same without the normal
-errors: what a good encoder gives, whose rounding is not white where a joint is slow.
+normal errors of half an encoder step, then rounding to steps with a random zero. The bound assumes white errors with
+the variance of both. The seeds cycle through WAVES multisines. `rounding_only` is the same without the normal errors,
+as for a good encoder, whose rounding errors are not white where a joint moves slowly.
 """
 
 import argparse
@@ -16,14 +16,16 @@ from typing import Any
 
 import numpy as np
 from machine import machine
-from recorded_arm import Recorded, record, servo_arm, wave
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
+from hil.estimator.options import IntegrationOptions
 from hil.fakes.plants.arm import base_parameters
+from hil.study.jobs import each
+from tests.support.recorded_arm import Recorded, record, servo_arm, wave
 
 WAVES = 10
 NOISE = 0.5  # encoder steps
@@ -32,10 +34,10 @@ MODEL = Model(2, "coulomb", "delay")
 
 
 def bound(recorded: Recorded, truth: dict[str, float], variance: float) -> np.ndarray:
-    """Standard deviation (parameters,) that no unbiased estimate from these positions can beat."""
+    """Cramer-Rao bound: smallest standard deviation (parameters,) of an unbiased estimate from these positions."""
     period = recorded.period(recorded.position)
     names = MODEL.names
-    run = SimulatedRun.of(period)
+    run = SimulatedRun.of(period, IntegrationOptions())
     information = np.zeros((len(names) + 4,) * 2)
     for _, _, derivative in run.pieces(Physics.of(truth), recorded.start, names):
         J = derivative.reshape(-1, derivative.shape[2])
@@ -45,20 +47,24 @@ def bound(recorded: Recorded, truth: dict[str, float], variance: float) -> np.nd
     return np.sqrt(variance * np.diag(inverse)[: len(names)]) / size[: len(names)]
 
 
-def campaign(recordings: list[Recorded], truth: dict[str, float], noise: float, seeds: int) -> dict[str, Any]:
+def campaign(
+    recordings: list[Recorded], truth: dict[str, float], noise: float, seeds: int, jobs: int | None = None
+) -> dict[str, Any]:
     step = recordings[0].step
     variance = step**2 * (noise**2 + 1.0 / 12.0)
     bounds = [bound(recorded, truth, variance) for recorded in recordings]
     true = np.array([truth[name] for name in MODEL.base_names])
-    error, std, least = [], [], []
-    for seed in range(seeds):
-        random = np.random.default_rng(seed)
-        recorded = recordings[seed % len(recordings)]
-        estimate = identify(noisy(recorded, noise, random), MODEL)
-        error.append(estimate.value[:12] - true)
-        std.append(estimate.std[:12])
-        least.append(bounds[seed % len(recordings)][:12])
-    return _figures(np.array(error), np.array(std), np.array(least))
+    items = [(recordings[seed % len(recordings)], noise, seed) for seed in range(seeds)]
+    value, std = zip(*each(_identified, items, count=jobs), strict=True)
+    least = [bounds[seed % len(recordings)][:12] for seed in range(seeds)]
+    return _figures(np.array(value) - true, np.array(std), np.array(least))
+
+
+def _identified(item: tuple[Recorded, float, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Values and standard deviations of the base parameters of one seed's recording."""
+    recorded, noise, seed = item
+    estimate = identify(noisy(recorded, noise, np.random.default_rng(seed)), MODEL)
+    return estimate.value[:12], estimate.std[:12]
 
 
 def noisy(recorded: Recorded, noise: float, random: np.random.Generator) -> SettledPeriod:
@@ -82,12 +88,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=500)
+    parser.add_argument("--jobs", type=int, help="workers; one per core unless given")
     options = parser.parse_args()
     arm = servo_arm({"coulomb_width": WIDTH})
     recordings = [record(arm, wave(seed, (0.80, 0.42))) for seed in range(1, min(WAVES, options.seeds) + 1)]
     truth = {**base_parameters(arm), "coulomb_width_1": WIDTH, "coulomb_width_2": WIDTH, "delay": 0.0}
-    measured = campaign(recordings, truth, NOISE, options.seeds)
-    measured["rounding_only"] = campaign(recordings, truth, 0.0, options.seeds)
+    measured = campaign(recordings, truth, NOISE, options.seeds, options.jobs)
+    measured["rounding_only"] = campaign(recordings, truth, 0.0, options.seeds, options.jobs)
     measured["seeds"] = options.seeds
     if options.json:
         print(json.dumps(measured))

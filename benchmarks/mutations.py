@@ -1,10 +1,10 @@
-"""Which small changes of the code that keeps the arm safe pass its tests unnoticed.
+"""Mutation testing of the safety code: which small changes its tests do not detect.
 
     python benchmarks/mutations.py [MODULE ...] [--json] [--every N]
 
-Each mutation changes one operator, comparison, number or boolean of a module (its texts, annotations and zip's `strict`
-aside) and runs that module's tests in a child process. Those that no test notices survive.
-A mutation that makes a test hang counts as noticed after `PATIENCE_S`.
+Each mutation changes one operator, comparison, number or boolean of a module (except in strings, annotations and zip's
+`strict`) and runs that module's tests in a child process. Mutations that no test detects survive. A mutation that makes
+a test hang counts as detected after `PATIENCE_S`.
 """
 
 import argparse
@@ -39,7 +39,7 @@ TESTS = {
     "hil/experiment/stream.py": [f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"],
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
 }
-"""Modules, and the tests that have to notice."""
+"""Modules, and the tests that should detect mutations."""
 
 Change = Callable[[], None]
 
@@ -51,7 +51,7 @@ _OPERATE = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.
 
 
 def mutants(source: str) -> Iterator[tuple[int, str, str]]:
-    """Line, what was changed, and the changed source of each mutation."""
+    """Yield each mutation: line, description, and mutated source."""
     tree = ast.parse(source)
     count = sum(1 for _ in _spots(tree))
     for number in range(count):
@@ -64,7 +64,7 @@ def mutants(source: str) -> Iterator[tuple[int, str, str]]:
 
 
 def _spots(tree: ast.AST) -> Iterator[tuple[ast.expr, Change]]:
-    """Every node that can be changed, with the change."""
+    """Yield every node that can be changed, with a function that changes it."""
     silent = set(_of_messages(tree))
     for node in ast.walk(tree):
         if node in silent:
@@ -95,7 +95,7 @@ def _other(value: float | bool) -> float | bool:
 
 
 def _of_messages(tree: ast.AST) -> Iterator[ast.AST]:
-    """What stands in formatted texts and annotations: words are judged elsewhere."""
+    """Yield nodes in formatted strings and annotations, which are not mutated."""
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr | ast.AnnAssign):
             parts = [node] if isinstance(node, ast.JoinedStr) else [node.annotation]
@@ -110,7 +110,7 @@ def _of_messages(tree: ast.AST) -> Iterator[ast.AST]:
 
 
 def survivors(module: str, every: int) -> tuple[int, list[str]]:
-    """How many mutations were tried, and those that survived."""
+    """Number of mutations tried, and descriptions of those that survived."""
     source = (ROOT / module).read_text(encoding="utf-8")
     if not _passes(module, source):
         raise SystemExit(f"The tests of {module} fail without any mutation.")
@@ -125,7 +125,7 @@ def survivors(module: str, every: int) -> tuple[int, list[str]]:
 
 
 def _passes(module: str, source: str) -> bool:
-    """Whether the module's tests pass with this source in its place: in a child that has all its libraries already."""
+    """Whether the module's tests pass with this source, in a forked child that already has the libraries loaded."""
     sys.stdout.flush()
     child = os.fork()
     if not child:
@@ -168,7 +168,7 @@ def main() -> None:
     options = parser.parse_args()
     os.chdir(ROOT)
     sys.path.insert(0, str(ROOT))
-    # What takes long to import, and holds none of the modules under test.
+    # Import slow libraries that contain none of the modules under test.
     for library in ("numpy", "scipy", "numba", "pydantic", "serial", "hil.config.schema", "hil.estimator.identify"):
         importlib.import_module(library)
     hypothesis.settings.register_profile("mutations", database=None, derandomize=True)

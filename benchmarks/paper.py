@@ -1,11 +1,11 @@
-"""The seed paper's arm: its method as printed beside the likelihood on the same data, and its figures 2 to 5 redrawn.
+"""The seed paper's arm: its method as printed and maximum likelihood on the same data, and its figures 2 to 5.
 
     python benchmarks/paper.py [--json] [--seeds N] [--figures DIR]
 
-Table 1's arm, each joint with Table 2's amplitudes on lines of its own, the paper's noise, 100 s at 100 Hz, J = 5.
+The arm of Table 1, with the amplitudes of Table 2 on separate lines for each joint, the paper's noise, 100 s at 100 Hz.
 `rmse_m1`, `rmse_m2` [kg] are the likelihood's over N seeds on the plant as printed (first order);
-`literal_rmse_m1`, `literal_rmse_m2` the method as printed. Beside them: the Cramer-Rao bound, the corrected plant
-(second order with friction), and 10 samples a second. The figures need matplotlib.
+`literal_rmse_m1`, `literal_rmse_m2` are those of the method as printed. For comparison: the Cramer-Rao bound, the
+corrected plant (second order with friction), and 10 samples per second. The figures need matplotlib.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def bound(rate):
 
 
 def figures(folder):
-    """Figures 2 to 5: the two torques, the angles as they settle, their steady state, the masses by seed."""
+    """Draw figures 2 to 5: torques, angles while settling, steady state, and mass estimates by seed."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -78,7 +78,7 @@ def figures(folder):
         time,
         torque,
         "torque [N m]",
-        "Figure 2: torques, each on its own lines",
+        "Figure 2: torques, on separate lines",
     )
     draw(plt, folder / "figure_3.png", *transient(excitation), "angle [rad]", "Figure 3: angles of the corrected arm")
     noisy = record(ARM, excitation, 1, rate, 0)
@@ -102,7 +102,7 @@ def figures(folder):
 
 
 def transient(excitation):
-    """The corrected arm from rest under the excitation: angles (2, samples), by the exponential of its matrix."""
+    """Angles of the corrected arm starting from rest (2, samples) [rad], computed with the matrix exponential."""
     from scipy.linalg import expm
 
     rate, D, K = 20.0, DAMPED.mass_matrix(), DAMPED.stiffness()
@@ -113,7 +113,7 @@ def transient(excitation):
     steady = response(DAMPED, excitation, 2)
     settled = (steady @ turn).real
     speed = (steady * (1j * excitation.frequency) @ turn).real
-    # What is left of the start dies away by itself.
+    # Add the decaying transient.
     away = -np.concatenate((settled[:, 0], speed[:, 0]))
     fade = expm(A / rate)
     position = settled.copy()

@@ -4,16 +4,16 @@
 
 `seconds`, `worst_relative_error` and `held_out_rms`, each by method, on the default demo recording (4,000 samples of
 two joints); under `textbook` the same on the arm of configs/fake_two_link_ideal.toml. The worst relative error is
-over inertias, gravity, viscous and Coulomb friction. How each peer was tuned stands in estimator/baselines/compare.py
-and hil/estimation/mujoco_peer.py; mujoco.sysid takes part where it is installed (extra `peers`), started within 50 %
-of the truth.
+over inertias, gravity, viscous and Coulomb friction. The tuning of each peer is described in
+estimator/baselines/compare.py and hil/estimation/mujoco_peer.py; mujoco.sysid is included if it is installed (extra
+`peers`), with an initial guess within 50 % of the truth.
 
-Time: the median of three runs of each method, in one process, after one to compile, this project's own estimate first;
-building mujoco.sysid's model and residual is not counted either. On the demo `hil` has the Stribeck friction and
-current lag of its configuration, which cost time; mujoco.sysid has the Coulomb friction that it can have, and
-`hil_coulomb` the same, which no more fits that arm than its own does. On the textbook arm all three have Coulomb
-friction and so has the arm: there times compare the same work. mujoco.sysid spreads its rollouts over all cores, this
-project's estimate two or three of its fits, so that a busy machine says little about their ratio.
+Times are medians of three runs of each method in one process, after one run for compilation, and exclude building the
+model and residual of mujoco.sysid. On the demo, `hil` fits the Stribeck friction and current lag of its configuration,
+which take time; mujoco.sysid is limited to Coulomb friction, and so is `hil_coulomb`, and neither can fit that arm
+completely. On the textbook arm, all three methods and the arm itself have Coulomb friction, so the times are for the
+same work. mujoco.sysid distributes its rollouts over all cores, and hil two or three of its fits, so the ratio is
+meaningful only on an idle machine.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from hil.runs.run_folder import RunFolder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 RECORDINGS = {"demo": "fake_two_link.toml", "textbook": "fake_two_link_ideal.toml"}
-TIMES = 3  # of which every method's median time counts
+TIMES = 3  # runs of each method; the median time counts
 KEYS = ("seconds", "worst_relative_error", "held_out_rms")
 
 
@@ -80,7 +80,7 @@ def _by_key(methods: dict[str, MethodResult]) -> dict[str, Any]:
 
 
 def worst(found: MethodResult) -> float:
-    """Relative error of the worst parameter; every arm here is a fake one."""
+    """Relative error of the worst parameter; all arms here are fake ones."""
     assert found.worst_relative_error is not None
     return found.worst_relative_error
 

@@ -1,13 +1,13 @@
-"""How long the program itself keeps the servos waiting between two exchanges, above all where one period ends.
+"""Computing time between two exchanges, especially at the end of a period.
 
     python benchmarks/period_gap.py [--json] [--rate HZ] [--period S]
 
-The stream plays two periods at 1 kHz, guard, model, recorder and comparison of periods included, to a stand-in for the
-bus that answers at once. Time is the processor time of the stream's thread from the end of an exchange to the beginning
-of the next: what other programs take does not count, what this one would do with a whole period at once does. Printed
-are the longest, the longest at the ends of periods and what of it is beyond the interval once an exchange has taken its
-time on the wire; and, since a virtual machine's own stalls are counted as processor time too, the longest of as many
-turns of a loop that does nothing but count for as long as the median.
+The stream plays two periods at 1 kHz, including guard, model, recorder and comparison of periods, on a substitute for
+the bus that answers immediately. The measured time is the processor time of the stream's thread from the end of an
+exchange to the beginning of the next; it excludes other programs but would include any work on a complete period.
+Printed are the longest time, the longest time at the ends of periods, and how much of it exceeds the interval minus the
+wire time of an exchange. Because stalls of a virtual machine count as processor time too, the longest iteration of a
+counting loop with the same median time and number of iterations is printed for comparison.
 """
 
 import argparse
@@ -31,11 +31,11 @@ from hil.runs.recording import Recorder
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
 EXCHANGE_S = 0.39e-3
-"""Of two servos at 2 Mbaud, the slowest wire on which 1 kHz is comfortable."""
+"""Duration of an exchange with two servos at 2 Mbaud [s], the lowest baud rate at which 1 kHz is comfortable."""
 
 
 class StandIn:
-    """A bus on which every joint follows its current as a mass on a spring does that the current's wave drives."""
+    """A bus whose joints follow their current like masses on springs driven by it."""
 
     def __init__(self, config: Config, clock: VirtualClock, swing: float) -> None:
         self.joints = config.bus.joints
@@ -66,7 +66,7 @@ class StandIn:
 
 
 def measure(rate: float, period: float) -> dict[str, Any]:
-    """Figures in ms."""
+    """Measured figures in ms."""
     config = load_config(CONFIG)
     config = config.model_copy(
         update={"experiment": config.experiment.model_copy(update={"rate": rate, "period": period, "held_out": False})}
@@ -79,7 +79,7 @@ def measure(rate: float, period: float) -> dict[str, Any]:
     bus = StandIn(config, clock, 0.05)
     with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "samples.npy", 2, plan.capacity) as recorder:
         stream = Stream(bus, plan, config, recorder, StopRequest(), lambda _: None, lambda _: None)  # type: ignore[arg-type]
-        # A stand-in obeys no mechanics: the model looks at every sample, and what it says is not listened to.
+        # The substitute does not obey mechanics: the model checks every sample, but its verdict is ignored.
         assert stream._model is not None
         stream._model._raise = lambda *_: None  # type: ignore[method-assign,assignment]
         gc.collect()
@@ -107,7 +107,7 @@ def measure(rate: float, period: float) -> dict[str, Any]:
 
 
 def _machine_longest(turns: int, median_ms: float) -> float:
-    """The longest of so many turns of a loop that counts for about `median_ms` [ms of processor time]."""
+    """Longest of `turns` iterations of a loop that counts for about `median_ms` [ms of processor time]."""
     counts = 100
     while True:
         started = time.thread_time_ns()

@@ -1,19 +1,19 @@
-"""Any arm: arms drawn at random go the whole way from `hil init`'s file to a verdict, as a person would take them.
+"""Randomly drawn arms, identified from the file of `hil init` to the verdict without any manual help.
 
-    python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--jobs N] [--json] [--keep DIR]
+    python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 
-The distribution stands in benchmarks/population_arms.py. Each arm is identified by `hil identify` in a process of its
-own, in virtual time, and judged against the truth of its fake arm. --quick: friction = "stribeck" in place of "auto",
-for tests.
+The distribution is described in benchmarks/population_arms.py, with --others in benchmarks/population_others.py. Each
+arm is identified by `hil identify` in a separate process, in virtual time, and judged by the true parameters of the
+fake arm. --quick: friction = "stribeck" instead of "auto", for tests.
 
-finished              share that ended with a result, nobody helping
-beyond_limit          arms that went farther beyond a position limit than hil.dry_run.stopping_distance predicts
-yes, yes_current, yes_pwm   share of all, of those with current sensors, of voltage-driven ones, with the verdict "yes"
+finished              share that ended with a result
+beyond_limit          arms that overshot a position limit by more than hil.dry_run.stopping_distance predicts
+yes, yes_current, yes_pwm   share with the verdict "yes": of all arms, those with current sensors, voltage-driven ones
 yes_but_wrong         share of the "yes" with an inertia, gravity or friction parameter off by more than 2 % and by more
-                      than 3 standard errors; torque constants aside: all torques count in the first joint's; friction
-                      counts as it was in the middle of the fitted multisine, while grease warmed
+                      than 3 standard errors. All torques are in units of the first joint's torque constant; warming
+                      friction is evaluated in the middle of the fitted multisine
 worst_percent_of_yes  largest such error of a "yes" [%]
-held_out_percent      largest error of the free prediction among the "yes", and its median [% of motion RMS]
+held_out_percent      largest held-out prediction error among the "yes", and its median [% of motion RMS]
 cpu_seconds_*         processor time of the whole process
 arm_seconds_median    time for which the arm was driven
 """
@@ -25,8 +25,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +39,14 @@ from hil.estimation.truth import true_parameters
 from hil.fakes.plants.arm import base_parameters
 from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, load_samples
+from hil.study.jobs import each
 
 try:
     from benchmarks.population_arms import DrawnArm, draw
+    from benchmarks.population_others import draw as draw_other
 except ImportError:  # run as a script
     from population_arms import DrawnArm, draw
+    from population_others import draw as draw_other
 
 FINISHED_WITHIN_S = 900.0
 JUDGED = ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb")
@@ -53,7 +56,7 @@ NOTHING = 1e-9  # N m
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one arm. errors: of each judged parameter, relative and in standard errors."""
+    """The outcome for one arm; errors: of each judged parameter, relative and in standard errors."""
 
     seed: int
     name: str
@@ -73,7 +76,7 @@ class Outcome:
 
     @property
     def wrong(self) -> dict[str, tuple[float, float]]:
-        """Parameters that are off by more than both bounds."""
+        """Parameters whose errors exceed both bounds."""
         return {n: e for n, e in self.errors.items() if abs(e[0]) > TOLERANCE and not abs(e[1]) <= DEVIATIONS}
 
     def __str__(self) -> str:
@@ -91,9 +94,9 @@ class Outcome:
         )
 
 
-def run(seed: int, folder: Path, *, quick: bool = False) -> Outcome:
-    """Identify the arm of this seed in a process of its own, and judge what it did."""
-    arm = draw(seed)
+def run(seed: int, folder: Path, *, quick: bool = False, others: bool = False) -> Outcome:
+    """Identify the arm of this seed in a separate process, and judge the outcome."""
+    arm = draw_other(seed) if others else draw(seed)
     if quick:
         arm = replace(arm, toml=arm.toml.replace('friction = "auto"  ', 'friction = "stribeck"'))
     folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +112,7 @@ def run(seed: int, folder: Path, *, quick: bool = False) -> Outcome:
 
 
 def _identify(path: Path, folder: Path) -> tuple[dict[str, Any] | None, str, float]:
-    """Result, else the message; processor seconds."""
+    """The result or an error message, and the processor time [s]."""
     command = [sys.executable, "-m", "hil", "identify", str(path), "--out", str(folder / "run"), "--json"]
     quiet = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with (folder / "out.json").open("w") as out, (folder / "said.txt").open("w") as said:
@@ -131,7 +134,7 @@ def _identify(path: Path, folder: Path) -> tuple[dict[str, Any] | None, str, flo
 
 
 def _motion(config: Config, folder: Path) -> tuple[float, int, float, float]:
-    """Arm seconds, runs, and how far a joint was beyond its limit against what is predicted [rad]."""
+    """Time driven [s], number of runs, largest overshoot beyond a limit and its prediction [rad]."""
     seconds, steps, beyond, predicted = 0.0, 0, 0.0, 0.0
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     for path in sorted(folder.rglob("samples.npy")):
@@ -150,7 +153,7 @@ def _motion(config: Config, folder: Path) -> tuple[float, int, float, float]:
 
 
 def _predicted(config: Config, at: np.void) -> float:
-    """How far a joint may go beyond its limit, stopped at this sample [rad]."""
+    """Predicted overshoot beyond a limit when stopped at this sample [rad]."""
     most = [0.97 * joint.goal_limit * joint.torque_per_goal for joint in config.joints]
     experiment = config.experiment.model_copy(update={"peak_torque": most})
     plan = make_plan(config.model_copy(update={"experiment": experiment}))
@@ -159,7 +162,7 @@ def _predicted(config: Config, at: np.void) -> float:
 
 
 def _truth(config: Config, folder: Path) -> dict[str, float]:
-    """Of the arm as it was in the middle of the fitted multisine: friction falls while grease warms."""
+    """True parameters in the middle of the fitted multisine: friction falls while grease warms."""
     truth = true_parameters(config)
     assert truth is not None and config.fake is not None
     samples = load_samples(folder / "samples.npy", len(config.joints))
@@ -177,7 +180,7 @@ def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, A
         if not name.startswith(JUDGED):
             continue
         true = truth[name] * arm.units
-        # An arm that lies flat has no gravity: what is found of it counts against its friction.
+        # In a horizontal arm the true gravity is zero: its error is related to friction instead.
         size = abs(true) if abs(true) > NOTHING else arm.units * friction
         error = entry["value"] - true
         std = entry["std"]
@@ -195,7 +198,7 @@ def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, A
 
 
 def figures(outcomes: list[Outcome]) -> dict[str, Any]:
-    """The printed keys."""
+    """The printed figures."""
     yes = [each for each in outcomes if each.trust == "yes"]
 
     def share(of: list[Outcome]) -> float | None:
@@ -221,16 +224,17 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
     }
 
 
-def study(seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False) -> list[Outcome]:
-    """The outcome of each seed's arm; tell: called with each as it ends."""
-    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
-        folder = keep or Path(temporary)
-        outcomes = []
-        for ended in as_completed([pool.submit(run, seed, folder / str(seed), quick=quick) for seed in seeds]):
-            outcomes.append(ended.result())
-            if tell:
-                tell(outcomes[-1])
-        return sorted(outcomes, key=lambda each: each.seed)
+def study(
+    seeds: list[int], jobs: int, keep: Path | None, tell: Any = None, *, quick: bool = False, others: bool = False
+) -> list[Outcome]:
+    """Identify the arm of each seed; tell: called with each outcome."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (keep or Path(temporary)).absolute()
+        return each(partial(_run_in, folder, quick, others), seeds, count=jobs, tell=tell or (lambda _: None))
+
+
+def _run_in(folder: Path, quick: bool, others: bool, seed: int) -> Outcome:
+    return run(seed, folder / str(seed), quick=quick, others=others)
 
 
 def _seeds(text: str) -> list[int]:
@@ -244,8 +248,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=200)
-    parser.add_argument("--seeds", type=_seeds, help="A..B, in place of --arms")
+    parser.add_argument("--seeds", type=_seeds, help="A..B, instead of --arms")
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--others", action="store_true", help="draw from benchmarks/population_others.py")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("--keep", type=Path, help="folder for files, run folders and messages")
     options = parser.parse_args()
@@ -254,7 +259,12 @@ def main() -> None:
         print(machine())
     stream = sys.stderr if options.json else sys.stdout
     outcomes = study(
-        seeds, options.jobs, options.keep, lambda each: print(each, file=stream, flush=True), quick=options.quick
+        seeds,
+        options.jobs,
+        options.keep,
+        lambda each: print(each, file=stream, flush=True),
+        quick=options.quick,
+        others=options.others,
     )
     measured = figures(outcomes)
     if options.json:

@@ -1,22 +1,22 @@
-"""Arms as people build them, drawn from a written distribution, as the TOML file that `hil init` would write.
+"""Typical arms drawn from a documented distribution, as the TOML files that `hil init` would write.
 
-models          XM430-W350, XM540-W270, XL330-M288, XC330-T288, XL430-W250 (voltage-driven), one in five each; of
-                two-joint arms with an XM540 shoulder, half have an XM430 elbow
+models          XM430-W350, XM540-W270, XL330-M288, XC330-T288, XL430-W250 (voltage-driven), equally likely;
+                half of the two-joint arms with an XM540 shoulder have an XM430 elbow
 joints          one (30 %) or two
 orientation     hanging 50 %, tilted by 10 to 60 degrees 20 %, flat 15 %, upright 15 %
-links           length 0.08 to 0.20 m of an XM430, times (stall torque / 4.1 N m)^0.4; 0.5 to 2.2 kg/m of it, times
-                (stall torque / 4.1 N m)^0.4; centre of mass at 0.4 to 0.9 of the length; inertia 0.5 to 1.6 times
-                a rod's. Drawn again where gravity at full stretch is above 18 % of stall.
-Coulomb         0.8 to 3 % of stall torque; 330 series and XL430 up to 7 %; the elbow's own
+links           length 0.08 to 0.20 m and 0.5 to 2.2 kg/m, both times (stall torque / 4.1 N m)^0.4; centre of mass at
+                0.4 to 0.9 of the length; inertia 0.5 to 1.6 times that of a rod. Redrawn if gravity at full stretch
+                exceeds 18 % of the stall torque.
+Coulomb         0.8 to 3 % of stall torque; 330 series and XL430 up to 7 %; independent for each joint
 Stribeck        rise 0 to 0.6, velocity 0.05 to 0.3 rad/s; viscous 0.3 to 2 % of stall per rad/s; offset up to 15 % of
                 Coulomb; armature 1.2 to 5 g m^2 per N m of stall; current lag 0.3 to 2 ms
 richer friction a third of the arms have one to three of: load 0.02 to 0.08; ripple 0.3 to 2 % (5 to 11 cycles);
                 presliding over 0.5 to 5 mrad
-zeros           each joint's off by 1 to 2 degrees, either way
-torque constant each joint's off by up to 12 %, evenly
-rest            each joint up to 4 degrees off its rest pose, and as far as friction would hold it
-imperfect       where the fake arm has them, a third each: friction that falls by 5 to 20 % as grease warms, encoder
-                noise of 0.2 to 0.6 steps, once- and twice-per-turn errors of up to 4 and 2 steps
+zeros           each off by 1 to 2 degrees in either direction
+torque constant each off by up to 12 %, uniformly distributed
+rest            each joint up to 4 degrees from its rest pose, but no farther than friction would hold it
+imperfect       a third of the arms each: friction that falls by 5 to 20 % as grease warms; encoder noise of 0.2 to 0.6
+                steps; once- and twice-per-turn encoder errors of up to 4 and 2 steps
 limits          what `hil init` writes: 30 % of stall current or voltage, 10 rad/s, swing of 60 to 120 degrees
 """
 
@@ -36,15 +36,15 @@ ORIENTATIONS = {"hanging": 0.5, "tilted": 0.2, "flat": 0.15, "upright": 0.15}
 SERVO_MASS = {"XM430": 0.082, "XM540": 0.165, "XL330": 0.018, "XC330": 0.023, "XL430": 0.0572}
 GEAR_RATIO = {"XM430": 353.5, "XM540": 272.5, "XL330": 288.35, "XC330": 288.35, "XL430": 258.5}
 REFERENCE_STALL = 4.1  # N m
-MOST_GRAVITY = 0.18  # of stall torque, at full stretch
+MOST_GRAVITY = 0.18  # relative to the stall torque, at full stretch
 DEGREE = math.pi / 180
 
 
 @dataclass(frozen=True)
 class DrawnArm:
-    """An arm: what it is called, its file, and over which supposed torque constants its truth counts.
+    """A drawn arm: its name, its file, and its torque unit.
 
-    units: supposed over true torque constant of the first joint. All identified torques are in these units.
+    units: ratio of assumed to true torque constant of the first joint. All identified torques are in these units.
     """
 
     name: str
@@ -54,7 +54,7 @@ class DrawnArm:
 
 
 def draw(seed: int) -> DrawnArm:
-    """The arm of this seed."""
+    """Draw the arm of this seed."""
     random = np.random.default_rng((13, seed))
     joints = 1 if random.random() < 0.3 else 2
     models = _models(random, joints)
@@ -122,7 +122,7 @@ def _servo_mass(model: ServoModel) -> float:
 
 
 def _holding_torque(links: list[dict[str, float]], models: list[ServoModel]) -> float:
-    """At joint 1 with the arm stretched out level [N m]."""
+    """Torque at joint 1 with the arm stretched out horizontally [N m]."""
     held = links[0]["mass"] * links[0]["centre"]
     if len(links) == 2:
         reach = links[0]["length"]
@@ -131,7 +131,7 @@ def _holding_torque(links: list[dict[str, float]], models: list[ServoModel]) -> 
 
 
 def _richer(random: np.random.Generator) -> list[str]:
-    """What a third of the arms have beside Stribeck friction."""
+    """Draw the additional friction effects, which a third of the arms have."""
     if random.random() > 1 / 3:
         return []
     count = int(random.integers(1, 4))
@@ -149,7 +149,7 @@ def _drive(random: np.random.Generator, model: ServoModel, factor: float, richer
         "mass": _servo_mass(model),
         "rotor_inertia": stall * random.uniform(1.2e-3, 5e-3) / GEAR_RATIO[family] ** 2,
         "gear_ratio": GEAR_RATIO[family],
-        # To the digits that the file of `hil init` has.
+        # Rounded like in the file of `hil init`.
         "torque_constant": factor * float(f"{constant:.3g}"),
         "current_lag": random.uniform(0.3e-3, 2e-3),
         "viscous": stall * random.uniform(0.003, 0.02),
@@ -172,7 +172,7 @@ def _drive(random: np.random.Generator, model: ServoModel, factor: float, richer
 
 
 def _warming(random: np.random.Generator) -> dict[str, float]:
-    """Friction of a third of the arms is higher while they are cold."""
+    """Draw the warm-up of friction, which a third of the arms have."""
     cold, seconds = random.uniform(0.05, 0.2), random.uniform(30, 120)
     if random.random() > 1 / 3:
         return {}
@@ -180,7 +180,7 @@ def _warming(random: np.random.Generator) -> dict[str, float]:
 
 
 def _encoder(random: np.random.Generator) -> dict[str, float]:
-    """One servo's errors; a third of the arms have noise, a third are not linear."""
+    """Draw encoder errors: a third of the arms have noise, and a third have nonlinearity."""
     noisy, bent = random.random(2) < 1 / 3
     encoder = {"noise_ticks": random.uniform(0.2, 0.6)} if noisy else {}
     if bent:
@@ -200,7 +200,9 @@ def _start(
     drives: list[dict[str, Any]],
     weight: float,
 ) -> list[float]:
-    """Off the rest pose by up to 4 degrees, half as far as friction would hold the joint, whichever is less."""
+    """Draw the initial pose [rad]: off the rest pose by up to 4 degrees, but at most half as far as friction would
+    hold.
+    """
     start = []
     for i, drive in enumerate(drives):
         moment = sum(link["mass"] * link["centre"] for link in links[i:])

@@ -1,11 +1,11 @@
-"""What friction that yields before it slides costs a model that has none, and what a model that has it makes of it.
+"""Effect of presliding friction on models with and without it.
 
     python benchmarks/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5] [--law slip]
 
-The realistic fake arm without its bus, its dry friction a spring of this stiffness [N m/rad] before it slides, damped
-to 0.7 of critical; Stribeck friction is in both models. `--law slip` moves the arm by a law that the estimator does not
-have, benchmarks/elastic_slip.py. The worst of N seeds; `gained`: held-out error of the
-model without presliding over that of the one with it, the least of them.
+The realistic fake arm without its bus. Its dry friction acts as a spring of this stiffness [N m/rad] before it slides,
+with a damping ratio of 0.7. Both models include Stribeck friction. With `--law slip`, the arm follows a law that the
+estimator does not have (benchmarks/elastic_slip.py). The figures are the worst of N seeds; `gained` is the smallest
+ratio of the held-out errors of the models without and with presliding.
 """
 
 import argparse
@@ -17,7 +17,6 @@ import numpy as np
 from backlash import GROUPS
 from elastic_slip import SlippingMotor
 from machine import machine
-from recorded_arm import record, servo_arm, wave
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
@@ -26,15 +25,16 @@ from hil.estimator.models.model import Model
 from hil.estimator.selection.settled import relative_error
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.motor import Motor
+from tests.support.recorded_arm import record, servo_arm, wave
 
 FRICTION = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}
 PEAK = (0.6, 0.35)  # N m
-INERTIA = 0.012  # kg m^2, about what either joint feels
+INERTIA = 0.012  # kg m^2, approximate inertia seen by either joint
 LAWS: dict[str, type[Motor]] = {"bristles": Motor, "slip": SlippingMotor}
 
 
 def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding: bool) -> dict[str, float]:
-    """All infinite where the fit, or the prediction, finds no end."""
+    """Errors of one identification; all infinite if the fit or the prediction does not converge."""
     keys = (*(f"{group}_error" for group in GROUPS), "held_out_rms", "residual_ticks")
     try:
         found = identify(period, Model(2, "stribeck", "lag", ("presliding",) if presliding else ()))

@@ -1,4 +1,4 @@
-"""A pty with responder.c at its far end."""
+"""A pty whose far end is served by responder.c."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ SOURCE = Path(__file__).with_name("responder.c")
 
 @contextmanager
 def responder_binary() -> Iterator[Path]:
-    """responder.c, compiled into a folder that goes away again."""
+    """Compile responder.c into a temporary folder."""
     compiler = shutil.which("cc")
     if compiler is None:
         sys.exit("The benchmark needs a C compiler called cc (Debian: apt install gcc).")
@@ -27,13 +27,13 @@ def responder_binary() -> Iterator[Path]:
 
 @contextmanager
 def served_pty(binary: Path, byte_ns: int) -> Iterator[str]:
-    """The name of a pty whose far end is answered by the responder. byte_ns: what a byte takes on the wire."""
+    """Name of a pty whose far end is served by the responder; byte_ns: wire time per byte [ns]."""
     master, slave = os.openpty()
     tty.setraw(slave)
     server = subprocess.Popen([binary, "serve", str(master), str(byte_ns)], pass_fds=[master])
     os.close(master)
     try:
-        # The slave stays open here, so that the responder outlives a client that closes its own.
+        # Keep the slave open here, so that the responder survives a client that closes its own.
         yield os.ttyname(slave)
     finally:
         os.close(slave)

@@ -2,7 +2,9 @@
  *
  * responder serve FD BYTE_NS        servos: answers Sync Read (82) and Fast Sync Read (8A) on the pty's master side, at
  *                                   once, or after the time that request and reply take on a wire of BYTE_NS a byte.
- *                                   The requested registers are counted up with each answer.
+ *                                   With ten bytes asked for, an arm at rest answers: Present Current (the goal that
+ *                                   the last Sync Write of Goal Current had for it), velocity 0, and half a turn, one
+ *                                   tick more with every other answer. Other registers are counted up.
  * responder client TTY SERVOS CYCLES WRITES
  *                                   the cheapest client that C allows: the same packets, prepared, in WRITES writes, one
  *                                   blocking read. Prints nanoseconds: CPU per cycle, median round trip, time per cycle.
@@ -58,6 +60,20 @@ static int head(uint8_t *packet, int id, int length) {
     return 8;
 }
 
+static uint8_t goals[256][2];
+
+/* A Sync Write of two bytes: what the motors are told, they carry. */
+static void listen(const uint8_t *request, int end) {
+    if (request[7] != 0x83 || request[10] != 2) return;
+    for (int at = 12; at + 3 <= end - 2; at += 3) memcpy(goals[request[at]], request + at + 1, 2);
+}
+
+static void fill(uint8_t *data, int size, int id, uint8_t count) {
+    const uint8_t rest[10] = {goals[id][0], goals[id][1], 0, 0, 0, 0, (uint8_t)(count & 1), 8, 0, 0};
+    if (size == 10) memcpy(data, rest, 10);
+    else memset(data, count, (size_t)size);
+}
+
 static int answer(const uint8_t *request, int end, uint8_t *reply) {
     static uint8_t count;
     int size = request[10] | request[11] << 8, servos = end - 14, at = 0;
@@ -67,13 +83,13 @@ static int answer(const uint8_t *request, int end, uint8_t *reply) {
         if (request[7] == 0x8A) {
             reply[at++] = 0;
             reply[at++] = request[12 + servo];
-            memset(reply + at, count, (size_t)size);
+            fill(reply + at, size, request[12 + servo], count);
             at = end_packet(reply, at + size);
         } else {
             int start = at;
             at += head(reply + at, request[12 + servo], size + 4);
             reply[at++] = 0;
-            memset(reply + at, count, (size_t)size);
+            fill(reply + at, size, request[12 + servo], count);
             at = start + end_packet(reply + start, at + size - start);
         }
     }
@@ -94,6 +110,7 @@ static int serve(int fd, int64_t byte_ns) {
         while (have >= 7) {
             int end = 7 + (buffer[5] | buffer[6] << 8);
             if (have < end) break;
+            listen(buffer, end);
             if (buffer[7] == 0x82 || buffer[7] == 0x8A) {
                 int count = answer(buffer, end, reply);
                 sent += count * byte_ns;

@@ -1,12 +1,12 @@
-"""An arm simulated by MuJoCo, not by equations like the estimator's, identified and predicted.
+"""Identification and prediction of an arm simulated by MuJoCo instead of by equations like the estimator's.
 
     python benchmarks/rigid_body_engine.py [--json] [--seeds N]        (needs the package mujoco)
 
-The links, servos and friction of the fake arm as MuJoCo bodies; dry friction is a constraint there (frictionloss),
-solved with everything else, not a function of velocity. Positions are rounded to encoder steps, currents to theirs.
-The friction model is chosen by the tool. The worst of N seeds is printed, and over all of them how many of the N x 12
-parameters lie outside their 99 % intervals (one in a hundred of a right interval does). Seeds whose phases turn the arm
-over, in the period or the held-out one, are counted and left out: there is no period then.
+The links, servos and friction of the fake arm are MuJoCo bodies; dry friction is a constraint there (frictionloss), not
+a function of velocity. Positions are rounded to encoder steps and currents to current steps. The friction model is
+chosen by hil. Printed are the worst of N seeds, and how many of the N x 12 parameters lie outside their 99 % intervals
+(1 % is expected). Seeds whose phases swing the arm over the top, in the fitted or the held-out period, are counted and
+skipped, because the motion is then not periodic.
 """
 
 import argparse
@@ -17,18 +17,17 @@ from typing import Any
 import mujoco
 import numpy as np
 from machine import machine
-from recorded_arm import BAND, COMMAND_TO_SAMPLE, CURRENT_STEP, DRIVES, LINKS, PERIOD, RATE, SERVO, STEP
 
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import RecordingError
 from hil.estimator.excitation.multisine import design_multisine, zippered_lines
 from hil.estimator.selection.settled import Choice, choose
 from hil.fakes.plants.arm import Arm, base_parameters
+from tests.support.recorded_arm import BAND, COMMAND_TO_SAMPLE, CURRENT_STEP, DRIVES, LINKS, PERIOD, RATE, SERVO, STEP
 
 PEAK = (0.80, 0.42)  # N m
-# s. The engine steps to first order, and what that does to the motion is no fault of an estimate: at 2e-5 s its
-# inertias come out 1.5 standard errors too large and everything 1e-5 s too early, by the same seeds at 5e-6 s a quarter
-# of that.
+# s. The engine's integrator is of first order, and its error must not be blamed on the estimate: at 2e-5 s, the
+# inertias are 1.5 standard errors too large and all motion is 1e-5 s too early; at 5e-6 s, a quarter of that.
 TIMESTEP = 2e-6
 GROUPS = {
     "inertia": ("inertia_1", "coupling", "inertia_2", "armature_2"),
@@ -39,7 +38,7 @@ TWO_SIDED_99 = 2.576
 
 
 def engine() -> mujoco.MjModel:
-    """The arm in MuJoCo's own terms: x forwards, z up, joints about -y, so that angles rise with z."""
+    """The arm in MuJoCo's convention: x forwards, z up, joints about -y, so that angles increase with z."""
     rotor = SERVO["rotor_inertia"] * SERVO["gear_ratio"] ** 2
     joint = (
         '<joint name="j{n}" type="hinge" axis="0 -1 0" damping="{viscous}" frictionloss="{coulomb}" armature="'
@@ -65,7 +64,7 @@ def engine() -> mujoco.MjModel:
 
 
 def record(seed: int) -> SettledPeriod:
-    """One period to settle, the next kept."""
+    """Simulate one period to settle and return the next one."""
     wave = design_multisine(RATE, PERIOD, zippered_lines(PERIOD, BAND, 2), PEAK, seed)
     constant = SERVO["torque_constant"]
     torque = np.round(wave.torque / constant / CURRENT_STEP) * CURRENT_STEP * constant

@@ -1,21 +1,26 @@
-"""Studies on a distributed engine: how two workers compare with one, what a task costs, what a killed worker loses.
+"""Studies on a distributed engine: speed-up with two workers, overhead per run, and robustness against killed workers.
 
-    python benchmarks/study.py [--runs 200] [--empty 10000] [--json]
+    python benchmarks/study.py [--runs 200] [--empty 10000] [--killed 50] [--only PART ...] [--json]
 
-speedup_2         wall time of one worker over that of two, the same short identifications
+Parts: speed (one, two and four workers), empty, killed; all of them take a quarter of an hour on two quiet cores.
+
+speedup_2         wall time with one worker over that with two, for the same short identifications
 overhead_ms       wall time of an empty run with one worker, scheduler and writer included [ms]
-same              whether 1, 2 and 4 workers gave the same rows to the last digit, timings aside
-lost_after_kill   rows missing or double after five kills of a worker and one of the whole engine (then --resume)
-bytes_a_run       of Parquet, identifications with their default columns
-worker_mb         largest memory of a worker over the empty runs; worker_mb_growth: from their first tenth to their end
+same              whether 1, 2 and 4 workers, and the study that was killed, give exactly the same rows,
+                  except for timings
+lost_after_kill   rows missing or duplicated after killing a worker five times, the engine once (then --resume)
+bytes_a_run       Parquet size per identification with the default columns
+worker_mb         largest memory of a worker in the empty runs; scheduler_mb: of the process with scheduler and
+                  writer; *_growth: from their first tenth to their end
 rows              of the empty runs, all of them
+seconds_a_run     processor time of a short identification, and the wall time of all of them with 1, 2 and 4 workers
 """
 
 import argparse
 import json
 import os
-import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -44,7 +49,7 @@ KILLS = 5
 
 
 def study_file(folder: Path, text: str) -> Path:
-    """The study beside an arm with short periods."""
+    """Write the study next to an arm with short periods."""
     arm = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
     for old, new in (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]")):
         arm = arm.replace(old, new)
@@ -55,14 +60,19 @@ def study_file(folder: Path, text: str) -> Path:
 
 
 def timed(path: Path, out: Path, workers: int) -> tuple[float, Dataset]:
-    """Wall time from the first row to the last [s], which leaves the workers' start out; the rows."""
+    """Wall time a run [s] once every worker has ended its first, which leaves start and compilation out; the rows."""
     seen: list[float] = []
     dataset = run_study(load_study(path), out, worker_count=workers, watch=lambda _: seen.append(time.perf_counter()))
-    return seen[-1] - seen[min(workers, len(seen) - 1) - 1], dataset
+    first = min(2 * workers, len(seen) - 1) - 1
+    return (seen[-1] - seen[first]) / (len(seen) - 1 - first), dataset
+
+
+def rows_of(dataset: Dataset) -> Any:
+    return dataset.table().drop_columns(list(TIMINGS))
 
 
 def workers_of(parent: int) -> list[int]:
-    """Process numbers below `parent` that are Dask workers, by their memory's size descending."""
+    """Process IDs of the Dask workers below `parent`, by decreasing memory size."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and parent in _ancestors(int(entry.name)):
@@ -90,31 +100,49 @@ def memory_mb(pid: int) -> float:
         return 0.0
 
 
+def speed(folder: Path, runs: int) -> dict[str, Any]:
+    """The same identifications with 1, 2 and 4 workers."""
+    path = study_file(folder, IDENTIFY.format(runs=runs))
+    seconds, tables, cpu = {}, {}, 0.0
+    for workers in (1, 2, 4):
+        seconds[workers], dataset = timed(path, folder / f"out_{workers}", workers)
+        tables[workers] = rows_of(dataset)
+        cpu = cpu or statistics.median(dataset.table().column("cpu_seconds").to_pylist())
+    size = sum(each.stat().st_size for each in (folder / "out_1" / "rows").iterdir())
+    return {
+        "speedup_2": round(seconds[1] / seconds[2], 2),
+        "same": tables[1].equals(tables[2]) and tables[1].equals(tables[4]),
+        "bytes_a_run": round(size / runs),
+        "seconds_a_run": {"processor": cpu, **{str(workers): each for workers, each in seconds.items()}},
+    }
+
+
 def empty_runs(folder: Path, runs: int) -> dict[str, Any]:
     """Time and memory of runs that do nothing."""
     path = study_file(folder, EMPTY.format(runs=runs))
-    memory: list[float] = []
-
-    def look(progress: StudyProgress) -> None:
-        if progress.done % max(1, runs // 10) == 0:
-            memory.append(max([memory_mb(pid) for pid in workers_of(os.getpid())], default=0.0))
-
+    memory: list[tuple[float, float]] = []
     seen: list[float] = []
 
     def watch(progress: StudyProgress) -> None:
         seen.append(time.perf_counter())
-        look(progress)
+        if progress.done % max(1, runs // 10) == 0:
+            largest = max([memory_mb(pid) for pid in workers_of(os.getpid())], default=0.0)
+            memory.append((largest, memory_mb(os.getpid())))
 
     dataset = run_study(load_study(path), folder / "out", worker_count=1, watch=watch)
+    rows = dataset.table().column("run").to_pylist()
+    worker, scheduler = zip(*memory, strict=True)
     return {
         "overhead_ms": round(1000 * (seen[-1] - seen[0]) / (len(seen) - 1), 2),
-        "rows": dataset.table().num_rows,
-        "worker_mb": round(max(memory), 1),
-        "worker_mb_growth": round(memory[-1] - memory[0], 1),
+        "rows": len(rows) if rows == list(range(runs)) else -1,
+        "worker_mb": round(max(worker), 1),
+        "worker_mb_growth": round(worker[-1] - worker[0], 1),
+        "scheduler_mb": round(max(scheduler), 1),
+        "scheduler_mb_growth": round(scheduler[-1] - scheduler[0], 1),
     }
 
 
-def killed(folder: Path, runs: int) -> int:
+def killed(folder: Path, runs: int) -> dict[str, Any]:
     """Rows lost or doubled when workers are killed `KILLS` times and then the engine itself, and the study resumed."""
     path = study_file(folder, IDENTIFY.format(runs=runs))
     out = folder / "out"
@@ -123,18 +151,25 @@ def killed(folder: Path, runs: int) -> int:
     done = 0
     for _ in range(KILLS):
         done = _after(out, done + 1, process)
-        for worker in workers_of(process.pid)[:1]:
-            os.kill(worker, signal.SIGKILL)
+        os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     _after(out, done + 1, process)
     process.kill()
     process.wait()
+    kept = len(Dataset(out / "rows").done())
+    assert kept < runs, f"all {runs} runs were done before the engine was killed: give --killed more"
     subprocess.run([*command, "--resume"], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    rows = Dataset(out / "rows").table().column("run").to_pylist()
-    return abs(len(rows) - runs) + len(set(range(runs)) ^ set(rows))
+    dataset = Dataset(out / "rows")
+    rows = dataset.table().column("run").to_pylist()
+    undisturbed = run_study(load_study(path), folder / "undisturbed", worker_count=2)
+    return {
+        "lost_after_kill": abs(len(rows) - runs) + len(set(range(runs)) ^ set(rows)),
+        "same": rows_of(dataset).equals(rows_of(undisturbed)),
+        "rows_before_kill": kept,
+    }
 
 
 def _after(out: Path, rows: int, process: "subprocess.Popen[bytes]") -> int:
-    """Wait until there are so many rows; how many there are."""
+    """Wait until there are at least `rows` rows; return their number."""
     while process.poll() is None:
         found = len(Dataset(out / "rows").done()) if (out / "rows").is_dir() else 0
         if found >= rows:
@@ -143,36 +178,34 @@ def _after(out: Path, rows: int, process: "subprocess.Popen[bytes]") -> int:
     return rows
 
 
+PARTS = ("speed", "empty", "killed")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--empty", type=int, default=10_000)
+    parser.add_argument("--killed", type=int, default=50, help="runs of the study that is killed")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    found: dict[str, Any] = {"machine": machine()}
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        path = study_file(folder, IDENTIFY.format(runs=options.runs))
-        seconds, rows = {}, {}
-        for workers in (1, 2, 4):
-            seconds[workers], dataset = timed(path, folder / f"out_{workers}", workers)
-            rows[workers] = dataset.table().drop_columns(list(TIMINGS))
-        size = sum(each.stat().st_size for each in (folder / "out_1" / "rows").iterdir())
-        found: dict[str, Any] = {
-            "machine": machine(),
-            "speedup_2": round(seconds[1] / seconds[2], 2),
-            "same": rows[1].equals(rows[2]) and rows[1].equals(rows[4]),
-            "bytes_a_run": round(size / options.runs),
-        }
-        for part in ("empty", "killed"):
-            shutil.rmtree(folder / part, ignore_errors=True)
-            (folder / part).mkdir()
-        found |= empty_runs(folder / "empty", options.empty)
-        found["lost_after_kill"] = killed(folder / "killed", max(20, options.runs // 4))
+        folders = {part: Path(name) / part for part in options.only}
+        for folder in folders.values():
+            folder.mkdir()
+        if "speed" in folders:
+            found |= speed(folders["speed"], options.runs)
+        if "empty" in folders:
+            found |= empty_runs(folders["empty"], options.empty)
+        if "killed" in folders:
+            after = killed(folders["killed"], options.killed)
+            found |= {**after, "same": after["same"] and found.get("same", True)}
     if options.json:
         print(json.dumps(found))
     else:
         for key, value in found.items():
-            print(f"{key:18s} {value}")
+            print(f"{key:20s} {value}")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""What people take away: figures of the report, the exports, the model in Python and the package.
+"""Figures of the report, the exports, the model in Python and the package.
 
     python benchmarks/takeaway.py [--json]
 
-Identifies the realistic fake arm once, then measures on its run folder. Needs mujoco, pin (pinocchio), hatchling and
-Chromium for their lines; a line whose tool is not installed says so.
+Identifies the realistic fake arm once, then measures on its run folder. Some figures need mujoco, pin (pinocchio),
+hatchling or Chromium; if the tool is not installed, the output says so.
 """
 
 import argparse
@@ -56,17 +56,17 @@ def report(run: Path) -> dict[str, Any]:
     page = run / "report.html"
     code = f"import sys; sys.argv = ['hil', 'report', {str(run)!r}]; from hil.cli.app import main; main()"
     return {
-        "report made, new process [s]": best_seconds(
+        "writing the report, new process [s]": best_seconds(
             lambda: subprocess.run([sys.executable, "-c", code], check=True, capture_output=True), 3
         ),
-        "report made, within identify [s]": best_seconds(lambda: write_report(RunData.load(run), page)),
+        "writing the report, within identify [s]": best_seconds(lambda: write_report(RunData.load(run), page)),
         "report size [MB]": page.stat().st_size / 1e6,
         "report opens in Chromium [s]": opening(page),
     }
 
 
 def opening(page: Path) -> float | str:
-    """Until the page's load event, as the page itself sees it."""
+    """Time until the page's load event [s], as measured by the page itself."""
     browser = shutil.which("chromium")
     if browser is None:
         return "chromium is not installed"
@@ -133,7 +133,7 @@ def examples(run: Path) -> dict[str, Any]:
         command = [sys.executable, str(ROOT / "examples" / f"{name}.py"), str(run)]
         printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         times = [float(number) for number in re.findall(r"([\d.]+) times smaller", printed)]
-        found[f"{name}: error smaller by, worst joint"] = min(times)
+        found[f"{name}: error reduction factor, worst joint"] = min(times)
     return found
 
 

@@ -1,1 +1,1 @@
-"""Bytes and servos: packets, control tables, clocks, ports, set-up work and the control cycle."""
+"""Communication with the servos: packets, control tables, clocks, ports, set-up work and the control cycle."""

@@ -1,7 +1,7 @@
-"""The servos of one arm on one port: set-up work before the control cycle, the cycle, and torque off after it."""
+"""The servos of one arm on one port: preparation, the control cycle, and torque off afterwards."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from hil.drivers.control_table import ControlTable, load_control_table, model_names
@@ -14,41 +14,41 @@ from hil.drivers.errors import (
 )
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
-from hil.drivers.packet import ALERT, BROADCAST_ID, HardwareError, Instruction, encode
+from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.hold import let_sink, refuse_held
 from hil.drivers.preparation.prepare import check_quiet, fault_text, learn_latency, prepare_servo, shared
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
-from hil.drivers.shield import signals_held_back
 from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_span
-from hil.drivers.sync_read import one_each
+from hil.drivers.sync_read import Answer, one_each
+from hil.drivers.torque_off import TorqueOff, cut_torque, disarm_watchdogs, signals_held_back
 
 _PROBES = 3
-"""How often Fast Sync Read may stay without an answer before Sync Read is used instead."""
+"""Unanswered Fast Sync Reads after which Sync Read is used instead."""
 
 STATUS_S = 0.035
-"""From one status of the servos to the next [s]."""
+"""Time between two status reads [s]."""
 
 _SHARE, _MOST_SHARE = 0.6, 0.9
-"""Of a cycle that a status may take on the wire; adapter and computer need the rest."""
+"""Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer."""
 
 MOST_STRANGERS = 2
-"""How many instructions of another master may be heard while an experiment runs; a damaged reply can look like one."""
-
-_INTERRUPTS_BORNE = 5
-"""How often confirming that a servo is off is begun again after an interrupt."""
+"""Tolerated number of foreign instructions heard during an experiment; a corrupted reply can look like one."""
 
 
 @dataclass(frozen=True)
 class BusConfig:
     """Location of the servos and how to communicate with them.
 
-    url: device or pyserial URL. one_write: Sync Write and group read leave in one write; False where `hil check` finds
-    that an arm needs two. fast_sync_read: use it where every servo's firmware has it. slow_every: cycles from one
-    reading of tick or voltage and temperature to the next. watchdog_required: refuse firmware without Bus Watchdog.
-    take_over: take over an arm whose torque is on: let it sink slowly, then cut torque; otherwise refuse it.
-    interval: s from one exchange to the next, 0 where there is no fixed rate; servos then report no status.
+    url: device or pyserial URL.
+    one_write: send Sync Write and group read in one write; False where `hil check` finds that an arm needs two.
+    fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
+    slow_every: number of cycles between two slow reads, which alternate between the servo clock (Realtime Tick) and
+    voltage with temperature.
+    watchdog_required: reject firmware without Bus Watchdog.
+    take_over: if torque is already on, let the arm sink slowly, then cut torque; otherwise refuse to start.
+    interval: time between two exchanges [s]; 0 without a fixed rate, in which case the servos' status is not read.
     """
 
     url: str
@@ -67,36 +67,8 @@ class BusConfig:
             raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}: each needs its own ID.")
 
     def is_same_arm(self, other: "BusConfig") -> bool:
-        """Whether both are the same servos on the same port."""
+        """Return whether both configurations describe the same servos on the same port."""
         return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
-
-
-@dataclass(frozen=True)
-class TorqueOff:
-    """Result of the attempt to cut torque: joints read back as off, why the others could not be confirmed, and which of
-    all have no Bus Watchdog.
-    """
-
-    confirmed: tuple[Joint, ...]
-    unconfirmed: tuple[tuple[Joint, str], ...]
-    unwatched: frozenset[Joint] = frozenset()
-
-    def __str__(self) -> str:
-        if not self.unconfirmed:
-            servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
-            return f"Torque is off on {servos}, read back."
-        names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
-        alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
-        if alone:
-            return (
-                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
-                "Watchdog and may keep its last current: cut the supply now."
-            )
-        return (
-            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, but cut "
-            "the "
-            "supply before you reach into the arm."
-        )
 
 
 class ServoBus:
@@ -105,7 +77,7 @@ class ServoBus:
         with ServoBus.open(BusConfig("/dev/ttyUSB0", 1_000_000, joints)) as bus, bus.torque(watchdog=0.1):
             state = bus.exchange([0.1, 0.0])
 
-    After any error the same object can still send torque off, and `torque_off_report` says whether that succeeded.
+    After any error the same object can still cut torque; `torque_off_report` then says whether that succeeded.
     """
 
     def __init__(self, port: Port, config: BusConfig) -> None:
@@ -113,24 +85,26 @@ class ServoBus:
         self.config = config
         self.joints = config.joints
         self._drives = tuple(drive for joint in self.joints for drive in joint.drives)
-        """One for each servo."""
+        """One entry per servo, each a joint with a single servo."""
         self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
         self._in_pairs = len(self._drives) > len(self.joints)
         self._servos = {
             drive: Servo(port, drive.id, load_control_table(drive.servo.name), drive.title) for drive in self._drives
         }
         self._measured = self._drives
-        """The same with the zero of the turn in which they are."""
+        """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
+        self._watchdog = 0.0
+        self._last_answers: Sequence[Answer] = ()
         self.torque_off_report: TorqueOff | None = None
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check who answers and that nobody holds the arm, set every servo's mode.
+        """Open the port, check that the expected servos answer and nobody holds the arm, and set every servo's mode.
 
-        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting, TorqueHeld; the port is closed then.
+        Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting or TorqueHeld, after closing the port.
         """
         bus = cls.connect(config)
         try:
@@ -144,7 +118,7 @@ class ServoBus:
 
     @classmethod
     def connect(cls, config: BusConfig) -> "ServoBus":
-        """Open the port and send nothing, for set-up work; raises PortNotOpened."""
+        """Open the port without sending anything, for set-up work; raises PortNotOpened."""
         port = open_port(config.url, config.baud)
         try:
             return cls(port, config)
@@ -162,16 +136,16 @@ class ServoBus:
         self.port.close()
 
     def servo(self, joint: Joint) -> Servo:
-        """The joint's servo, the first where it has two, for reading and writing registers."""
+        """Return the joint's servo (the first if it has several), for reading and writing registers."""
         return self.servos(joint)[0]
 
     @property
     def drives(self) -> Mapping[Joint, Servo]:
-        """Every servo, by a joint of its own: those of `Joint.drives`, in their order."""
+        """All servos, each keyed by a single-servo joint from `Joint.drives`, in bus order."""
         return self._servos
 
     def servos(self, joint: Joint) -> tuple[Servo, ...]:
-        """All servos of a joint, in the order of its `drives`."""
+        """Return all servos of a joint, in the order of its `drives`."""
         return tuple(self._servos[drive] for drive in joint.drives)
 
     def check_identity(self) -> None:
@@ -185,7 +159,7 @@ class ServoBus:
             if number != servo.table.number:
                 found = model_names().get(number, f"model number {number}")
                 raise WrongModel(
-                    f"{joint.title}: a {found} answers at ID {joint.id}, where the configuration has a "
+                    f"{joint.title}: a {found} answers at ID {joint.id}, but the configuration has a "
                     f"{joint.servo.name}. Correct `model` or `id` in the configuration, or change the servo's ID."
                 )
             firmware = servo.read("Firmware Version")
@@ -202,8 +176,10 @@ class ServoBus:
         self._without_watchdog.add(joint)
 
     def release_held(self, ours: Collection[Joint] = ()) -> None:
-        """Ensure that no servo has torque before anything is written: raises TorqueHeld, or with
-        `BusConfig.take_over` lets the arm sink. ours: joints that a program of this user left behind, cut at once.
+        """Ensure that no servo has torque on before anything is written.
+
+        If one has, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
+        ours: joints that an earlier program of this user left with torque on; it is cut immediately.
         """
         for joint in ours:
             if self._servos[joint].read("Torque Enable"):
@@ -238,15 +214,18 @@ class ServoBus:
         self._exchange = exchange
 
     def knows_fast_sync_read(self) -> bool:
-        """Whether every servo's firmware supports Fast Sync Read."""
+        """Return whether every servo's firmware supports Fast Sync Read."""
         return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
 
     def make_exchange(
         self, *, fast: bool, one_write: bool, slow_every: int | None = None, status: bool = True
     ) -> Exchange:
-        """An exchange with these servos, sent one way or the other; reads their Return Delay Times first.
+        """Return an exchange with these servos, after reading their Return Delay Times.
 
-        status: whether the servos report their status periodically, if time allows.
+        fast: use Fast Sync Read instead of Sync Read.
+        one_write: send the goals and the read request in one write instead of two.
+        slow_every: cycles between two slow reads; by default `BusConfig.slow_every`.
+        status: read the servos' status periodically, if there is time.
         """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
@@ -271,11 +250,11 @@ class ServoBus:
         )
 
     def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Spans | None, int]:
-        """The status registers read and the number of cycles between reads; None if there is no time."""
+        """Return the status registers to read and the number of cycles between reads; None if there is no time."""
         interval, modes, count = self.config.interval, [drive.mode for drive in self._drives], len(self._drives)
         if not interval:
             return None, 0
-        # Without a sensor in the motor lost torque shows in Torque Enable first, so that is worth a late sample.
+        # Without a current sensor in the motor, a loss of torque shows first in Torque Enable: worth a late sample.
         share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
         for whole in (True, False):
             span = status_span(modes, tables, whole=whole)
@@ -293,61 +272,70 @@ class ServoBus:
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Every joint's angle [rad], by set-up reads; a joint with two servos has the first one's."""
+        """Read each joint's angle [rad] outside the control cycle; a joint with several servos has the first's."""
         first = [self._of.index(index) for index in range(len(self.joints))]
         return tuple(
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
         )
 
-    def exchange(self, goals: Sequence[float]) -> State:
-        """Send goals, one per joint [A, or V under PWM], and read the arm's state.
+    def exchange(self, goals: Sequence[float], *, hurried: bool = False) -> State:
+        """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
-        A silent servo is marked missing. Raises PortLost; BusShared when another master's instructions are heard again
-        and again; ValueError for a goal that is not a number.
+        A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
+        are heard repeatedly; ValueError for a goal that is not a finite number.
         """
         if self._in_pairs and len(goals) == len(self.joints):
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
         ticks = self._converter.ticks(goals)
         exchange = self._exchange or self.prepared
-        state = self._converter.state(ticks, exchange.cycle(ticks))
+        reply = exchange.cycle(ticks, hurried=hurried)
+        self._last_answers = reply.servos
+        state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:
             raise shared(f"has sent {exchange.strangers} instructions")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
+    def read_status_next(self) -> None:
+        """Read the servos' status in the next exchange, if they report one at all."""
+        self.prepared.read_status_next()
+
     def check_alerts(self, state: State) -> None:
-        """Where a servo raised its alert bit, read the cause; raises ServoFault, which names all of them."""
+        """Read the cause wherever a servo has raised its alert bit; raises ServoFault naming all of them."""
         raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
         faults = [text for joint in raised if (text := self._faults(joint))]
         if faults:
             raise ServoFault(" ".join(faults))
 
     def _faults(self, joint: Joint) -> str:
-        """The faults of the servos of a joint that raised its alert."""
+        """Return the faults of a joint's servos after one of them has raised its alert."""
         texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
         return " ".join(filter(None, texts))
 
     def _fault(self, drive: Joint, *, alone: bool = True) -> str:
-        """What is wrong with one servo; alone: it is certainly this one."""
+        """Return the fault of one servo as text, or "" if it reports none and may not be the one that raised the alert.
+
+        alone: the joint has no other servo, so the alert is certainly this one's.
+        """
         try:
             error = self._servos[drive].hardware_error()
             cause = describe_error(error)
         except DriverError as problem:
-            return fault_text(drive, f"unknown, it could not be read ({problem})")
+            return fault_text(drive, f"unknown; it could not be read ({problem})")
         return fault_text(drive, cause) if alone or error else ""
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
-        """Torque is on inside the block and off after it, however the block is left.
+        """Switch torque on for the block and off afterwards, however the block is left.
 
-        watchdog: seconds without a packet after which a servo stops by itself (20 ms steps, at most 2.54 s).
-        Raises TorqueNotOff on leaving when a servo could not be confirmed off; `torque_off_report` tells which.
+        watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
+        Raises TorqueNotOff on exit if torque off could not be confirmed; `torque_off_report` lists the servos.
         """
         self.torque_off_report = None
         try:
             self._torque_on(watchdog)
             yield
         finally:
-            # Nothing stands between `finally` and `try`: an interrupt that comes before the shield is up is met here.
+            # No statement may stand between `finally` and `try`, so that an interrupt before torque_off is caught here.
             try:
                 report = self.torque_off()
             except BaseException:
@@ -361,11 +349,12 @@ class ServoBus:
         ticks = round(watchdog / WATCHDOG_UNIT)
         if not 1 <= ticks <= 127:
             raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
+        self._watchdog = watchdog
         for joint, servo in self._servos.items():
             watched = joint not in self._without_watchdog
             if watched:
                 servo.write("Bus Watchdog", 0)
-            # Changing Operating Mode leaves Goal Current at Current Limit.
+            # A change of Operating Mode leaves Goal Current at Current Limit, so it is zeroed before torque is on.
             servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
             if watched:
                 servo.write("Bus Watchdog", ticks)
@@ -378,65 +367,25 @@ class ServoBus:
                 raise
 
     def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back. Tries all of them whatever fails.
+        """Cut torque on every servo and read it back (`hil.drivers.torque_off`). All servos are tried, whatever fails.
 
-        After each servo that cannot be confirmed all are told again: it may hear though it cannot answer, and while it
-        was asked the others' watchdogs heard packets and waited. Signals are held back until it is done; an interrupt
-        that still arrives is raised after all servos have been tried and `torque_off_report` is there.
+        Signals are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
+        `torque_off_report` is set.
         """
         interrupts: list[BaseException] = []
         with signals_held_back():
-            try:
-                self._torque_off_at_once()
-            except BaseException as interrupt:  # the servos must be tried one by one whatever happens
-                interrupts.append(interrupt)
-            confirmed, unconfirmed = self._confirm_torque_off(interrupts)
+            silent = {
+                drive
+                for drive, answer in zip(self._drives, self._last_answers, strict=False)
+                if answer is None or len(answer) == 1
+            }
+            confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
+            watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
+            disarm_watchdogs(watched, interrupts)
             self.torque_off_report = TorqueOff(confirmed, unconfirmed, frozenset(self._without_watchdog))
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report
-
-    def _confirm_torque_off(
-        self, interrupts: list[BaseException]
-    ) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
-        confirmed, unconfirmed = [], []
-        for joint, servo in self._servos.items():
-            why = _write_surely(servo, "Torque Enable", 0, interrupts)
-            if why is None:
-                confirmed.append(joint)
-            else:
-                unconfirmed.append((joint, why))
-                self._torque_off_at_once()
-        for joint in confirmed:
-            if joint not in self._without_watchdog:
-                _write_surely(self._servos[joint], "Bus Watchdog", 0, interrupts)
-        return tuple(confirmed), tuple(unconfirmed)
-
-    def _torque_off_at_once(self) -> None:
-        """Torque off to all servos of the arm at once, which takes 0.3 ms; confirming takes some ms each, and 0.1 s
-        where one is
-        silent. A Sync Write, since other servos on the bus may be in use. Twice, since a packet may be lost.
-        """
-        entry = self._servos[self._drives[0]].table["Torque Enable"]
-        body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
-        body += b"".join(bytes((drive.id, 0)) for drive in self._drives)
-        # Where this fails, the confirmed writes will say so.
-        with suppress(DriverError):
-            self.port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
-
-
-def _write_surely(servo: Servo, register: str, value: int, interrupts: list[BaseException]) -> str | None:
-    """Write a register and read it back, again after an interrupt, which is kept; why it failed, or None."""
-    for _ in range(_INTERRUPTS_BORNE):
-        try:
-            servo.write(register, value)
-        except Exception as error:  # whatever one servo does, the next must be tried
-            return str(error) or type(error).__name__
-        except BaseException as interrupt:
-            interrupts.append(interrupt)
-        else:
-            return None
-    return "It was interrupted repeatedly."
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

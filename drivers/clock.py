@@ -1,31 +1,32 @@
-"""Time as a parameter: everything that waits takes a Clock.
+"""Time as a parameter: everything that waits is given a Clock.
 
-The in-process fake bus has its own clock, on which sleeping costs nothing; see `hil.fakes.bus.clock`.
+The in-process fake bus has its own clock, on which sleeping takes no real time; see `hil.fakes.bus.clock`.
 """
 
 import time
 from typing import Protocol
 
 SPIN_S = 300e-6
-"""How long before a deadline the wall clock stops sleeping and spins. Sleeping wakes up to 0.2 ms late."""
+"""Before a deadline the wall clock stops sleeping this early and spins instead [s]; a sleep can end up to 0.2 ms late.
+"""
 
 
 class Clock(Protocol):
-    """Monotonic time in seconds, and the means to wait for it."""
+    """Monotonic time in seconds, and a way to wait for it."""
 
     def now(self) -> float:
-        """Seconds since an arbitrary start, never going back."""
+        """Return the seconds since an arbitrary start; never decreases."""
         ...
 
     def wait_until(self, deadline: float) -> None:
-        """Return at `deadline` [s, on this clock], or at once when it has passed."""
+        """Wait until `deadline` [s, on this clock]; return immediately if it has passed."""
         ...
 
 
 class WallClock:
     """The machine's monotonic clock. Sleeps to just before the deadline, then spins."""
 
-    now = staticmethod(time.perf_counter)  # itself, not a call around it: it is asked twice a cycle
+    now = staticmethod(time.perf_counter)  # not wrapped in a method: it is called twice per cycle
 
     def wait_until(self, deadline: float) -> None:
         remaining = deadline - time.perf_counter()

@@ -1,7 +1,7 @@
-"""Control tables: the registers and addresses of each model.
+"""Control tables: the registers of each servo model and their addresses.
 
-Read from the `.model` files that the `dynamixel-sdk` package ships (one per model, tab separated), so that no table is
-copied here. They hold addresses and sizes; what a register means is in the ROBOTIS e-Manual.
+They are read from the `.model` files that the `dynamixel-sdk` package ships (one per model, tab-separated), so that no
+table is copied here. The files hold addresses and sizes; the meaning of each register is in the ROBOTIS e-Manual.
 """
 
 from collections.abc import Mapping
@@ -41,11 +41,11 @@ class Register:
 
     @property
     def signed(self) -> bool:
-        """Whether the value is two's complement. The `.model` files say so of a few registers only."""
+        """Whether the value is two's complement. The `.model` files mark only some of the signed registers."""
         return self.name in _SIGNED
 
     def encode(self, value: int) -> bytes:
-        """The register's bytes; OverflowError when the value does not fit."""
+        """Return the value as bytes; raises OverflowError if it does not fit."""
         return value.to_bytes(self.size, "little", signed=self.signed)
 
     def decode(self, data: bytes) -> int:
@@ -54,7 +54,7 @@ class Register:
 
 @dataclass(frozen=True, slots=True)
 class ControlTable:
-    """All registers of one model, by name. `number` is what the servo answers to a ping."""
+    """All registers of one model, by name. `number` is the model number returned by a ping."""
 
     model: str
     number: int
@@ -68,7 +68,7 @@ class ControlTable:
 
 
 def _folder() -> Path:
-    # find_spec does not import the package, which would load more than we read.
+    # find_spec does not import the package, which would load far more than the data files.
     spec = find_spec("dynamixel_easy_sdk")
     if spec is None or spec.origin is None:
         raise UnknownModel(
@@ -79,7 +79,7 @@ def _folder() -> Path:
 
 @cache
 def model_names() -> Mapping[int, str]:
-    """Model number -> model name as printed on the servo, for every model with a control table."""
+    """Return the model name as printed on the servo by model number, for every model with a control table."""
     names: dict[int, str] = {}
     for line in (_folder() / "dynamixel.model").read_text(encoding="utf-8").splitlines()[1:]:
         number, _, file = line.partition("\t")
@@ -90,7 +90,7 @@ def model_names() -> Mapping[int, str]:
 
 @cache
 def load_control_table(model: str) -> ControlTable:
-    """The control table of a model, e.g. "XM430-W350"; raises UnknownModel."""
+    """Return the control table of a model, e.g. "XM430-W350"; raises UnknownModel."""
     for number, name in model_names().items():
         if name == model.upper():
             file = _folder() / f"{name.lower().replace('-', '_')}.model"

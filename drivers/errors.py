@@ -1,26 +1,26 @@
-"""What can go wrong between the computer and the servos.
+"""Errors between the computer and the servos.
 
 DriverError
-├── UnknownModel        a model name or number that no control table describes
-├── PortNotOpened       the port does not exist, is taken, or cannot do this baud
+├── UnknownModel        no control table describes this model name or number
+├── PortNotOpened       the port does not exist, is in use, or does not support this baud rate
 │   └── NotPermitted    the port exists, but this user may not open it
-├── PortLost            the port was open and then failed: cable pulled, adapter gone
-├── NoReply             a servo did not answer: wrong ID, wrong baud rate, no power
-├── WrongReply          a servo's reply does not match the request
-├── ServoRefused        a servo answered with an error code: access, range, limit
+├── PortLost            the port failed while open: cable unplugged, adapter gone
+├── NoReply             a servo did not reply: wrong ID, wrong baud rate, no power
+├── WrongReply          a servo's reply is corrupted or does not match the request
+├── ServoRefused        a servo replied with an error code: access, range, limit
 ├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
-├── BusShared           another program is master of the same bus
-├── WrongModel          another model, or one whose firmware is too old, answers at this ID
-├── WrongSetting        a register holds a value with which no experiment may start
+├── BusShared           another master is active on the same bus
+├── WrongModel          a different model, or one whose firmware is too old, replies at this ID
+├── WrongSetting        a register holds a value that rules out an experiment
 │   └── TorqueHeld      torque is already on: another program holds or drives the arm
-└── TorqueNotOff        a servo could not be confirmed to be without torque
+└── TorqueNotOff        torque off could not be confirmed for a servo
 """
 
 
 class DriverError(Exception):
-    """Anything that went wrong between the computer and the servos.
+    """Base class of all errors between the computer and the servos.
 
-    last_samples: the last samples an experiment recorded before it, if one was running.
+    last_samples: the last samples that an experiment recorded before the error, if one was running.
     """
 
     last_samples: object = None
@@ -35,15 +35,15 @@ class PortNotOpened(DriverError):
 
 
 class NotPermitted(PortNotOpened):
-    """The user may not open the port. Example: a new user who is not in group `dialout`."""
+    """The user may not open the port. Example: a new user who is not in the group `dialout`."""
 
 
 class PortLost(DriverError):
-    """The port failed after it was open. Example: the USB cable was pulled while the arm moved."""
+    """The port failed after it was opened. Example: the USB cable was unplugged while the arm moved."""
 
 
 class NoReply(DriverError):
-    """A servo did not answer in time. Example: no power on the bus, or a baud rate that is not the servo's."""
+    """A servo did not reply in time. Example: no power on the bus, or a baud rate other than the servo's."""
 
 
 class WrongReply(DriverError):
@@ -51,23 +51,23 @@ class WrongReply(DriverError):
 
 
 class ServoRefused(DriverError):
-    """The servo understood and refused. Example: an EEPROM register written while torque is on."""
+    """The servo understood an instruction and refused it. Example: writing an EEPROM register while torque is on."""
 
 
 class ServoFault(DriverError):
-    """The servo reports a hardware error. Example: overload, after which it stays without torque until rebooted."""
+    """The servo reports a hardware error. Example: overload, after which its torque stays off until it is rebooted."""
 
 
 class BusShared(DriverError):
-    """Another master sends instructions on this bus. Example: a controller board plugged in beside the adapter."""
+    """Another master sends instructions on this bus. Example: a controller board wired next to the adapter."""
 
 
 class WrongModel(DriverError):
-    """Not the servo that the configuration describes. Example: an XL430 where an XM430-W350 should be."""
+    """The servo is not the one that the configuration describes. Example: an XL430 instead of an XM430-W350."""
 
 
 class WrongSetting(DriverError):
-    """A register forbids the experiment. Example: Drive Mode with Torque On by Goal Update."""
+    """The value of a register rules out an experiment. Example: Drive Mode with Torque On by Goal Update."""
 
 
 class TorqueHeld(WrongSetting):
@@ -75,4 +75,4 @@ class TorqueHeld(WrongSetting):
 
 
 class TorqueNotOff(DriverError):
-    """Torque off could not be confirmed for every servo. Example: the cable was pulled: cut the supply."""
+    """Torque off could not be confirmed for every servo. Example: the cable was unplugged: cut the supply."""

@@ -1,14 +1,14 @@
-"""The control cycle on the wire: goals out, states in, one write and one bounded read.
+"""The control cycle on the wire: goals out and states in, with one write and one bounded read.
 
-Servos in current mode and servos in PWM mode have their goals in different registers: each register has a Sync Write of
-its own, all in the same write.
+Servos in current mode and servos in PWM mode have their goals in different registers. Each of these registers is
+written by its own Sync Write; all leave in the same write.
 
-A Sync Write has no reply, so the group read that follows it leaves in the same write: one transaction of the adapter
-instead of two. All packets are prepared once; a cycle packs the goals and one CRC.
+A Sync Write has no reply, so the group read that follows it can leave in the same write: one adapter transaction
+instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
 
-The registers read may change from cycle to cycle: `spans[0]` mostly, and every `slow_every`-th time one of the
-others, in turn. All spans should hold what the control needs; the slow ones hold more. Every `status_every`-th time
-it is `status`, with the registers that show whether torque is still on.
+The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
+of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is
+still on. Every span must include what the control loop needs.
 """
 
 import struct
@@ -23,13 +23,13 @@ from hil.drivers.port import Port
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
 HOST_S = 0.75e-3
-"""Allowed for the computer itself, USB frames included, on top of what wire, servos and adapter take."""
+"""Time allowed for the computer itself, including USB frames, on top of wire, servos and adapter [s]."""
 
 PATIENCE_SHARE = 0.5
-"""Of the time between two cycles: how long an answer is waited for, where that is more than it should take."""
+"""Minimum reply timeout as a fraction of the time between two cycles."""
 
 MOST_PATIENCE_S = 0.02
-"""However slow the cycle: a servo that says nothing must not keep the others waiting."""
+"""Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 _NEVER = 1 << 62
 _DOUBTS = 3
@@ -39,10 +39,11 @@ _pack_crc = struct.Struct("<H").pack
 
 
 class Reply(NamedTuple):
-    """One exchange: times on the port's clock [s], which of the spans was read, and one answer per servo.
+    """The result of one exchange.
 
-    span: index into the exchange's spans; len(spans) is the status.
-    See hil.drivers.sync_read for what an answer is; None where none came.
+    time_before_write, time_after_read: times on the port's clock [s].
+    span: index of the span that was read; len(spans) stands for the status.
+    servos: one answer per servo as described in hil.drivers.sync_read, None for a servo that did not reply.
     """
 
     time_before_write: float
@@ -52,13 +53,16 @@ class Reply(NamedTuple):
 
 
 class Exchange:
-    """Sync Write of a two-byte goal register and a group read of the servos' state, for a fixed list of servos.
+    """Sync Write of a two-byte goal register and a group read of the state, for a fixed list of servos.
 
-    goal: the register, or one for each servo. spans, status: what is read, each of them for all servos or one for each.
-    return_delay: the longest Return Delay Time of the servos [s]. fast: read with Fast Sync Read. one_write: both
-    packets leave in one write; else in two. slow_every: cycles from one slow span to the next. status: span in which
-    the servos tell their status, every `status_every` cycles; None for never. interval: s from one cycle to the next,
-    where known; a slow cycle can wait longer for an answer than a fast one.
+    goal: the goal register, or one per servo.
+    spans, status: registers to read; each is one span for all servos, or one per servo.
+    return_delay: the longest Return Delay Time of the servos [s].
+    fast: read with Fast Sync Read.
+    one_write: send both packets in one write instead of two.
+    slow_every: number of cycles between two slow spans.
+    status_every: number of cycles between two status reads; there are none if `status` is None.
+    interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
     """
 
     def __init__(
@@ -82,12 +86,12 @@ class Exchange:
                 raise ValueError(f"{register.name} has {register.size} bytes; a goal of 2 bytes is needed.")
         self._port = port
         self._now = port.clock.now
-        self._echoes: bool = getattr(port, "echoes", False)  # set-up work has found out by now
+        self._echoes: bool = getattr(port, "echoes", False)  # detected during set-up
         self.ids = tuple(ids)
         self.fast = fast
         self.one_write = one_write
         self.strangers = 0
-        """Instruction packets heard that are not this program's: another one is master of the same bus."""
+        """Number of instruction packets received that this program did not send: another master is on the bus."""
         self._write, *self._more_writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
@@ -96,7 +100,8 @@ class Exchange:
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self._slow_spans = len(spans) - 1
         least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
-        self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
+        self._shortest_timeouts = [self._timeout(read, return_delay) for read in self._reads]
+        self._timeouts = [max(shortest, least) for shortest in self._shortest_timeouts]
         self._soonest = [0.5 * port.wire_time(self._bytes(read)) for read in self._reads]
         self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
@@ -109,20 +114,26 @@ class Exchange:
 
     @property
     def command_to_sample(self) -> float:
-        """s from the goals' arrival at the servos to the arrival of the request for their state: what lies between them
-        on the wire. With two writes the adapter may add a pause that is not known here.
+        """Wire time from the goals' arrival at the servos to the arrival of the read request [s].
+
+        With two writes the adapter may add a pause, which is not included.
         """
         return self._port.wire_time(len(self._reads[0].request))
 
     @property
     def longest(self) -> float:
-        """s that the longest exchange takes on the wire, without adapter and computer: no faster cycle is possible."""
+        """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
         return self._port.wire_time(max(self._bytes(read) for read in self._reads))
 
-    def cycle(self, goal_ticks: Sequence[int]) -> Reply:
-        """Send one goal per servo and read all states. A silent servo is a None.
+    def read_status_next(self) -> None:
+        """Read the status in the next cycle instead of when its turn comes."""
+        if self._status_every < _NEVER:
+            self._until_status = min(self._until_status, 1)
 
-        Raises PortLost; ValueError for a wrong number of goals or one that does not fit into two bytes.
+    def cycle(self, goal_ticks: Sequence[int], *, hurried: bool = False) -> Reply:
+        """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
+
+        Raises PortLost; ValueError for the wrong number of goals or a goal that does not fit into two bytes.
         """
         port = self._port
         self._until_slow -= 1
@@ -136,7 +147,7 @@ class Exchange:
                 goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
-        timeout = self._timeouts[span]
+        timeout = (self._shortest_timeouts if hurried else self._timeouts)[span]
         before = self._now()
         if self._echoes:
             received = self._ask_behind_echo(goals, read, timeout, before)
@@ -155,11 +166,11 @@ class Exchange:
         return Reply(before, self._now(), span, servos)
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
-        """Handle replies that arrive sooner than the wire allows: they may answer an earlier request.
+        """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.
 
-        A reply that comes twice lies there when the next request is sent, and from then on every answer is one cycle
-        old. Where the true answer follows it is taken. If none follows, the far end is not a real wire (a pty), and
-        after a few such cases the check is dropped.
+        A duplicated reply is still in the input when the next request is sent; from then on every reply would be one
+        cycle old. If the true reply follows, it is used. If none follows, the port is not a real serial line (a pty),
+        and after a few such cases the check is switched off.
         """
         received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
         if not received:
@@ -168,16 +179,16 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self) -> int:
-        """The span to read where it is not simply the first: after a loss, in a slow turn, or to learn a status."""
+        """Choose the span for a cycle that does not simply read the first: after a loss, a slow span, or the status."""
         if self._late_possible:
             self._late_possible = False
             self._port.discard_input()
-            # An answer that comes later still must not be taken for the answer to this request. Nothing in a packet
-            # says which request it answers, but its length does when the spans differ.
+            # A reply that arrives even later must not be taken for the reply to this request. Nothing in a packet
+            # identifies the request it belongs to, but its length differs if another span was requested.
             return self._next_slow() if self._lost == 0 else 0
         if self._until_slow <= 0:
             self._until_slow = self._slow_every
-            # A status that is due too waits for the next cycle: both at once would be the longest of all.
+            # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
             return self._next_slow()
         self._until_status = self._status_every
         return 1 + self._slow_spans
@@ -189,20 +200,20 @@ class Exchange:
         return self._slow
 
     def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:
-        """Find the answers among stuffed, damaged or missing ones, reading on until all are there or time is up."""
+        """Extract the answers if some are stuffed, damaged or missing; read on until all have arrived or time is up."""
         while True:
             answers, over = read.search(received)
             remaining = deadline - self._now()
             if over or remaining <= 0:
                 break
-            # Byte by byte: how long a stuffed packet is shows only as it comes.
+            # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
         if not self._echoes:
             self.strangers += sum(not packet.is_status for packet in Framer().feed(received))
         return answers
 
     def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
-        """The reply through an adapter that hears itself: what was sent comes back before it."""
+        """Return the reply received through an adapter that echoes what is sent, with the echo removed."""
         port, sent = self._port, goals + read.request
         if self.one_write:
             received = port.ask(sent, len(sent) + read.reply_size, timeout, start)
@@ -212,7 +223,7 @@ class Exchange:
         return received.removeprefix(sent)
 
     def _timeout(self, read: GroupRead, return_delay: float) -> float:
-        # Each servo's answer may be stuffed twice.
+        # Each servo's answer may contain up to two stuffing bytes.
         wire = self._port.wire_time(self._bytes(read) + 2 * len(self.ids))
         return wire + return_delay * len(self.ids) + self._port.latency + HOST_S
 
@@ -221,7 +232,7 @@ class Exchange:
 
 
 class _GoalWrite:
-    """A Sync Write of one goal register to the servos at `places` of all IDs."""
+    """A Sync Write of one goal register to a subset of the servos, given as indices `places` into all IDs."""
 
     def __init__(self, goal: Register, ids: Sequence[int], places: Sequence[int]) -> None:
         # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
@@ -235,7 +246,7 @@ class _GoalWrite:
         self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
-        """The packet with these goals, one for each of all servos; raises struct.error where one does not fit."""
+        """Return the packet for these goals, one per servo of the exchange; raises struct.error for one too big."""
         fields, places = self._fields, self._places
         if places is not None:
             if len(goal_ticks) != self._count:
@@ -247,6 +258,6 @@ class _GoalWrite:
 
 
 def _front(goal: Register, count: int) -> bytes:
-    """A Sync Write up to its first ID."""
+    """Return the bytes of a Sync Write up to its first ID."""
     length = 7 + 3 * count  # INST, address, size, then per servo ID and value, CRC
     return struct.pack("<4sBHBHH", HEADER, BROADCAST_ID, length, Instruction.SYNC_WRITE, goal.address, goal.size)

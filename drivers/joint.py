@@ -1,4 +1,4 @@
-"""One joint of the arm: which servo moves it, and how its ticks become SI units."""
+"""One joint of the arm: which servos move it, and how their ticks convert to SI units."""
 
 import math
 from dataclasses import dataclass, replace
@@ -8,7 +8,11 @@ from hil.drivers.servo_model import FULL_PWM_TICKS, VELOCITY_UNIT, Mode, ServoMo
 
 
 class SecondServo(NamedTuple):
-    """Another servo on the same joint: its ID, and +1 or -1, the joint's sense of rotation against this servo's."""
+    """Another servo on the same joint.
+
+    id: its bus ID.
+    direction: +1 or -1, the joint's sense of rotation relative to this servo's.
+    """
 
     id: int
     direction: int
@@ -16,15 +20,15 @@ class SecondServo(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """A joint and its servo.
+    """A joint and its servos.
 
-    direction: +1 or -1, the joint's sense of rotation against the servo's.
-    zero_ticks: Present Position at which the joint's angle is zero.
-    mode: what a goal is, a current [A] or a voltage [V]. Raises ValueError for a current that the servo does not have.
-    near: about where the joint is when the bus is opened [rad], which determines its turn; None: as Present Position
-    indicates.
-    seconds: further servos of the same model on this joint. A goal is shared out between all of them, and the measured
-    current (under PWM the voltage) is their sum; angle and velocity are the first one's.
+    direction: +1 or -1, the joint's sense of rotation relative to the servo's.
+    zero_ticks: Present Position at joint angle zero.
+    mode: what a goal is: a current [A] or a voltage [V]. Raises ValueError for current mode if the servo has none.
+    near: approximate joint angle when the bus is opened [rad], which selects the turn; None to take Present Position as
+    it is.
+    seconds: further servos of the same model on this joint. A goal is divided equally among all servos; the measured
+    current (in PWM mode the voltage) is their sum; angle and velocity are the first servo's.
     """
 
     name: str
@@ -42,39 +46,40 @@ class Joint:
 
     @property
     def drives(self) -> tuple["Joint", ...]:
-        """One joint of a single servo for each of the servos."""
+        """The joint as single-servo joints, one for each of its servos."""
         first = replace(self, seconds=())
         return first, *[replace(first, id=servo_id, direction=sign, near=None) for servo_id, sign in self.seconds]
 
     @property
     def position_unit(self) -> float:
-        """rad of joint angle per tick, with the joint's sign."""
+        """Joint angle per tick [rad], with the joint's sign."""
         return self.direction * self.servo.position_unit
 
     @property
     def velocity_unit(self) -> float:
-        """rad/s of joint velocity per tick, with the joint's sign."""
+        """Joint velocity per tick [rad/s], with the joint's sign."""
         return self.direction * VELOCITY_UNIT
 
     def drive_unit(self, supply_voltage: float) -> float:
-        """A or V, as `mode` says, per tick of goal and of its measured counterpart, with the joint's sign.
+        """Return the drive quantity per tick of the goal and of its measured counterpart, with the joint's sign.
 
-        supply_voltage: V; a PWM of 885 ticks is all of it.
+        The unit is A or V, depending on `mode`. supply_voltage [V]: a PWM of 885 ticks applies all of it.
         """
         if self.mode is Mode.CURRENT:
-            assert self.servo.current_unit is not None  # checked when the joint was made
+            assert self.servo.current_unit is not None  # checked in __post_init__
             return self.direction * self.servo.current_unit
         return self.direction * supply_voltage / FULL_PWM_TICKS
 
     def angle(self, position_ticks: int) -> float:
-        """Joint angle [rad] of a Present Position."""
+        """Return the joint angle [rad] for a Present Position."""
         return (position_ticks - self.zero_ticks) * self.position_unit
 
     def within_turn(self, position_ticks: int) -> "Joint":
-        """This joint with the zero of the turn in which it is `near`, where it is known, at this Present Position.
+        """Return this joint with its zero shifted by whole turns, so that its angle is closest to `near`.
 
-        A servo counts turns from where it was switched on: within one turn, and a joint that hangs just beyond the end
-        of that turn starts a whole turn away.
+        Without `near` the joint is returned unchanged. A servo measures its position within one turn when it is
+        switched on and counts turns from there, so a joint that rests just beyond the end of that turn starts a whole
+        turn away.
         """
         if self.near is None:
             return self
@@ -83,7 +88,7 @@ class Joint:
 
     @property
     def title(self) -> str:
-        """For the beginning of a sentence."""
+        """The joint's name, capitalised for the beginning of a sentence."""
         text = str(self)
         return text[0].upper() + text[1:]
 

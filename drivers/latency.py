@@ -1,8 +1,8 @@
 """The USB adapter's latency timer: how long the adapter may hold back a reply.
 
-FTDI adapters (U2D2 among them) buffer what they receive until 62 bytes have arrived or a timer has expired, 16 ms from
-the factory, which limits a cycle to 60 Hz. On Linux the timer is a file of the tty's in sysfs, which only root may
-write; the port's "low latency" flag sets it to 1 ms too, and any user of the port may set that one.
+FTDI adapters (including the U2D2) buffer received data until 62 bytes have arrived or a timer has expired. The factory
+setting of 16 ms limits the control cycle to 60 Hz. On Linux the timer is a file of the tty in sysfs, writable by root
+only; the port's "low latency" flag also sets it to 1 ms, and any user of the port may set that flag.
 """
 
 from pathlib import Path
@@ -11,28 +11,29 @@ FACTORY_MS = 16
 WANTED_MS = 1
 
 LOCAL_S = 1e-3
-"""Allowed for a device without a latency timer: a CDC-ACM adapter (one USB frame), a UART, a pty, the fake."""
+"""Latency allowed for a device without a latency timer [s]: a CDC-ACM adapter (one USB frame), a UART, a pty, the fake.
+"""
 
 REMOTE_S = 16e-3
-"""Allowed for a port behind a network."""
+"""Latency allowed for a port behind a network [s]."""
 
 BLUETOOTH_S = 60e-3
-"""Allowed for a serial port over Bluetooth."""
+"""Latency allowed for a serial port over Bluetooth [s]."""
 
 _SYSFS = Path("/sys")
 
 
 def latency_timer(url: str, sysfs: Path = _SYSFS) -> Path | None:
-    """The sysfs file of the port's latency timer; None when it has none (no FTDI adapter, no Linux)."""
+    """Return the sysfs file of the port's latency timer; None if there is none (not an FTDI adapter, not Linux)."""
     if "://" in url:
         return None
-    device = Path(url).resolve().name  # /dev/serial/by-id/... are links
+    device = Path(url).resolve().name  # /dev/serial/by-id/... are symbolic links
     file = sysfs / "class" / "tty" / device / "device" / "latency_timer"
     return file if file.is_file() else None
 
 
 def read_latency_ms(file: Path) -> int:
-    """The timer's value. An adapter that was just unplugged counts as one from the factory."""
+    """Return the timer's value [ms]; an adapter that was just unplugged is taken to have the factory setting."""
     try:
         return int(file.read_text())
     except (OSError, ValueError):
@@ -40,7 +41,7 @@ def read_latency_ms(file: Path) -> int:
 
 
 def write_latency_ms(file: Path, value_ms: int = WANTED_MS) -> bool:
-    """Set the timer; whether it then reads back so. Needs root, or a udev rule that opens the file."""
+    """Set the timer and return whether it then reads back as set. Needs root, or a udev rule that opens the file."""
     try:
         file.write_text(str(value_ms))
     except OSError:
@@ -49,12 +50,12 @@ def write_latency_ms(file: Path, value_ms: int = WANTED_MS) -> bool:
 
 
 def command_to_set(file: Path, value_ms: int = WANTED_MS) -> str:
-    """What to type when setting it was not permitted. It lasts until the adapter is unplugged."""
+    """Return the shell command that sets the timer as root; the setting lasts until the adapter is unplugged."""
     return f"echo {value_ms} | sudo tee {file}"
 
 
 def adapter_latency(url: str, sysfs: Path = _SYSFS) -> float:
-    """The longest that a reply may lie in the adapter of this port [s]."""
+    """Return the longest time that the adapter of this port may hold back a reply [s]."""
     file = latency_timer(url, sysfs)
     if file is not None:
         return read_latency_ms(file) * 1e-3

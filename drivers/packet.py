@@ -1,11 +1,11 @@
-"""Dynamixel Protocol 2.0 packets, both directions: CRC, byte stuffing, building and finding them in a stream.
+"""Dynamixel Protocol 2.0 packets in both directions: CRC, byte stuffing, encoding, and finding packets in a stream.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". A packet on the wire is
 
     FF FF FD 00  ID  LEN_L LEN_H  INST  [ERR]  PARAM...  CRC_L CRC_H
 
-LEN counts from INST to the CRC. Stuffing is applied to INST..last parameter, then LEN is set, then the CRC is taken
-over everything before it.
+LEN counts the bytes from INST to the CRC. First the bytes from INST to the last parameter are stuffed, then LEN is set,
+then the CRC is computed over everything before it.
 """
 
 from collections.abc import Iterator
@@ -19,12 +19,12 @@ HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
 MAX_ID = 252
 MAX_LENGTH = 1024
-"""Longest LEN believed; beyond it the bytes are noise that looks like a header."""
+"""Longest LEN accepted; above it, the bytes are noise that looks like a header."""
 
 _FRONT = Struct("<4sBH")  # header, ID, LEN
 _STUFFED = b"\xff\xff\xfd"
 _NO_ID = (0xFD, 0xFF)
-"""IDs that no packet has, because they could be part of a header."""
+"""IDs that no servo can have, because they could be part of a header."""
 
 
 class Instruction(IntEnum):
@@ -47,7 +47,7 @@ class Instruction(IntEnum):
 
 
 class StatusError(IntEnum):
-    """Low seven bits of a status packet's ERR byte."""
+    """Error numbers in the low seven bits of a status packet's ERR byte."""
 
     NONE = 0
     RESULT_FAIL = 1
@@ -74,13 +74,13 @@ class HardwareError(IntFlag):
 
 
 class Packet(NamedTuple):
-    """One packet with its stuffing removed. `body` stands between INST and CRC; in a status, ERR comes first."""
+    """One packet with its stuffing removed. `body` runs from after INST to the CRC; in a status it begins with ERR."""
 
     id: int
     instruction: int
     body: bytes
     damaged: bool = False
-    """True when the CRC does not match. Only a `Framer` that was asked for such packets gives them."""
+    """True when the CRC does not match. A `Framer` only returns such packets if created with `damaged=True`."""
 
     @property
     def is_status(self) -> bool:
@@ -98,27 +98,27 @@ class Packet(NamedTuple):
 
 
 def crc(data: bytes) -> int:
-    """CRC-16 of the servos: polynomial 0x8005, initial value 0, not reflected."""
+    """Return the CRC-16 that the servos use: polynomial 0x8005, initial value 0, not reflected."""
     return int(crc16.umts(data))
 
 
 def stuff(payload: bytes) -> bytes:
-    """Insert an FD after every FF FF FD, so that a header can never appear inside a packet."""
+    """Return the payload with an FD inserted after every FF FF FD, so that no header can appear inside a packet."""
     return payload.replace(_STUFFED, _STUFFED + b"\xfd")
 
 
 def unstuff(payload: bytes) -> bytes:
-    """Undo `stuff`."""
+    """Return the payload without the bytes inserted by `stuff`."""
     return payload.replace(_STUFFED + b"\xfd", _STUFFED)
 
 
 def encode(packet_id: int, instruction: int, body: bytes = b"") -> bytes:
-    """The bytes of one packet on the wire."""
+    """Return the bytes of one packet on the wire."""
     return _seal(packet_id, bytes((instruction,)) + body)
 
 
 def encode_status(packet_id: int, error: int, data: bytes = b"") -> bytes:
-    """The bytes of one status packet on the wire."""
+    """Return the bytes of one status packet on the wire."""
     return _seal(packet_id, bytes((Instruction.STATUS, error)) + data)
 
 
@@ -129,12 +129,12 @@ def _seal(packet_id: int, payload: bytes) -> bytes:
 
 
 class Framer:
-    """Finds packets in a stream of bytes, and finds the next one again after noise.
+    """Finds packets in a stream of bytes and resynchronises after noise.
 
-    A packet whose CRC does not match is counted in `bad_crc`. A host then looks for a header right behind the failed
-    one, since its length may be what was corrupted. With `damaged=True` the framer does as a servo: it believes the
-    length and gives the packet marked as damaged, because a servo answers it with an error.
-    A LEN above `longest` is noise.
+    A packet whose CRC does not match is counted in `bad_crc`. The host then searches for a header from the next byte
+    on, since the length may be what was corrupted. With `damaged=True` the framer behaves like a servo: it trusts the
+    length and returns the packet marked as damaged, because a servo answers it with an error.
+    A LEN above `longest` is treated as noise.
     """
 
     def __init__(self, *, damaged: bool = False, longest: int = MAX_LENGTH) -> None:
@@ -145,18 +145,18 @@ class Framer:
         self.noise_bytes = 0
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Take bytes as they come; yield each whole packet."""
+        """Take bytes as they arrive; yield each complete packet."""
         self._buffer += data
         while self._buffer and (packet := self._next()) is not None:
             yield packet
 
     @property
     def pending(self) -> int:
-        """How many bytes were taken and not yet given as a packet or dropped as noise."""
+        """Number of buffered bytes: received, but neither returned as a packet nor dropped as noise."""
         return len(self._buffer)
 
     def reset(self) -> None:
-        """Forget a packet that was begun, as a servo does after a gap of 1.5 ms between bytes."""
+        """Drop an incomplete packet, as a servo does after a gap of 1.5 ms between bytes."""
         self.noise_bytes += len(self._buffer)
         self._buffer.clear()
 
@@ -165,7 +165,7 @@ class Framer:
         while True:
             start = buffer.find(HEADER)
             if start < 0:
-                # Keep what may be the beginning of a header.
+                # Keep the last bytes, which may be the beginning of a header.
                 self._drop(max(0, len(buffer) - len(HEADER) + 1))
                 return None
             if start:

@@ -1,7 +1,7 @@
-"""A serial port that cannot hang: any pyserial URL, bounded reads, one error when the cable is unplugged.
+"""A serial port that cannot hang: any pyserial URL, bounded reads, and one error when the cable is unplugged.
 
-`open_port` opens one. `Port` works through pyserial and so on anything that pyserial can open; `DescriptorPort`
-does the reading and writing of a local device itself, at half of pyserial's cost per cycle.
+Open one with `open_port`. `Port` does its I/O through pyserial and so supports every URL that pyserial does;
+`DescriptorPort` reads and writes a local device directly, at half of pyserial's cost per cycle.
 """
 
 import contextlib
@@ -18,20 +18,28 @@ from hil.drivers.errors import NotPermitted, PortLost, PortNotOpened
 from hil.drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
 
 _FAILURES = (OSError, termios.error)
-# OSError covers SerialException. A pulled cable gives termios.error, which is no OSError, from flushing the input.
+# OSError covers SerialException. An unplugged cable makes flushing the input raise termios.error, which is no OSError.
+
+_REASONS = {
+    "No such file": "there is no such device",
+    "Inappropriate ioctl": "it is not a serial port",
+    "Permission denied": "permission denied",
+    "Is a directory": "it is a folder, not a serial port",
+}
+"""Reasons in words, by what the operating system says."""
 
 _WRITE_PATIENCE_S = 0.1
-"""How long a device may refuse to take bytes before it counts as lost."""
+"""How long a device may refuse to accept bytes before it counts as lost [s]."""
 
 
 def open_port(url: str, baud: int) -> "Port":
-    """Open a device or pyserial URL; raises PortNotOpened, which says why and what to do."""
+    """Open a device or pyserial URL; raises PortNotOpened, whose message states the reason and the remedy."""
     try:
-        # exclusive: a second program on the same bus would steal replies and send goals of its own.
+        # exclusive: a second program on the same bus would steal replies and send its own goals.
         opened = serial.serial_for_url(url, baudrate=baud, timeout=0, exclusive=True)
     except (OSError, termios.error, ValueError) as error:
         kind = NotPermitted if "Permission denied" in str(error) else PortNotOpened
-        raise kind(f"Cannot open port {url!r} at {baud} baud: {_why(error)}. {_advice(error)}".rstrip()) from error
+        raise kind(f"Cannot open port {url!r}: {_why(error, baud)}. {_advice(error)}".rstrip()) from error
     return (DescriptorPort if type(opened) is serial.Serial else Port)(url, baud, opened)
 
 
@@ -39,7 +47,7 @@ class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
     After PortLost the same object may be used again, and fails again as long as the device is gone; a cable that was
-    plugged in again needs a new port. `latency` is the longest time the adapter may hold back a reply [s].
+    replugged needs a new port. `latency` is the longest time the adapter may hold back a reply [s].
     """
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
@@ -47,33 +55,33 @@ class Port:
         self.baud = baud
         self.latency = adapter_latency(url)
         self.latency_measured = False
-        """Whether `latency` was measured, because replies come later than this kind of adapter lets one think."""
+        """Whether `latency` was measured, because replies arrive later than expected of this kind of adapter."""
         self.echoes = False
-        """Whether the adapter hears what it sends. Set-up work finds out."""
+        """Whether the adapter echoes what it sends; detected during set-up."""
         self._serial = opened
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
         self.is_open = True
 
     @property
     def has_baud(self) -> bool:
-        """Whether setting the baud does anything: over TCP the other end has set it."""
+        """Whether setting the baud rate has an effect; over TCP the remote end determines it."""
         return not self.url.startswith("socket://")
 
     def wire_time(self, count: int) -> float:
-        """Wire time [s] of `count` bytes (8 data bits, start and stop)."""
+        """Return the wire time [s] of `count` bytes (8 data bits, one start and one stop bit each)."""
         return count * 10 / self.baud
 
     def write(self, data: bytes) -> None:
-        """Send bytes; returns when the device has taken them, not when they have left it."""
+        """Send bytes; returns when the device has accepted them, not when they have been transmitted."""
         try:
             self._serial.write(data)
         except _FAILURES as error:
             raise self._lost(error) from error
 
     def read(self, count: int, timeout: float) -> bytes:
-        """Up to `count` bytes: fewer if they have not arrived within `timeout` [s]."""
+        """Return up to `count` bytes; fewer if they have not arrived within `timeout` [s]."""
         try:
-            # Setting the timeout makes pyserial look at the terminal's settings, so only when it changes.
+            # Setting the timeout makes pyserial query the terminal settings, so it is set only when it changes.
             if self._serial.timeout != timeout:
                 self._serial.timeout = timeout
             return cast(bytes, self._serial.read(count))
@@ -81,10 +89,10 @@ class Port:
             raise self._lost(error) from error
 
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
-        """`write`, then `read` until `timeout` [s] after `start` [s, on the port's clock]: the control cycle's way.
+        """Write, then read until `timeout` [s] after `start` [s, on the port's clock], as the control cycle does.
 
-        Pending input is dropped: otherwise a repeated or late reply would be taken for this one, and every later reply
-        would be one cycle late.
+        Pending input is discarded first: otherwise a duplicated or late reply would be taken for this one, and every
+        later reply would be one cycle late.
         """
         if self.has_input():
             self.discard_input()
@@ -92,7 +100,7 @@ class Port:
         return self.read(count, timeout)
 
     def has_input(self) -> bool:
-        """Whether bytes have been received and not read."""
+        """Return whether received bytes are waiting to be read."""
         try:
             return bool(self._serial.in_waiting)
         except _FAILURES as error:
@@ -106,7 +114,7 @@ class Port:
             raise self._lost(error) from error
 
     def set_baud(self, baud: int) -> None:
-        """Change the port's baud; raises PortNotOpened when the adapter cannot."""
+        """Change the port's baud rate; raises PortNotOpened if the adapter does not support it."""
         try:
             self._serial.baudrate = baud
         except (*_FAILURES, ValueError) as error:
@@ -114,7 +122,7 @@ class Port:
         self.baud = baud
 
     def lower_latency(self) -> bool:
-        """Set the adapter's latency timer to 1 ms; False when it has one and that was not permitted."""
+        """Set the adapter's latency timer to 1 ms; return False if it has a timer that this user may not set."""
         file = latency_timer(self.url)
         if file is None or read_latency_ms(file) <= WANTED_MS:
             return True
@@ -125,7 +133,7 @@ class Port:
         return read_latency_ms(file) <= WANTED_MS
 
     def close(self) -> None:
-        """Close; harmless when closed or when the cable is gone."""
+        """Close the port; has no effect if it is already closed or the cable is gone."""
         self.is_open = False
         with contextlib.suppress(*_FAILURES):
             self._serial.close()
@@ -137,9 +145,9 @@ class Port:
 
 
 class DescriptorPort(Port):
-    """A local device, read and written on its file descriptor.
+    """A local device, read and written through its file descriptor.
 
-    pyserial opens and configures it, without blocking and with VMIN = VTIME = 0.
+    pyserial opens and configures it as non-blocking, with VMIN = VTIME = 0.
     """
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
@@ -166,8 +174,8 @@ class DescriptorPort(Port):
             raise self._lost(error) from error
 
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
-        # One Python frame for the whole transaction, and where all goes well three system calls and nothing else:
-        # after a wait of a millisecond, with cold caches, every further call costs a microsecond.
+        # One Python frame for the whole transaction, and three system calls in the normal case: after a wait of a
+        # millisecond the caches are cold, and every further call costs a microsecond.
         try:
             if self._wait_ms(0):
                 self.discard_input()
@@ -195,13 +203,13 @@ class DescriptorPort(Port):
             raise self._lost(error) from error
 
     def close(self) -> None:
-        # A closed number may soon be another file's: nothing of ours may touch it again.
+        # The closed descriptor number may soon be reused for another file, so it must not be used again.
         self._descriptor = -1
         self._wait_ms = _never_ready
         super().close()
 
     def _read_on(self, received: bytes, count: int, deadline: float) -> bytes:
-        """Read the rest of a fragmented reply; select, because poll counts whole milliseconds."""
+        """Read the rest of a fragmented reply. Uses select because poll only has a resolution of one millisecond."""
         while len(received) < count:
             remaining = max(0.0, deadline - time.perf_counter())
             if not select.select([self._descriptor], [], [], remaining)[0]:
@@ -235,9 +243,15 @@ def _never_ready(_timeout_ms: float | None = None, /) -> list[tuple[int, int]]:
     raise OSError("the port was closed")
 
 
-def _why(error: BaseException) -> str:
+def _why(error: BaseException, baud: int | None = None) -> str:
+    """The reason, without the numbers and repetitions that come with it."""
     text = str(error.args[-1] if error.args else error)
-    return text.rstrip(".") or type(error).__name__
+    of_device = "open port" in text or "configure port" in text
+    for known, said in _REASONS.items():
+        if of_device and known in text:
+            return said
+    at = "" if baud is None else f" (at {baud} baud)"
+    return f"{text.rstrip('.') or type(error).__name__}{at}"
 
 
 def _advice(error: BaseException) -> str:
@@ -245,7 +259,9 @@ def _advice(error: BaseException) -> str:
     if "Permission denied" in text:
         return "Add yourself to the port's group (`sudo usermod -aG dialout $USER`), then log out and in again."
     if "exclusively lock" in text:
-        return "Another program has it open: close that one first."
+        return "Another program has it open; close that program first."
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."
+    if "ioctl" in text:
+        return "The adapter's port is usually /dev/ttyUSB0 or /dev/ttyACM0; `hil scan` lists those that exist."
     return ""

@@ -6,9 +6,11 @@ from hil.drivers.clock import Clock
 
 
 class Tick(NamedTuple):
-    """One deadline [s, on the clock], the time at which its wait ended, and whether it was missed.
+    """One deadline of a fixed rate.
 
-    Missed means a whole interval or more late: it should be skipped.
+    deadline: when the wait should have ended [s, on the clock].
+    now: when it ended [s].
+    missed: it ended a whole interval or more too late; the caller should skip this sample.
     """
 
     deadline: float
@@ -17,10 +19,10 @@ class Tick(NamedTuple):
 
 
 class FixedRate:
-    """Deadlines at `rate` per second, the first one interval after the first wait.
+    """Deadlines at `rate` per second, the first one interval after the first call of `wait`.
 
-    After a stall the missed deadlines come at once, one by one and marked, so that whoever plays samples stays in step
-    with the clock without sending a burst. `missed` counts them.
+    After a stall the missed deadlines are returned at once, one by one and marked as missed, so that a caller playing
+    back samples stays in step with the clock without sending a burst. `missed` counts them.
     """
 
     def __init__(self, clock: Clock, rate: float) -> None:
@@ -31,7 +33,7 @@ class FixedRate:
         self.missed = 0
 
     def wait(self) -> Tick:
-        """Wait for the next deadline."""
+        """Wait for the next deadline and return it."""
         if self._start is None:
             self._start = self._clock.now() + self._interval
         deadline = self._start + self._index * self._interval

@@ -1,26 +1,25 @@
-"""The port that `dynamixel-sdk`'s packet handler works on, in place of its own PortHandler."""
+"""The port on which the packet handler of `dynamixel-sdk` works, in place of the SDK's own PortHandler."""
 
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
-"""How long set-up work waits for a reply beyond its wire time, whatever the adapter: writing EEPROM takes a servo
-some ms."""
+"""Time that set-up work waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
 
 
 class SdkPort:
-    """`dynamixel-sdk` on our open port. The echo of an adapter that receives its own transmissions is removed.
+    """Adapts our open port to `dynamixel-sdk`, removing the echo of an adapter that receives its own transmissions.
 
-    Unlike the SDK's own port, reads wait instead of polling, time is the port's clock, and a failure cannot leave the
-    port marked as in use, after which torque could never be switched off. Method names are the SDK's.
+    Unlike the SDK's own port, reads block instead of polling, time is the port's clock, and a failure cannot leave the
+    port marked as in use, which would make it impossible to cut torque. The method names are the SDK's.
     """
 
     def __init__(self, port: Port) -> None:
         self._port = port
         self._deadline = 0.0
         self._sent = b""
-        """What was written last, as long as it may still come back."""
+        """What was written last, as long as its echo may still arrive."""
         self._held = b""
-        """What was received and may yet be the beginning of that."""
+        """Bytes received that may be the beginning of the echo."""
 
     @property
     def is_using(self) -> bool:
@@ -28,7 +27,7 @@ class SdkPort:
 
     @is_using.setter
     def is_using(self, value: bool) -> None:
-        """The SDK sets it around each exchange and leaves it set after an exception: not kept."""
+        """Ignore the value: the SDK sets it around each exchange and leaves it set after an exception."""
 
     def getBaudRate(self) -> int:  # noqa: N802
         return self._port.baud
@@ -44,7 +43,7 @@ class SdkPort:
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         while self._sent and self._sent.startswith(self._held):
-            # A status and the instruction that it answers begin alike and differ at the eighth byte.
+            # A status packet and the instruction it answers begin alike and differ at the eighth byte.
             if self._held == self._sent:
                 self._port.echoes = True
                 self._sent = self._held = b""

@@ -1,7 +1,7 @@
-"""One servo on a port, for set-up work: ping, and registers by name; each exchange is tried up to three times.
+"""One servo on a port, for set-up work: ping, and read and write registers by name, with up to three attempts each.
 
-Everything goes through `dynamixel-sdk`'s packet handler. What is written is read back: a Sync Write has no status at
-all, and a status says that the packet was understood, not what the register holds now.
+Everything goes through the packet handler of `dynamixel-sdk`. Writes are read back, because a status packet only says
+that the instruction was understood, not what the register now holds.
 """
 
 from collections.abc import Callable
@@ -19,21 +19,21 @@ from hil.drivers.sdk_port import SdkPort
 _T = TypeVar("_T")
 
 _ATTEMPTS = 3
-"""How often a set-up exchange is tried before a damaged or missing reply is believed."""
+"""Attempts at a set-up exchange before a corrupted or missing reply is reported."""
 
 
 _LATE_S = 0.06
-"""How long an answer may be late after which nobody waits for it [s]."""
+"""How late a reply to an exchange that has timed out may still arrive [s]."""
 
 _DATA = 9
-"""Where the data begin in a status packet."""
+"""Index of the first data byte in a status packet."""
 
 _BESIDE_DATA = 4
-"""What LEN counts beside the data: INST, ERR, CRC."""
+"""Bytes that LEN counts in addition to the data: INST, ERR, CRC."""
 
 
 class Servo:
-    """A servo by its ID. `title` begins the error messages, e.g. "Joint 'elbow' (ID 2, XM430-W350)"."""
+    """A servo addressed by its ID. `title` begins its error messages, e.g. "Joint 'elbow' (ID 2, XM430-W350)"."""
 
     def __init__(self, port: Port, servo_id: int, table: ControlTable, title: str = "") -> None:
         self.port = port
@@ -44,7 +44,7 @@ class Servo:
         self._sdk = PacketHandler(2.0)
 
     def ping(self, attempts: int = _ATTEMPTS) -> int:
-        """The model number that answers at this ID; raises NoReply, WrongReply, PortLost."""
+        """Return the model number reported at this ID; raises NoReply, WrongReply, PortLost."""
 
         def ask() -> tuple[int, int, int]:
             number, result, error = self._sdk.ping(self._sdk_port, self.id)
@@ -52,15 +52,15 @@ class Servo:
 
         return self._try("ping", ask, attempts)
 
-    def read(self, register: str) -> int:
-        """The value of a register, in ticks; raises NoReply, WrongReply, ServoRefused, PortLost."""
-        return self.read_entry(self.table[register])
+    def read(self, register: str, attempts: int = _ATTEMPTS) -> int:
+        """Return the value of a register in ticks; raises NoReply, WrongReply, ServoRefused, PortLost."""
+        return self.read_entry(self.table[register], attempts)
 
-    def read_entry(self, entry: Register) -> int:
-        """`read` for a register that the model's table leaves out."""
+    def read_entry(self, entry: Register, attempts: int = _ATTEMPTS) -> int:
+        """Read a register that is missing from the model's table; raises as `read`."""
 
         def ask() -> tuple[list[int], int, int]:
-            # The SDK's own readTxRx takes the first bytes of whatever comes: a late answer to another question too.
+            # The SDK's own readTxRx accepts the first bytes of any reply, including a late one to another request.
             request = [
                 0,
                 0,
@@ -83,19 +83,23 @@ class Servo:
                 return [], COMM_RX_CORRUPT, error
             return data, result, error
 
-        return entry.decode(bytes(self._try(f"reading {entry.name}", ask)))
+        return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts)))
 
-    def write(self, register: str, value: int) -> None:
-        """Write a register and read it back; raises as `read`, and ServoRefused when it reads back otherwise."""
-        # A status may be lost, or switched off (Status Return Level 1): what counts is what the register holds.
+    def write(self, register: str, value: int, attempts: int | None = None) -> None:
+        """Write a register and read it back; raises as `read`, and ServoRefused if another value is read back.
+
+        attempts: of the write and of the read; by default as many as for all set-up work.
+        """
+        attempts = _ATTEMPTS if attempts is None else attempts
+        # The status packet may be lost or switched off (Status Return Level 1); what counts is the register's value.
         with suppress(NoReply):
-            self.write_only(register, value)
-        actual = self.read(register)
+            self.write_only(register, value, attempts)
+        actual = self.read(register, attempts)
         if actual != value:
             raise ServoRefused(f"{self.title}: {register} was written as {value} but reads back as {actual}.")
 
     def write_only(self, register: str, value: int, attempts: int = _ATTEMPTS) -> None:
-        """Write a register whose new value cannot be read back under the old ID or baud; raises as `read`."""
+        """Write a register without reading it back, as needed for ID and Baud Rate; raises as `read`."""
         entry = self.table[register]
         data = list(entry.encode(value))
 
@@ -106,7 +110,7 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def hardware_error(self) -> HardwareError:
-        """Why the servo raised its alert bit; raises as `read`."""
+        """Return the Hardware Error Status, the reason for a raised alert bit; raises as `read`."""
         return HardwareError(self.read("Hardware Error Status"))
 
     def _try(self, what: str, action: Callable[[], tuple[_T, int, int]], attempts: int = _ATTEMPTS) -> _T:
@@ -118,7 +122,7 @@ class Servo:
                 break
             late = late or result == COMM_RX_TIMEOUT
         if late and result == COMM_SUCCESS:
-            # The answers to the questions that seemed lost may be on their way, and would answer the next one.
+            # Late replies to the requests that timed out may still arrive and would be taken for the next reply.
             self.port.clock.wait_until(self.port.clock.now() + _LATE_S)
             self.port.discard_input()
         if result == COMM_RX_TIMEOUT:
@@ -143,7 +147,7 @@ def _two_bytes(value: int) -> tuple[int, int]:
 
 
 def describe_error(error: HardwareError) -> str:
-    """Hardware errors in words, e.g. "overload, overheating"."""
+    """Return hardware errors in words, e.g. "overload, overheating"."""
     known = [bit.name.replace("_", " ").lower() for bit in HardwareError if bit in error and bit.name]
     rest = int(error) & ~sum(HardwareError)
     return ", ".join(known + ([f"unknown bits {rest:#04x}"] if rest else [])) or "none"

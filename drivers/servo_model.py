@@ -1,7 +1,7 @@
-"""What a servo's ticks mean, by model: the facts that the SDK's control tables leave out.
+"""The meaning of each model's ticks: facts that the SDK's control tables leave out.
 
 Sources: ROBOTIS e-Manual, page of each model (current unit, resolution, Operating Mode, stall figures). None of the
-torque constants below was measured here.
+torque constants below was measured by us.
 """
 
 import math
@@ -14,26 +14,26 @@ from typing import NamedTuple
 from hil.drivers.errors import UnknownModel
 
 VELOCITY_UNIT = 0.229 * 2 * math.pi / 60
-"""rad/s per tick of Present Velocity."""
+"""Velocity per tick of Present Velocity [rad/s]."""
 
 WATCHDOG_UNIT = 0.020
-"""s per tick of Bus Watchdog."""
+"""Time per tick of Bus Watchdog [s]."""
 
 RETURN_DELAY_UNIT = 2e-6
-"""s per tick of Return Delay Time."""
+"""Time per tick of Return Delay Time [s]."""
 
 VOLTAGE_UNIT = 0.1
-"""V per tick of Present Input Voltage."""
+"""Voltage per tick of Present Input Voltage [V]."""
 
 FULL_PWM_TICKS = 885
-"""Goal PWM that puts the whole supply voltage on the motor."""
+"""Goal PWM that applies the whole supply voltage to the motor [ticks]."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
-"""Baud by the value of the register Baud Rate. The 330 models end at 4 M."""
+"""Baud rates by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
 
 
 class Mode(IntEnum):
-    """How a joint is driven: the value of Operating Mode. A goal is a current [A], or a voltage [V] under PWM."""
+    """How a joint is driven: the value of Operating Mode. A goal is a current [A], or a voltage [V] in PWM mode."""
 
     CURRENT = 0
     PWM = 16
@@ -44,7 +44,7 @@ class Mode(IntEnum):
 
 
 class Stall(NamedTuple):
-    """One line of the e-Manual's stall figures: V, A, N m at the output shaft."""
+    """One row of the e-Manual's stall figures: voltage [V], current [A], torque at the output shaft [N m]."""
 
     voltage: float
     current: float
@@ -52,10 +52,10 @@ class Stall(NamedTuple):
 
 
 class Published(NamedTuple):
-    """A torque constant as published: the middle of the figures, and the lowest and the highest of them.
+    """A torque constant as published: the median of the figures, and the lowest and highest of them.
 
-    Uncertain regardless of the spread: stall torque is the peak that a servo reaches, friction included, and a servo of
-    the same model can differ from it by tens of percent. Where it matters, measure it with a known weight.
+    It is uncertain even where the figures agree: the stall torque is a servo's peak torque, friction included, and an
+    individual servo can differ from it by tens of percent. If it matters, measure it with a known weight.
     """
 
     value: float
@@ -65,17 +65,18 @@ class Published(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ServoModel:
-    """Units of one model.
+    """Units and limits of one servo model.
 
-    current_unit: A per tick of Goal and Present Current; None where the model has neither current mode nor sensor.
+    current_unit: current per tick of Goal and Present Current [A]; None if the model has neither current mode nor
+    sensor.
     stalls: the e-Manual's stall figures.
     other_constants: further published torque constants [N m/A].
     position_steps: ticks of Present Position per turn.
-    min_voltage: the supply below which it shuts down from the factory (Min Voltage Limit) [V].
+    min_voltage: supply voltage below which it shuts down with factory settings (Min Voltage Limit) [V].
     watchdog_firmware: first firmware with a Bus Watchdog.
-    fast_sync_read_firmware: first firmware that answers Fast Sync Read; None where no firmware does.
-    senses_supply: whether Present Current is the supply's, which is the motor's times the share of time in which its
-    bridge is on: far less than what is commanded while the joint is slow.
+    fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
+    senses_supply: Present Current is the supply current, that is, the motor current times the bridge's duty cycle: far
+    less than the commanded current while the joint is slow.
     """
 
     name: str
@@ -90,30 +91,30 @@ class ServoModel:
 
     @property
     def position_unit(self) -> float:
-        """rad per tick of Present Position."""
+        """Angle per tick of Present Position [rad]."""
         return 2 * math.pi / self.position_steps
 
     @property
     def default_mode(self) -> Mode:
-        """Current mode where the servo has it, else PWM."""
+        """Current mode if the servo has it, otherwise PWM."""
         return Mode.PWM if self.current_unit is None else Mode.CURRENT
 
     @property
     def resistance(self) -> float:
-        """Ohm between the motor's terminals, from the stall figures: the least of them."""
+        """Resistance between the motor's terminals [Ohm]: the lowest value among the stall figures."""
         return min(stall.voltage / stall.current for stall in self.stalls)
 
     @property
     def torque_per_ampere(self) -> Published:
-        """N m/A at the output shaft: stall torque over stall current, and what else has been published."""
+        """Torque constant at the output shaft [N m/A]: stall torque over stall current, and other published values."""
         return _spread([stall.torque / stall.current for stall in self.stalls] + list(self.other_constants))
 
     @property
     def torque_per_volt(self) -> Published:
-        """N m/V at the output shaft, at rest: stall torque over supply voltage.
+        """Torque at the output shaft at rest per volt [N m/V]: stall torque over supply voltage.
 
-        In PWM mode the motor's torque is this times the applied voltage, less what turning generates: an identified
-        viscous friction then includes the back-EMF.
+        In PWM mode the motor's torque is this times the applied voltage, minus the effect of the back-EMF; an
+        identified viscous friction then includes the latter.
         """
         return _spread([stall.torque / stall.voltage for stall in self.stalls])
 
@@ -124,7 +125,7 @@ def _spread(values: list[float]) -> Published:
 
 
 _WORKBENCH_XM430 = 1 / (149.795 * 2.69e-3)
-# ROBOTIS' own dynamixel-workbench takes 149.795 ticks per N m for the whole XM family: 2.48 N m/A.
+# From ROBOTIS' dynamixel-workbench: 149.795 ticks per N m for the whole XM family, hence 2.48 N m/A.
 
 _MODELS = (
     ServoModel(
@@ -152,7 +153,7 @@ _MODELS = (
         min_voltage=3.5,
         fast_sync_read_firmware=46,
     ),
-    # Its current sensor sits in the supply, not in a motor phase.
+    # Its current sensor is in the supply line, not in a motor phase.
     ServoModel(
         "XC330-T288",
         1.0e-3,
@@ -167,14 +168,12 @@ _MODELS = (
 )
 
 SERVO_MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _MODELS})
-"""Models that the driver can drive, by name."""
+"""The supported servo models, by name."""
 
 
 def servo_model(name: str) -> ServoModel:
-    """The model's units; raises UnknownModel with the names that are possible."""
+    """Return the model with this name; raises UnknownModel, listing the supported names."""
     try:
         return SERVO_MODELS[name]
     except KeyError:
-        raise UnknownModel(
-            f"{name!r} is not a servo model that can be driven here. Possible: {', '.join(SERVO_MODELS)}."
-        ) from None
+        raise UnknownModel(f"{name!r} is not a supported servo model. Supported: {', '.join(SERVO_MODELS)}.") from None

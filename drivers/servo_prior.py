@@ -1,8 +1,8 @@
-"""Prior knowledge of a servo's friction and rotor: medians as fractions of stall torque, and spread.
+"""Prior knowledge of a servo's friction and rotor inertia: medians as fractions of stall torque, and spreads.
 
-From identified X-series servos: Rhoban's bam (dry friction of 1.2 to 2.5 % of stall torque, small servos up to 7 %),
-published models of XM430 arms (armature 0.005 to 0.012 kg m^2, viscous 0.02 to 0.06 N m s/rad at 4.1 N m). Plastic
-gears of small servos vary most. None of it was measured here, hence the wide spread.
+Based on identified X-series servos: Rhoban's bam (dry friction 1.2 to 2.5 % of stall torque, small servos up to 7 %)
+and published models of XM430 arms (armature 0.005 to 0.012 kg m^2, viscous friction 0.02 to 0.06 N m s/rad at a stall
+torque of 4.1 N m). Small servos with plastic gears vary most. None of this was measured by us, hence the wide spreads.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from hil.drivers.servo_model import ServoModel
 
 @dataclass(frozen=True)
 class Guess:
-    """A positive quantity: its median, and the relative standard deviation of a log-normal about it."""
+    """A log-normally distributed positive quantity: its median and its relative standard deviation."""
 
     median: float
     spread: float
@@ -20,10 +20,15 @@ class Guess:
 
 @dataclass(frozen=True)
 class ServoPrior:
-    """Of one model, at its output shaft.
+    """Prior distributions for one servo model, referred to its output shaft.
 
-    coulomb [N m], viscous without back-EMF [N m s/rad], armature [kg m^2], mass [kg], stribeck_rise [1],
-    stribeck_velocity [rad/s], lag of the current loop [s].
+    coulomb: Coulomb friction [N m].
+    viscous: viscous friction without back-EMF [N m s/rad].
+    armature: reflected rotor inertia [kg m^2].
+    mass: mass of the servo [kg].
+    stribeck_rise: breakaway friction above Coulomb friction, as a fraction of the latter [1].
+    stribeck_velocity: Stribeck velocity [rad/s].
+    lag: time constant of the current loop [s].
     """
 
     coulomb: Guess
@@ -36,17 +41,17 @@ class ServoPrior:
 
 
 _MASS = {"XM430": 0.082, "XH430": 0.082, "XM540": 0.165, "XL330": 0.018, "XC330": 0.023, "XL430": 0.0572}
-"""kg, by family (e-Manual)."""
+"""Mass by servo family [kg] (e-Manual)."""
 
 _COULOMB_SHARE = Guess(0.016, 0.5)
 _SMALL_COULOMB_SHARE = Guess(0.026, 0.75)
 _SMALL = ("XL330", "XC330", "XL430")
-_VISCOUS_SHARE = Guess(0.009, 0.7)  # of stall torque per rad/s
+_VISCOUS_SHARE = Guess(0.009, 0.7)  # fraction of stall torque, per rad/s
 _ARMATURE_SHARE = Guess(2.5e-3, 0.5)  # kg m^2 per N m
 
 
 def servo_prior(model: ServoModel) -> ServoPrior:
-    """The guesses for a model."""
+    """Return the prior for a model."""
     stall, family = stall_torque(model), model.name.split("-")[0]
     share = _SMALL_COULOMB_SHARE if family in _SMALL else _COULOMB_SHARE
 
@@ -59,6 +64,6 @@ def servo_prior(model: ServoModel) -> ServoPrior:
 
 
 def stall_torque(model: ServoModel) -> float:
-    """N m at the middle one of the published voltages."""
+    """Return the stall torque [N m] at the middle one of the published voltages."""
     torques = sorted(stall.torque for stall in model.stalls)
     return torques[len(torques) // 2]

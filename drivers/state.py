@@ -1,4 +1,4 @@
-"""One sample of the arm in SI units, and how raw answers become it."""
+"""One sample of the arm in SI units, and its conversion from raw answers."""
 
 import functools
 import operator
@@ -16,7 +16,7 @@ NAN = float("nan")
 
 
 class Slow(NamedTuple):
-    """What is read in turn, a few times a second; NaN where it was not this one's turn, or the servo is silent.
+    """Values that are read in turn, a few times a second; NaN if not read in this cycle, or if the servo did not reply.
 
     tick: the servo's own clock [s], which wraps at 32.768 s. voltage: supply [V]. temperature: [degrees C].
     """
@@ -27,11 +27,13 @@ class Slow(NamedTuple):
 
 
 class Status(NamedTuple):
-    """Status that a servo reports a few times per 0.1 s besides its state.
+    """What a servo reports every few cycles in addition to its state.
 
-    watchdog: Bus Watchdog [20 ms], 255 when it acted. goal: the register of the goal [A, or V under PWM]. tick: the
-    servo's own clock [s], which wraps at 32.768 s. torque: Torque Enable; hardware_error: Hardware Error Status; both
-    None where the cycle has no time for them.
+    watchdog: Bus Watchdog [20 ms], 255 after it has tripped.
+    goal: the goal that the servo holds [A, or V in PWM mode].
+    tick: the servo's own clock [s], which wraps at 32.768 s.
+    torque: Torque Enable; hardware_error: Hardware Error Status. Both are None if the cycle leaves no time to read
+    them.
     """
 
     watchdog: int
@@ -42,12 +44,16 @@ class Status(NamedTuple):
 
 
 class State(NamedTuple):
-    """One sample of the arm; NaN where a servo did not answer.
+    """One sample of the arm, one value per joint; NaN if a servo did not reply.
 
-    time_before_write, time_after_read: s on the port's clock. goal_current: what was sent, a whole number of ticks,
-    and current: what the servo measured [A] (under PWM both are voltages [V], sent and applied); velocity [rad/s];
-    position [rad]; error: the ERR bytes, 0 where missing; missing: no values from this servo; slow, status: in
-    turn, else None.
+    time_before_write, time_after_read: times on the port's clock [s].
+    goal_current: the goals that were sent, rounded to whole ticks [A, or V in PWM mode].
+    current: the measured current [A], or the applied voltage [V] in PWM mode.
+    velocity: joint velocity [rad/s].
+    position: joint angle [rad].
+    error: the ERR bytes, 0 if missing.
+    missing: whether the servo returned no values.
+    slow, status: values that are only read in some cycles, otherwise None.
     """
 
     time_before_write: float
@@ -66,13 +72,14 @@ _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
 
 
 Spans = Span | tuple[Span, ...]
-"""One span for all servos, or where they are driven in different modes one for each."""
+"""One span for all servos, or one per servo where they are driven in different modes."""
 
 
 def spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans, Spans]:
-    """What is read in each cycle, and the two longer spans read now and then: with the tick, with voltage and heat.
+    """Return the registers read in most cycles, and two longer spans read occasionally.
 
-    mode: how all servos are driven, or how each is.
+    The second span adds the servo's clock, the third the supply voltage and temperature. mode: drive mode of all
+    servos, or of each.
     """
     return (
         _span(mode, tables, (), ()),
@@ -90,19 +97,19 @@ def _span(
 
 
 SLOW_SPANS = 2
-"""How many of `spans` are read now and then."""
+"""Number of `spans` that are read only occasionally."""
 
 _WHOLE_STATUS = 9
-"""Values of an answer with a whole status: ERR, five registers and the state."""
+"""Number of values in an answer with the whole status: ERR, five registers and the state."""
 
 _DRIVEN = ("Torque Enable", "Hardware Error Status")
 
 
 def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, whole: bool) -> Spans:
-    """The registers that show whether torque and watchdog are still on, plus the state.
+    """Return the registers that show whether torque and watchdog are still on, plus the state.
 
-    mode: how all servos are driven, or how each is. whole: from Torque Enable on; else without what stands in front of
-    Bus Watchdog, which takes half of the bytes.
+    mode: drive mode of all servos, or of each. whole: start at Torque Enable; otherwise start at Bus Watchdog, which
+    halves the number of bytes.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     names = [(*_DRIVEN, *_status_names(own)) if whole else _status_names(own) for own in modes]
@@ -115,7 +122,7 @@ def _status_names(mode: Mode) -> tuple[str, ...]:
 
 
 class Converter:
-    """Turns replies into States and goals into ticks. drive_units: A or V per tick, with each joint's sign."""
+    """Converts replies to States and goals to ticks. drive_units: A or V per tick, with each joint's sign."""
 
     def __init__(self, joints: Sequence[Joint], drive_units: Sequence[float]) -> None:
         self._joints = tuple(joints)
@@ -126,7 +133,7 @@ class Converter:
         ]
 
     def ticks(self, goals: Sequence[float]) -> list[int]:
-        """The nearest goals in ticks. Raises ValueError for a goal that is not a number."""
+        """Return the goals rounded to the nearest ticks; raises ValueError for a goal that is not a finite number."""
         try:
             return [round(goal / unit) for goal, unit in zip(goals, self._drive_units, strict=True)]
         except (ValueError, OverflowError):
@@ -134,7 +141,7 @@ class Converter:
 
     def state(self, ticks: Sequence[int], reply: Reply) -> State:
         sent = tuple([unit * tick for unit, tick in zip(self._drive_units, ticks, strict=True)])
-        # What is read beside the three that are always read stands in front of them, voltage and heat behind them.
+        # Additional registers precede the three that are always read, but voltage and temperature follow them.
         at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
         drive, velocity, position, error, missing = [], [], [], [], []
         for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True):
@@ -201,10 +208,11 @@ def _column(answers: Sequence[Answer], index: int, unit: float) -> tuple[float, 
 
 
 def fold(state: State, of: Sequence[int], count: int) -> State:
-    """The state of joints from that of their servos. of: of each servo, its joint, in rising order; count: joints.
+    """Return the state of the joints, given that of their servos.
 
-    Currents and goals are sums, angle, velocity and clock the first servo's, the voltage the lowest, the temperature
-    the highest; an error or a loss of one servo is one of the joint.
+    of: the joint index of each servo, in ascending order. count: number of joints.
+    Goals and currents are summed; angle, velocity and clock are the first servo's; of the voltages the lowest is taken,
+    of the temperatures the highest; an error or a missing reply of one servo applies to its joint.
     """
     servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]
     first = [places[0] for places in servos]
@@ -227,7 +235,7 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
 
 def _told(statuses: Sequence[Status | None]) -> Status | None:
-    """The combined status of one joint's servos: the goal is the sum, what is wrong with one is wrong with it."""
+    """Return the combined status of one joint's servos: goals are summed, and a fault of any servo counts."""
     told = [status for status in statuses if status is not None]
     if len(told) < len(statuses):
         return None
@@ -243,7 +251,7 @@ def _told(statuses: Sequence[Status | None]) -> Status | None:
 
 
 def _joined(errors: Iterable[int]) -> int:
-    """The ERR bytes of one joint's servos as one: the first error number, and whether any has its Alert set."""
+    """Return the combined ERR byte of one joint's servos: the first error number, plus Alert if any servo has it."""
     number = alert = 0
     for error in errors:
         alert |= error & ALERT

@@ -1,7 +1,7 @@
 """Sync Read and Fast Sync Read: one request for the same contiguous registers of several servos, and their answers.
 
-A servo's answer is a plain tuple: the ERR byte, then the registers' values in ticks; the ERR byte alone where the servo
-refused; None where it did not answer. ERR holds a StatusError in its low bits and the Alert in bit 7.
+A servo's answer is a plain tuple: the ERR byte followed by the register values in ticks; only the ERR byte if the servo
+refused; None if it did not reply. ERR holds a StatusError in its low bits and Alert in bit 7.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _FORMATS = {(1, False): "B", (2, False): "H", (4, False): "I", (1, True): "b", (
 
 @dataclass(frozen=True)
 class Span:
-    """Registers that are read together: everything from the first to the last of them. `format` is struct's."""
+    """Registers that are read together: all bytes from the first to the last. `format` is a `struct` format."""
 
     registers: tuple[str, ...]
     address: int
@@ -32,9 +32,9 @@ class Span:
 
     @classmethod
     def of(cls, tables: Sequence[ControlTable], registers: Sequence[str]) -> "Span":
-        """The span of these registers, in ascending order of address, which must be the same in all tables.
+        """Return the span of these registers, given in ascending order of address.
 
-        Raises ValueError where two models have them at different places, KeyError where one has not got one.
+        Raises ValueError if their addresses differ between the tables, KeyError if a table lacks one of them.
         """
         spans = {cls._in(table, registers) for table in tables}
         if len(spans) != 1:
@@ -44,9 +44,9 @@ class Span:
 
     @classmethod
     def each(cls, tables: Sequence[ControlTable], registers: Sequence[Sequence[str]]) -> "tuple[Span, ...]":
-        """One span per table, `registers[i]` of `tables[i]`, all of the same stretch: from the first to the last.
+        """Return one span per table, with `registers[i]` of `tables[i]`, all covering the same range of addresses.
 
-        Raises KeyError where a table has not got one of its registers.
+        Raises KeyError if a table lacks one of its registers.
         """
         own = [cls._in(table, names) for table, names in zip(tables, registers, strict=True)]
         start = min(span.address for span in own)
@@ -73,32 +73,36 @@ class Span:
 
 
 def one_each(span: Span | Sequence[Span], count: int) -> tuple[Span, ...]:
-    """A span for each servo. Raises ValueError where they are not of one stretch, with as many registers."""
+    """Return one span per servo; raises ValueError unless all cover the same addresses with equally many registers."""
     spans = (span,) * count if isinstance(span, Span) else tuple(span)
     if len(spans) != count or len({(each.address, each.size, len(each.registers)) for each in spans}) != 1:
-        raise ValueError(f"{count} servos read together need spans of one stretch, as many registers in each: {spans}")
+        raise ValueError(f"{count} servos read together need spans of the same addresses and register count: {spans}")
     return spans
 
 
 class GroupRead(Protocol):
-    """What the exchange needs of a group read. `request` and `reply_size` bytes go over the wire."""
+    """A group read as the exchange needs it. `request` is sent; the reply usually has `reply_size` bytes."""
 
     request: bytes
     reply_size: int
 
     def unpack(self, received: bytes) -> list[Answer] | None:
-        """The usual case: every servo answered and nothing was stuffed. None when it is not that case."""
+        """Decode a regular reply, in which every servo answered and nothing was stuffed; return None for any other."""
         ...
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
-        """The answers found among stuffed, damaged, foreign or missing answers; whether nothing more is to come."""
+        """Return the answers found in an irregular reply, and whether no further bytes are expected.
+
+        Answers may be stuffed, damaged, missing, or meant for an earlier request.
+        """
         ...
 
 
 class SyncRead:
-    """Each servo answers with a status packet of its own, in the order of `ids`.
+    """Each servo answers with its own status packet, in the order of `ids`.
 
-    span: what is read, for all or one each, which then differ in what of the stretch is looked at (`Span.each`).
+    span: the registers to read, for all servos or one per servo (`Span.each`). The spans then cover the same addresses
+    but differ in which values are decoded.
     """
 
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
@@ -108,12 +112,12 @@ class SyncRead:
         span = spans[0]
         self._size = span.size
         self.request = _request(Instruction.SYNC_READ, ids, span)
-        # A damaged LEN must not swallow the answers behind it; stuffing adds at most a byte for every three.
+        # A damaged LEN must not swallow the answers that follow; stuffing adds at most one byte for every three.
         self._longest = span.size + 4 + (span.size + 2) // 3
         length = span.size + 11  # header, ID, LEN, INST, ERR, data, CRC
         self.reply_size = length * len(self._ids)
         behind_id = (span.size + 4).to_bytes(2, "little") + bytes((Instruction.STATUS,))
-        # All answers in one unpacking: per servo the eight bytes up to INST as one number, ERR, the values, the CRC.
+        # Unpack all answers at once: per servo the eight bytes up to INST as one number, ERR, the values, the CRC.
         self._unpack = Struct("<" + "".join(f"QB{own.format}H" for own in spans)).unpack
         width = len(span.registers) + 3
         self._parts = [
@@ -145,22 +149,22 @@ class SyncRead:
             if packet.is_status and packet.id in self._ids and (answer := self._answer(packet)):
                 turn = self._ids.index(packet.id)
                 if turn <= latest:
-                    found.clear()  # they answer in turn: what stands before is left over from an earlier request
+                    found.clear()  # servos answer in order, so the earlier ones belong to an earlier request
                 found[packet.id], latest = answer, turn
-        # They answer in turn, so nobody speaks after the last one.
+        # Servos answer in order, so nothing follows the last one.
         return [found.get(servo_id) for servo_id in self._ids], self._ids[-1] in found
 
     def _answer(self, packet: Packet) -> Answer:
         if len(packet.data) == self._size:
             return self._values[packet.id].unpack(packet.body)
-        # An answer of another length is one to an earlier request, or a refusal.
+        # An answer of a different length belongs to an earlier request or is a refusal.
         return (packet.error,) if packet.error & _ERROR_BITS and not packet.data else None
 
 
 class FastSyncRead:
     """All servos append to one status packet, which is never stuffed: `ERR ID data CRC` each.
 
-    Each CRC is taken over everything from the packet's header on, so the last one vouches for the whole.
+    Each CRC covers everything from the packet's header on, so the last one covers the whole packet.
     """
 
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
@@ -168,7 +172,7 @@ class FastSyncRead:
         spans = one_each(span, len(self._ids))
         self._values = {servo_id: Struct(f"<Bx{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
         span = spans[0]
-        # All parts in one unpacking: per servo its ERR, ID, values and CRC.
+        # Unpack all parts at once: per servo its ERR, ID, values and CRC.
         self._whole = Struct("<8x" + "".join(f"BB{own.format}H" for own in spans))
         self._width = len(span.registers) + 3
         self.request = _request(Instruction.FAST_SYNC_READ, ids, span)
@@ -207,7 +211,7 @@ class FastSyncRead:
                 break
             answer = self._values[servo_id].unpack_from(packet, start)
             answers.append(answer[:1] if answer[0] & _ERROR_BITS else answer)
-        # Behind a servo that is silent or damaged the packet cannot be trusted.
+        # After a silent or damaged servo, the rest of the packet cannot be trusted.
         answers += [None] * (len(self._ids) - len(answers))
         return answers, len(packet) >= self.reply_size
 

@@ -1,1 +1,1 @@
-"""Mathematics without input or output: excitation, arm model, Fourier analysis, estimators, uncertainty."""
+"""Mathematics without input or output: excitation, arm models, Fourier analysis, estimators, uncertainty."""

@@ -1,4 +1,4 @@
-"""The one kind of array between the estimator's stages."""
+"""Array types used between the estimator's stages."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,7 +1,7 @@
-"""BLAS on one thread, where its products are small and many.
+"""BLAS limited to one thread, for products that are small and many.
 
-Its own threads spin while they wait: on two cores with other work a singular value decomposition of 1200 by 16 took
-30 ms on two threads and 0.6 ms on one (docs/dependencies.md).
+BLAS threads spin while they wait: on two busy cores, a singular value decomposition of a 1200 by 16 matrix took 30 ms
+with two threads and 0.6 ms with one (docs/dependencies.md).
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 
 
 def one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """`function` with BLAS held to one thread while it runs, in the whole process; calls may be nested."""
+    """Return `function` with BLAS limited to one thread in the whole process while it runs; calls may be nested."""
 
     @wraps(function)
     def held(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:

@@ -1,13 +1,14 @@
-"""Torque constants from a known mass: two settled periods, without and with it, in one likelihood.
+"""Torque constants from a known mass: a joint likelihood of two settled periods, without and with the mass.
 
-Every parameter of a joint scales with its torque constant, so one experiment cannot tell them apart. A mass M bolted
-to the last link at a known distance changes the arm by amounts that are known in kilograms and metres:
+Every parameter of a joint scales with its torque constant, so a single experiment cannot determine the latter. A mass M
+bolted to the last link at a known distance changes the arm's parameters by amounts that are known in kilograms and
+metres:
 
     gravity_2 + M d g    inertia_2 + M d^2 + J    coupling + M l1 d    gravity_1 + M l1 g    inertia_1 + M l1^2
     (one joint: gravity_1 + M d g, inertia_1 + M d^2 + J)
 
-Both periods are fitted at once, with the second's parameters the first's plus these, and each joint's torque as
-commanded times an unknown factor: the ratio of true to assumed torque constant.
+Both periods are fitted together. The second period's parameters are the first's plus these amounts, and each joint's
+torque is the commanded one times an unknown factor: the ratio of true to assumed torque constant.
 """
 
 from dataclasses import dataclass
@@ -37,19 +38,19 @@ ADDED = {
 
 @dataclass(frozen=True)
 class KnownMass:
-    """A mass bolted to the last link, on the line from its joint through its centre of mass."""
+    """A mass bolted to the last link, on the line from that link's joint through its centre of mass."""
 
     mass: float
-    """[kg]"""
+    """Mass [kg]."""
     distance: float
-    """Of its centre from the last joint [m]."""
+    """Distance of its centre of mass from the last joint [m]."""
     inertia: float = 0.0
-    """About its own centre [kg m^2]."""
+    """Inertia about its own centre of mass [kg m^2]."""
     length: float = 0.0
-    """Of link 1, joint to joint [m]; of an arm of two joints."""
+    """Length of link 1 from joint to joint [m]; only needed for an arm of two joints."""
 
     def change(self, gravity: float, joints: int) -> dict[str, float]:
-        """The change of the base parameters [SI]; raises ModelError for values that no mass can have."""
+        """Return the change of the base parameters [SI]; raises ModelError for impossible values."""
         if not (self.mass > 0.0 and self.distance > 0.0 and self.inertia >= 0.0):
             raise ModelError(
                 f"a mass of {self.mass:g} kg at {self.distance:g} m with inertia {self.inertia:g} kg m^2: mass and "
@@ -91,22 +92,22 @@ def calibrate(
     gravity: float,
     options: CalibrationOptions = DEFAULTS,
 ) -> Calibration:
-    """Torque constants of all joints from two settled periods.
+    """Estimate the torque constants of all joints from two settled periods.
 
     Args:
-        without: the arm without the mass.
-        with_mass: the arm with the mass.
-        first: the estimate of `without` under the assumed torque constants; its model is used for both.
+        without: settled period of the arm without the mass.
+        with_mass: settled period of the arm with the mass.
+        first: estimate from `without` with the assumed torque constants; its model is used for both periods.
         known: the mass.
-        gravity: in the arm's plane [m/s^2].
+        gravity: acceleration of gravity in the arm's plane [m/s^2].
         options: tolerances and limits.
 
     Returns:
         Factors of the torque constants, and the arm's parameters in true units.
 
     Raises:
-        ModelError: when the periods differ in joints.
-        ConvergenceError: when the fit does not converge.
+        ModelError: if the periods differ in their number of joints.
+        ConvergenceError: if the fit does not converge.
     """
     if without.joints != with_mass.joints:
         raise ModelError(f"one run has {without.joints} joints and the other {with_mass.joints}: they must agree")
@@ -140,7 +141,7 @@ def calibrate(
 
 
 class _TwoRuns:
-    """Residuals of both periods: log factors, the parameters' coordinates, the two initial states."""
+    """Residuals of both periods as a function of log factors, the parameters' coordinates and two initial states."""
 
     def __init__(
         self,
@@ -162,7 +163,7 @@ class _TwoRuns:
         self._state_scale = np.repeat([options.angle_scale, velocity], periods[0].joints)
 
     def start(self) -> Array:
-        """From the first run's estimate; the second period starts from its measured state."""
+        """Return the initial guess: the first run's estimate, and the second period's measured initial state."""
         joints, rate = self.periods[0].joints, self.periods[1].rate
         filled = self.periods[1].filled()
         value = self._first.value.copy()
@@ -180,7 +181,7 @@ class _TwoRuns:
         )
 
     def evaluate(self, x: Array) -> Quadratic:
-        """The sum of squares at `x` with its normal equations, by finite differences."""
+        """Return the sum of squares at `x` with its normal equations, by finite differences."""
         here = self.residual(x)
         jacobian = np.empty((here.size, x.size))
         difference = self._options.difference
@@ -193,7 +194,7 @@ class _TwoRuns:
         return Quadratic(float(np.sum(here * here)), *normal_equations(jacobian, here))
 
     def residual(self, x: Array) -> Array:
-        """Simulated minus measured positions of both periods in units of their noise."""
+        """Return simulated minus measured positions of both periods, in units of their noise."""
         joints = self.periods[0].joints
         factor = np.exp(x[:joints])
         value = self.coordinates.values(x[joints : joints + self.size])

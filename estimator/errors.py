@@ -1,39 +1,39 @@
-"""What can go wrong in the estimator, as a tree.
+"""The estimator's exceptions, as a tree.
 
 EstimationError
 ├── ExcitationError       the requested multisine cannot be built
 ├── RecordingError        the samples are not a settled period of an experiment
-│   ├── ShapeError        arrays whose sizes do not fit together
+│   ├── ShapeError        arrays with incompatible shapes
 │   └── StandstillError   a joint never moved
-├── ModelError            no such friction or drive model, or no such number of joints
+├── ModelError            unsupported friction model, drive model or number of joints
 ├── UnidentifiableError   the data do not separate some parameters
-├── ConvergenceError      the likelihood found no minimum
+├── ConvergenceError      no minimum of the likelihood was found
 └── PeriodicityError      the simulated arm does not settle into periodic motion
 """
 
 
 class EstimationError(Exception):
-    """The root: catch this to catch all that the estimator raises."""
+    """The root: catch this to catch everything that the estimator raises."""
 
 
 class ExcitationError(EstimationError):
-    """A multisine cannot be built: an empty band, a line above half the rate, a peak that is not positive."""
+    """A multisine cannot be built: an empty band, a line above half the rate, or a peak that is not positive."""
 
 
 class RecordingError(EstimationError):
-    """No settled period: too many samples are missing, values are not finite, the period does not close."""
+    """Not a settled period: too many samples are missing, values are not finite, or the period does not close."""
 
 
 class ShapeError(RecordingError):
-    """Arrays whose sizes do not fit together; the message quotes both."""
+    """Arrays with incompatible shapes; the message quotes both shapes."""
 
 
 class StandstillError(RecordingError):
-    """A joint moved by a few encoder steps at most: nothing to identify there."""
+    """A joint moved by at most a few encoder steps, so its parameters cannot be identified."""
 
 
 class ModelError(EstimationError):
-    """A friction model, drive model or number of joints that the estimator does not have."""
+    """A friction model, drive model or number of joints that the estimator does not support."""
 
 
 class UnidentifiableError(EstimationError):
@@ -41,7 +41,7 @@ class UnidentifiableError(EstimationError):
 
 
 class ConvergenceError(EstimationError):
-    """The likelihood's iterations ended without a minimum: the model or the initial guess is far from the data."""
+    """The iterations ended without a minimum of the likelihood: model or initial guess is too far from the data."""
 
 
 class PeriodicityError(EstimationError):

@@ -9,6 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError, PeriodicityError, ShapeError
+from hil.estimator.fit.fitted_parameters import FittedParameters
 from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.fit.stage2 import Near, fit_runs
 from hil.estimator.models.model import Model
@@ -23,58 +24,29 @@ SETTLING = SettlingOptions()
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """What settled periods say of the arm.
+class Estimate(FittedParameters):
+    """Parameters of the arm estimated from settled periods.
 
-    `std` and `covariance` hold what position errors leave open, scaled by the residual as it is and widened
-    where it is correlated (`hil.estimator.fit.covariance`), so that they include the actual rounding errors (a residual
-    of 0.2887 encoder steps RMS is rounding alone). They do not include systematic errors: an error of
-    the torque constant, by which all parameters of a joint scale, of the encoder's zero or linearity, or of the
-    model. A residual well above 0.29 steps means that the model is incomplete and that the parameters may be
-    off by more than `std`.
+    `std` and `covariance` are the uncertainty due to position errors. They are scaled by the actual residual and
+    widened if it is correlated (`hil.estimator.fit.covariance`), so they include the true effect of rounding (a
+    residual of 0.2887 encoder steps RMS is rounding alone). They do not include systematic errors: of the torque
+    constant, with which all parameters of a joint scale, of the encoder's zero or linearity, or of the model. A
+    residual well above 0.29 steps means that the model is incomplete and that the parameters may be off by more than
+    `std`.
     """
 
     model: Model
     """The fitted model."""
-    names: tuple[str, ...]
-    """The base parameters, then the friction terms and the drive's."""
-    units: tuple[str, ...]
-    """Of each."""
-    value: Array
-    """(parameters,) [SI]."""
-    covariance: Array
-    """(parameters, parameters)."""
     start: Array
     """Angles and velocities at the first sample (2, joints) [rad, rad/s]."""
     position: Array
     """Simulated positions (joints, samples) [rad]."""
-    residual: Array
-    """Measured minus simulated position (joints, samples) [rad]; NaN where a sample is missing."""
-    position_step: Array
-    """The encoders' steps (joints,) [rad]."""
     iterations: int
-    """Simulations with derivatives that the likelihood took."""
+    """Number of simulations with derivatives used to maximise the likelihood."""
     outliers: int = 0
-    """Samples left out or downweighted because they are far from their neighbours or from the model."""
+    """Number of samples excluded or downweighted because they are far from their neighbours or from the model."""
     correlation_time: float = 1.0
-    """Samples over which the residual is seen to be correlated; 1 is white. `covariance` allows for more."""
-
-    @property
-    def std(self) -> Array:
-        """Standard errors (parameters,)."""
-        std: Array = np.sqrt(np.diag(self.covariance))
-        return std
-
-    @property
-    def residual_steps(self) -> Array:
-        """RMS of the residual in encoder steps (joints,); rounding alone leaves 0.2887."""
-        rms: Array = np.sqrt(np.nanmean(self.residual**2, axis=1)) / self.position_step
-        return rms
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Values by name [SI]."""
-        return dict(zip(self.names, self.value.tolist(), strict=True))
+    """Number of samples over which the residual is correlated; 1 is white. `covariance` takes it into account."""
 
 
 @one_blas_thread
@@ -89,24 +61,24 @@ def identify(
 ) -> Estimate:
     """Estimate the parameters of `model`: regression on Fourier lines, then maximum likelihood.
 
-    The same periods give the same numbers to the last digit.
+    The result is deterministic to the last digit.
 
     Args:
-        periods: one settled period, or several of one arm, which are fitted together.
+        periods: one settled period, or several of the same arm, which are fitted together.
         model: the model to fit.
-        coarse: for trying models: one whose residual is well above the noise is not fitted to full convergence.
-        starts: parameters by name [SI], of another experiment or of arms like this one; further initial guesses,
-            nothing more.
-        near: where a minimum is known to be close: the only initial guess, for a fraction of the time.
+        coarse: for comparing models: stop early where the residual is well above the noise.
+        starts: parameters by name [SI], from another experiment or similar arms, used only as additional initial
+            guesses.
+        near: point known to be close to a minimum, used as the only initial guess, which is much faster.
         options: tolerances and limits of the likelihood.
 
     Returns:
-        Parameters with standard errors, simulated motion and residual of the first period.
+        Parameters with standard errors, and simulated motion and residual of the first period.
 
     Raises:
-        ModelError: when `model` has another number of joints than a period.
-        UnidentifiableError: when the motion does not tell parameters apart.
-        ConvergenceError: when no initial guess leads to a minimum.
+        ModelError: if `model` and a period differ in their number of joints.
+        UnidentifiableError: if the motion does not separate the parameters.
+        ConvergenceError: if no initial guess leads to a minimum.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:
@@ -117,18 +89,18 @@ def identify(
     fit = fit_runs(used, model, linear, coarse=coarse, starts=starts, near=near, options=options)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     return Estimate(
-        model,
-        model.names,
-        model.units,
-        fit.value,
-        fit.covariance,
-        fit.starts[0],
-        fit.positions[0],
-        np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
-        used[0].position_step,
-        fit.iterations,
-        fit.outliers + spikes,
-        fit.correlation_time,
+        names=model.names,
+        units=model.units,
+        value=fit.value,
+        covariance=fit.covariance,
+        residual=np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
+        position_step=used[0].position_step,
+        model=model,
+        start=fit.starts[0],
+        position=fit.positions[0],
+        iterations=fit.iterations,
+        outliers=fit.outliers + spikes,
+        correlation_time=fit.correlation_time,
     )
 
 
@@ -145,23 +117,23 @@ def predict(
     The arm starts at rest and is simulated until its motion repeats.
 
     Args:
-        estimate: whose parameters.
+        estimate: the estimate whose parameters are used.
         torque: one period (joints, samples) [N m].
-        rate: samples per second.
-        command_to_sample: from a command to the sample of its index [s], as in `SettledPeriod`.
-        pose: where the arm starts (joints,) [rad]; by default where the identified period began.
+        rate: sampling rate [1/s].
+        command_to_sample: time from a command to the sample of the same index [s], as in `SettledPeriod`.
+        pose: initial joint angles (joints,) [rad]; by default those at the start of the identified period.
         settling: tolerances and limits.
 
     Returns:
         Positions (joints, samples) [rad].
 
     Raises:
-        ShapeError: when `torque` is not of the estimate's joints.
-        PeriodicityError: when the motion does not repeat.
+        ShapeError: if `torque` does not have the estimate's number of joints.
+        PeriodicityError: if the motion does not become periodic.
     """
     joints = estimate.model.joints
     if torque.ndim != 2 or torque.shape[0] != joints:
-        raise ShapeError(f"torque is {torque.shape}, the estimate is of {joints} joints: it must be (joints, samples)")
+        raise ShapeError(f"torque has shape {torque.shape}; an estimate of {joints} joints needs ({joints}, samples)")
     physics = Physics.of(estimate.parameters)
     steps = steps_per_sample(rate)
     step = 1.0 / (rate * steps)

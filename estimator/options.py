@@ -1,7 +1,8 @@
-"""What a fit may be told: tolerances, limits and initial guesses, gathered in one frozen object for each fit.
+"""Options of the fits: tolerances, limits and initial guesses, in one frozen object per fit.
 
 Names follow scipy.optimize: `ftol` is the relative decrease of the sum of squares below which a fit has converged,
-`max_iterations` how long it may take. The defaults are what every figure of this project was measured with.
+`max_iterations` the maximum number of iterations. All published figures of this project were measured with the
+defaults.
 """
 
 from dataclasses import dataclass
@@ -9,38 +10,38 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class IntegrationOptions:
-    """Of the simulation in `hil.estimator.simulation.arm`."""
+    """Options of the simulation in `hil.estimator.simulation.arm`."""
 
     max_step: float = 0.85e-3
-    """[s]"""
+    """Longest integration step [s]."""
     max_substeps: int = 64
-    """Into which one step may be cut where a joint is near standstill."""
+    """Maximum number of substeps into which a step is divided when a joint is near standstill."""
 
 
 @dataclass(frozen=True)
 class MinimiserOptions:
-    """Options of Levenberg-Marquardt in coordinates of order 1."""
+    """Options of Levenberg-Marquardt, for coordinates of order 1."""
 
     max_iterations: int = 60
     max_step: float = 2.0
-    """Largest change of one coordinate in one iteration."""
+    """Maximum change of a coordinate per iteration."""
     unfinished: float = 1e-2
-    """After `max_iterations` a relative decrease below this still counts as converged."""
+    """After `max_iterations`, a relative decrease below this still counts as converged."""
     initial_damping: float = 1e-3
-    """Of the squared length of each coordinate's column."""
+    """Initial damping, as a fraction of the squared norm of each coordinate's column."""
     min_damping: float = 1e-9
     max_damping: float = 1e3
 
 
 @dataclass(frozen=True)
 class SegmentedMinimiserOptions:
-    """Of Levenberg-Marquardt with unknowns of each segment."""
+    """Options of Levenberg-Marquardt with additional unknowns per segment."""
 
     max_iterations: int = 80
     max_step: float = 2.0
-    """Largest change of one coordinate in one iteration."""
+    """Maximum change of a coordinate per iteration."""
     unfinished: float = 1e-3
-    """After `max_iterations` a relative decrease below this still counts as converged."""
+    """After `max_iterations`, a relative decrease below this still counts as converged."""
     initial_damping: float = 1e-3
     min_damping: float = 1e-8
     max_damping: float = 1e5
@@ -48,159 +49,174 @@ class SegmentedMinimiserOptions:
 
 @dataclass(frozen=True)
 class CoordinateOptions:
-    """Of the likelihood's coordinates, which keep parameters in their range."""
+    """Options of the likelihood's coordinates, which keep parameters in their range."""
 
     width_floor: float
-    """What the width of every Coulomb step stays above [rad/s]."""
+    """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
     min_initial: float = 1e-3
-    """Of its scale: the least that a positive parameter starts with."""
+    """Minimum initial value of a positive parameter, as a fraction of its scale."""
     max_initial_share: float = 0.95
-    """Of its bound, which the parameter may start with if it is a share of two others."""
+    """Maximum initial value of a parameter that is a share of two others, as a fraction of its bound."""
     min_width: float = 1e-3
-    """Of the floor: what a width always keeps above it, or no step would lead back."""
+    """Minimum distance of a width from its lower bound, as a fraction of the latter, so that it can grow again."""
     max_relative_increase: float = 2.0
-    """Of a width, in one iteration."""
+    """Maximum relative increase of a width per iteration."""
 
 
 @dataclass(frozen=True)
 class LinearOptions:
-    """Of stage 1, the regression on Fourier lines."""
+    """Options of stage 1, the regression on Fourier lines."""
 
     coulomb_width: float = 0.05
-    """About the velocity that the dropped lines leave in a sticking joint [rad/s]."""
+    """Width of the smoothed Coulomb step [rad/s], about the velocity error of a sticking joint due to omitted lines."""
     max_condition: float = 1e8
 
 
 @dataclass(frozen=True)
 class CovarianceOptions:
-    """Of the standard errors under correlated residuals."""
+    """Options of the standard errors for correlated residuals."""
 
     max_lag: int = 400
-    """Samples."""
+    """Maximum lag [samples]."""
     max_lag_share: float = 0.05
-    """Of a run."""
+    """Maximum lag as a fraction of a run."""
     min_lag: int = 4
-    """Samples."""
+    """Minimum lag [samples]."""
     min_window_share: float = 0.005
-    """Of a run: rounding is correlated, a little, over more lags than its autocorrelation shows."""
+    """Minimum window as a fraction of a run: rounding errors are slightly correlated beyond their apparent range."""
 
 
 @dataclass(frozen=True)
 class LikelihoodOptions:
-    """Of stage 2, the maximum likelihood of settled periods.
+    """Options of stage 2, the maximum likelihood estimation from settled periods.
 
-    Sums of squares are in units of the noise: 1 per sample is noise alone.
+    Sums of squares are in units of the noise variance: 1 per sample is noise alone.
     """
 
     ftol: float = 1e-5
-    """At the end: what is left to gain is a tenth of a standard error's worth over all parameters together."""
+    """Final tolerance; the remaining gain corresponds to a tenth of a standard error, over all parameters together."""
     ftol_refine: float = 3e-4
-    """While minima are told apart."""
+    """Tolerance while candidate minima are compared."""
     ftol_start: float = 3e-3
-    """From one initial guess."""
+    """Tolerance of the fit from one initial guess."""
     ftol_coarse: float = 2e-2
-    """Where only the neighbourhood of a minimum is wanted: of a coarse fit, of the tracking fit."""
+    """Tolerance where only the neighbourhood of a minimum is needed: in a coarse fit and in the tracking fit."""
     ftol_state: float = 0.1
-    """Of the first state alone."""
+    """Tolerance of the fit of the initial state alone."""
 
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=1e-4)
-    """Friction that sticks is not told from a width of 1e-4 rad/s, and from 3e-4 by half a standard error."""
+    """Stiction cannot be distinguished from a width of 1e-4 rad/s, and from 3e-4 only by half a standard error."""
     minimiser: MinimiserOptions = MinimiserOptions()
     integration: IntegrationOptions = IntegrationOptions()
     coarse_integration: IntegrationOptions = IntegrationOptions(max_step=2.6e-3, max_substeps=16)
-    """Off by a few hundredths of an encoder step, for a third of the time."""
+    """Accurate to a few hundredths of an encoder step, in a third of the time."""
     covariance: CovarianceOptions = CovarianceOptions()
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
-    """Of the Coulomb step [rad/s]. From a narrow step the fit of a wide one may end in a local minimum, and the other
-    way round: every one is tried."""
+    """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried.
+
+    Starting from a narrow step, the fit of a wide one may end in a local minimum, and vice versa.
+    """
     initial_bends: tuple[float, ...] = (1e-3, 5e-3)
-    """How far friction with presliding bends before it slides [rad], one for each of `initial_widths`."""
+    """Initial presliding deflection at which the joint begins to slide [rad], one for each of `initial_widths`."""
     min_initial_lag: float = 1e-4
-    """[s]"""
+    """Minimum initial time constant of the current loop [s]."""
     angle_scale: float = 0.1
-    """[rad]"""
+    """Scale of the initial angles [rad]."""
 
     tracking_frequency: float = 2.0
-    """[Hz] that springs to the measured motion would give each joint. An arm that swings past the upright amplifies
-    what is still wrong: it is held to the measured motion first."""
+    """Natural frequency of the springs that pull each joint to the measured motion in the tracking fit [Hz].
+
+    An arm that swings past the upright pose amplifies parameter errors, so it is first held to the measured motion.
+    """
     tracking_loss: float = 1.5
-    """Where the free motion leaves so many times more than the tracking one, the arm's free beginning is fitted before
-    the whole."""
+    """Ratio of free to tracking cost above which the run's beginning is fitted before the whole."""
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
-    """Shares of the run that this beginning has, one after the other."""
+    """Lengths of that beginning as fractions of the run, in the order in which they are fitted."""
     min_horizon_samples: int = 10
-    """Samples per unknown over all joints; a shorter beginning is skipped."""
+    """Minimum number of samples per unknown, over all joints; a shorter beginning is skipped."""
 
     max_relative_decrease: float = 0.8
-    """Of a Coulomb width in one iteration: in fine steps, near the minimum, the sum is nearly quadratic in it."""
+    """Maximum relative decrease of a Coulomb width per iteration with fine steps, where the cost is nearly quadratic.
+    """
     max_relative_decrease_coarse: float = 0.5
-    """The same far from the minimum, where it is anything but."""
+    """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
+    same_motion: float = 0.02
+    """Relative difference of two sums of squares, in coarse and in fine steps, up to which coarse ones may lead on."""
     same_cost: float = 1.0
-    """Minima whose sums of squares are this close count as the same."""
+    """Minima whose sums of squares differ by less than this count as the same."""
     close_cost: float = 25.0
-    """Minima this close are distinguished only with fine steps."""
+    """Minima whose sums of squares differ by less than this are compared with fine steps."""
     explained_cost: float = 1.03
-    """Per sample: below this no further initial guess is tried."""
+    """Cost per sample below which no further initial guess is tried."""
     hopeless_cost: float = 2.0
-    """Per sample: a coarse fit with a larger residual is abandoned."""
+    """Cost per sample above which a coarse fit is abandoned."""
     refine_ratio: float = 1.01
-    """Relative to the best sum of squares: up to this ratio another try may still end lower."""
+    """Ratio to the best sum of squares up to which another candidate may still end lower."""
     outlier_threshold: float = 4.0
-    """Standard deviations from which a sample is downweighted; rounding never leaves more than 1.7."""
+    """Residual in standard deviations above which a sample is downweighted; rounding alone stays below 1.7."""
     threads: int = 8
-    """Maximum number of parallel tries; the result does not depend on it."""
+    """Maximum number of parallel fits; the result does not depend on it."""
 
 
 @dataclass(frozen=True)
 class ShootingOptions:
-    """Of multiple shooting on any recording."""
+    """Options of multiple shooting, which fits any recording."""
 
     ftol: float = 3e-5
-    ftol_start: float = 1e-3
-    """Of the short segments that come first."""
+    ftol_refine: float = 1e-3
+    """Of fits between which segments are downweighted."""
+    ftol_start: float = 1e-2
+    """Of those that only lead near a minimum."""
+    max_step: float = 1e-3
+    """Of the integration, in the last fit [s]."""
+    coarse_step: float = 2.6e-3
+    """In the fits before: off by a few hundredths of a standard error, for a third of the time [s]."""
+    start_segments: int = 80
+    """That many of the segments, evenly chosen, lead near a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
-    """A width below 3e-3 rad/s costs much time and is not seen in a second of motion."""
+    """A width below 3e-3 rad/s is slow to simulate and has no visible effect in a second of motion."""
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()
     initial_width: float = 0.05
-    """Of the Coulomb step [rad/s]."""
+    """Initial width of the smoothed Coulomb step [rad/s]."""
     initial_bend: float = 0.003
-    """How far friction with presliding bends before it slides [rad]."""
+    """Initial presliding deflection at which the joint begins to slide [rad]."""
     initial_stribeck_velocities: tuple[float, ...] = (0.2, 2.0)
-    """[rad/s], each of which is tried."""
+    """Initial Stribeck velocities [rad/s], all of which are tried."""
     short: float = 0.25
-    """Of the segments' length: the segments that come first."""
+    """Length of the short segments that are fitted first, as a fraction of the segments' length."""
     angle_scale: float = 0.1
-    """[rad]"""
+    """Scale of the initial angles [rad]."""
     reweightings: int = 2
-    """Fits after the first, each with segments downweighted by their residual in the one before."""
+    """Number of refits, in which segments are downweighted by their residual in the previous fit."""
 
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """Of the joint likelihood of two periods, without and with a known mass."""
+    """Options of the joint likelihood of two periods, without and with a known mass."""
 
     ftol: float = 1e-6
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
     minimiser: MinimiserOptions = MinimiserOptions()
     initial_width: float = 0.005
-    """Of the Coulomb step [rad/s]: under a wrong torque constant the first estimate's is worth nothing."""
+    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is useless.
+    """
     angle_scale: float = 0.1
-    """[rad]"""
+    """Scale of the initial angles [rad]."""
     difference: float = 1e-6
-    """Of a coordinate, in finite differences."""
+    """Step of finite differences, in units of a coordinate."""
 
 
 @dataclass(frozen=True)
 class SettlingOptions:
-    """Of a simulation that goes on until the motion is periodic."""
+    """Options of a simulation that continues until the motion is periodic."""
 
     max_periods: int = 50
     atol: float = 1e-7
-    """[rad and rad/s] from one period's end to the next."""
+    """Largest change of the state from one period's end to the next that counts as periodic [rad and rad/s]."""
     acceptable: float = 1e-5
-    """Accepted after `max_periods`: far below any encoder step."""
+    """Change that is accepted after `max_periods`; far below any encoder step [rad and rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -208,22 +224,25 @@ class SelectionOptions:
     """Options for choosing a friction model by held-out error."""
 
     keep_ratio: float = 0.98
-    """Of the error of the best model so far: what a richer one must reach to be kept."""
+    """Error relative to the best model so far that a richer model must reach to be kept."""
     explained_error: float = 1.05
-    """RMS error of the prediction in units of the noise: nothing is left for another term."""
+    """RMS prediction error in units of the noise below which no further term is tried."""
     explained_residual: float = 1.02
-    """RMS residual in units of the noise: likewise."""
+    """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
-    """The same below which a richer model's minimum is sought near the plainer one's."""
+    """RMS residual in units of the noise below which a richer model's minimum is searched near the simpler one's."""
     presliding_residual: float = 1.2
-    """The same from which presliding is tried, whose fit takes long."""
+    """RMS residual in units of the noise above which presliding is tried, which is slow to fit."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)
-    """Of the Coulomb step of one joint, tried where the motion is not explained [rad/s]."""
+    """Initial widths of one joint's smoothed Coulomb step [rad/s], tried if the motion is not explained."""
     overrule_ratio: float = 0.8
-    """Of the chosen model's error of prediction: what another one must reach to be chosen instead."""
+    """Prediction error relative to the chosen model's that another model must reach to replace it."""
     ripple_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
-    """A turn: where ripple is looked for."""
+    """Numbers of ripple cycles per turn that are searched."""
     ripple_evidence: float = 0.05
-    """Of the score test, from which ripple is tried: where it repeats is found roughly, so that a fit sees more."""
+    """Significance level of the score test at which ripple is tried.
+
+    It is lenient because the test only finds the ripple's period roughly; a fit that includes the ripple explains more.
+    """
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
-    """Significance levels, tried in turn until the motion is explained as well."""
+    """Significance levels for removing terms, tried in turn until the reduced model explains the motion as well."""

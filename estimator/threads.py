@@ -1,4 +1,4 @@
-"""How many threads independent work may take."""
+"""Number of threads for independent work."""
 
 import os
 
@@ -6,9 +6,9 @@ VARIABLE = "HIL_THREADS"
 
 
 def thread_count(most: int | None = None) -> int:
-    """One for each core, or as many as the environment variable HIL_THREADS says, and not more than `most`.
+    """Return the number of CPU cores, or the value of the environment variable HIL_THREADS, but at most `most`.
 
-    Results do not depend on it. A process that shares its machine with others of its kind is given one.
+    Results do not depend on it. Set HIL_THREADS to 1 for processes that run in parallel on one machine.
     """
     told = os.environ.get(VARIABLE, "")
     count = int(told) if told.isdigit() and int(told) > 0 else os.cpu_count() or 1

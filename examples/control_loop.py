@@ -1,4 +1,4 @@
-"""What both examples share: an identified run, and a loop that sends torques at a fixed rate under hil's guard."""
+"""Code shared by both examples: an identified run, and a loop that sends torques at a fixed rate under hil's guard."""
 
 import sys
 import tempfile
@@ -20,11 +20,11 @@ from hil.setup.servo_session import servo_session
 
 Array = NDArray[np.float64]
 Controller = Callable[[int, Array, Array], Array]
-"""Takes the number of the sample, angles [rad] and velocities [rad/s] (joints,); gives torques [N m] (joints,)."""
+"""Takes the sample number, angles [rad] and velocities [rad/s] (joints,); returns torques [N m] (joints,)."""
 
 
 def identified_arm() -> tuple[Config, ArmModel]:
-    """The run folder on the command line, or the realistic fake arm, identified now."""
+    """Load the run folder given on the command line, or identify the realistic fake arm."""
     if len(sys.argv) > 1:
         run = RunFolder.open(Path(sys.argv[1]))
         return run.load_config(), load_model(run.path)
@@ -37,7 +37,9 @@ def identified_arm() -> tuple[Config, ArmModel]:
 
 
 def play(config: Config, model: ArmModel, controller: Controller, samples: int) -> Array:
-    """Run the controller for so many samples; measured angles (samples, joints) [rad]. Torque is off afterwards."""
+    """Run the controller for `samples` samples; return the measured angles (samples, joints) [rad]. Torque is off
+    afterwards.
+    """
     guard = Guard(config)
     measured = np.empty((samples, len(model.joints)))
     goals = [0.0] * len(model.joints)
@@ -48,7 +50,7 @@ def play(config: Config, model: ArmModel, controller: Controller, samples: int) 
             state = bus.exchange(goals)
             guard.look(state)
             measured[index] = state.position
-            # This torque leaves with the next exchange, one sample later.
+            # This torque is sent with the next exchange, one sample later.
             torque = controller(index, measured[index], np.array(state.velocity))
             goals = guard.clamp(model.goal(torque).tolist())
     return measured

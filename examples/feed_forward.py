@@ -1,9 +1,9 @@
-"""Follow a trajectory with a weak PD controller, without and with the identified model as feed-forward.
+"""Follow a trajectory with a weak PD controller, with and without the identified model as feed-forward.
 
     python examples/feed_forward.py [RUN]
 
-RUN is a run folder of `hil identify`; without it the realistic fake arm is identified first. The printed errors are
-measured minus wanted position, RMS over the motion.
+RUN is a run folder of `hil identify`; without it, the realistic fake arm is identified first. The printed errors are
+RMS differences between measured and desired position.
 """
 
 import numpy as np
@@ -12,11 +12,11 @@ from control_loop import Array, Controller, identified_arm, play
 STIFFNESS = np.array([4.0, 2.0])  # N m/rad
 DAMPING = np.array([0.10, 0.05])  # N m s/rad
 SECONDS = 6.0
-FADE = 1.0  # s until the motion has its full size
+FADE = 1.0  # s until the motion reaches its full amplitude
 
 
 def trajectory(rest: Array, rate: float) -> tuple[Array, Array, Array]:
-    """Wanted angles, velocities and accelerations, (samples, joints): two sines a joint, faded in from rest."""
+    """Desired angles, velocities and accelerations (samples, joints): two sines per joint, faded in from rest."""
     time = np.arange(-1, round(SECONDS * rate) + 1) / rate
     size = np.clip(time / FADE, 0.0, 1.0)
     size = size**3 * (10 - 15 * size + 6 * size**2)
@@ -31,9 +31,9 @@ def main() -> None:
     config, model = identified_arm()
     rest = np.array(model.rest_pose)
     angle, velocity, acceleration = trajectory(rest, config.experiment.rate)
-    # What the model says the motion needs; its friction is that of the wanted velocity.
+    # The torque that the motion needs according to the model, with friction at the desired velocity.
     known = model.inverse_dynamics(angle, velocity, acceleration)
-    # A torque leaves with the next exchange: it is for the sample after this one.
+    # A torque is sent with the next exchange, so shift by one sample.
     known = np.roll(known, -1, axis=0)
 
     def pd(index: int, position: Array, speed: Array) -> Array:

@@ -1,9 +1,9 @@
-"""Hold a pose with a weak spring, without and with the identified model carrying the arm's weight.
+"""Hold a pose with a weak spring, with and without the identified model compensating gravity.
 
     python examples/gravity_compensation.py [RUN]
 
-RUN is a run folder of `hil identify`; without it the realistic fake arm is identified first. The printed errors are how
-far the arm ends from the pose it should hold.
+RUN is a run folder of `hil identify`; without it, the realistic fake arm is identified first. The printed errors are
+the distances between the final pose and the desired one.
 """
 
 import numpy as np

@@ -2,7 +2,7 @@
 
 
 def register() -> None:
-    """Register the pyserial URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Harmless when repeated."""
+    """Register the pyserial URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Safe to call twice."""
     import serial
 
     if __name__ not in serial.protocol_handler_packages:
@@ -10,13 +10,16 @@ def register() -> None:
 
 
 def register_for(url: str) -> None:
-    """`register` if `url` is one of a fake; for a real arm pyserial is left untouched."""
+    """Call `register` if `url` is that of a fake arm; for a real arm pyserial is left untouched."""
     if url.startswith("fake://"):
         register()
 
 
 def allow_code(allowed: bool = True) -> None:
-    """Let the [fake] tables opened from now on run functions of other packages as their `plant`; see there."""
+    """Permit (or forbid) [fake] tables opened from now on to call functions of other packages through `plant`.
+
+    See `hil.fakes.plants.plant` for why this is off by default.
+    """
     from hil.fakes.plants.plant import allow_code as allow
 
     allow(allowed)

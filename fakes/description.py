@@ -1,4 +1,4 @@
-"""The [fake] table of an arm's TOML file: which fake servos hang on the bus, and what they move."""
+"""The [fake] table of an arm's TOML file: the fake servos on the bus, and what they move."""
 
 import tomllib
 from pathlib import Path
@@ -19,50 +19,50 @@ from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_chain, ma
 from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.toml_errors import describe
 
 
 class DescriptionError(ValueError):
-    """The [fake] table cannot be read or is wrong. The message names file, key, value and what is allowed."""
+    """The [fake] table is unreadable or invalid. The message names the file, the key, the value and what is allowed."""
 
 
 class FakeServo(BaseModel):
-    """One servo, as it lies on the bench: set up for its arm, switched on, torque off."""
+    """One servo as delivered to the bus: set up for its arm, powered, torque off."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
     zero_ticks: Annotated[int, Field(description="Present Position at which the joint's angle is 0")]
-    direction: Annotated[int, Field(description="-1 where the servo turns against the joint")] = 1
+    direction: Annotated[int, Field(description="-1 if the servo turns in the opposite direction to the joint")] = 1
     joint: Annotated[
         int | None,
-        Field(ge=1, description="which joint it moves, from 1; the one behind the last servo's unless given"),
+        Field(ge=1, description="joint it moves, counted from 1; by default the one after the previous servo's"),
     ] = None
     firmware: Annotated[int, Field(ge=38, le=255, description="Firmware Version")] = 48
-    baud: Annotated[int, Field(description="baud rate the servo is set to")] = 1_000_000
+    baud: Annotated[int, Field(description="baud rate to which the servo is set")] = 1_000_000
     return_delay_us: Annotated[
-        int, Field(ge=0, le=508, multiple_of=2, description="Return Delay Time [us]; 500 from the factory")
+        int, Field(ge=0, le=508, multiple_of=2, description="Return Delay Time [us]; factory default 500")
     ] = 0
     input_voltage_v: Annotated[
-        float | None, Field(gt=0, le=100, description="supply [V]; the model's nominal voltage unless given")
+        float | None, Field(gt=0, le=100, description="supply voltage [V]; by default the model's nominal voltage")
     ] = None
-    temperature_c: Annotated[float, Field(ge=0, le=255, description="inside the servo [C]")] = 35.0
+    temperature_c: Annotated[float, Field(ge=0, le=255, description="temperature inside the servo [C]")] = 35.0
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
     senses_supply: Annotated[
         bool | None,
-        Field(description="whether Present Current is the supply's and not the motor's; as its model has it if absent"),
+        Field(description="whether Present Current is the supply current, not the motor's; default: as its model"),
     ] = None
-    encoder: Annotated[Encoder, Field(description="errors of Present Position; none unless given")] = PERFECT
-    clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="how much too fast its clock runs")] = 0.0
+    encoder: Annotated[Encoder, Field(description="errors of Present Position; none by default")] = PERFECT
+    clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="clock error; positive: fast [ppm]")] = 0.0
     voltage_limited: Annotated[
-        bool, Field(description="whether supply voltage and back-EMF limit the current in current mode too")
+        bool, Field(description="whether supply voltage and back-EMF also limit the current in current mode")
     ] = False
-    thermal: Annotated[Thermal | None, Field(description="warmth from the motor's current; none unless given")] = None
-    overload: Annotated[Overload | None, Field(description="when it shuts down by overload; never unless given")] = None
+    thermal: Annotated[Thermal | None, Field(description="heating by the motor current; none by default")] = None
+    overload: Annotated[Overload | None, Field(description="when it shuts down on overload; never by default")] = None
     registers: Annotated[
-        dict[str, int], Field(description="other EEPROM registers that are not at their factory value")
+        dict[str, int], Field(description="other EEPROM registers with values different from the factory defaults")
     ] = {}
 
     @field_validator("model")
@@ -70,7 +70,7 @@ class FakeServo(BaseModel):
     def _known_model(cls, model: str) -> str:
         if model not in all_model_names():
             others = ", ".join(all_model_names()[len(MODEL_NAMES) :])
-            raise ValueError(f"the fake bus knows {', '.join(MODEL_NAMES)}; of {others} addresses and sizes at least")
+            raise ValueError(f"known models: {', '.join(MODEL_NAMES)}; by addresses and sizes only: {others}")
         return model
 
     @field_validator("direction")
@@ -100,29 +100,29 @@ class FakeServo(BaseModel):
 
 
 class FakeArm(BaseModel):
-    """The whole [fake] table: an adapter, servos on its bus, and the arm that they move."""
+    """The whole [fake] table: an adapter, the servos on its bus, and the arm that they move."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    seed: Annotated[int, Field(ge=0, description="of noise and faults")] = 0
+    seed: Annotated[int, Field(ge=0, description="random seed of noise and faults")] = 0
     adapter_latency_us: Annotated[
-        float, Field(ge=0, le=1e6, description="from the wire to the host's read, for every byte [us]")
+        float, Field(ge=0, le=1e6, description="delay of every byte between wire and host [us]")
     ] = 0.0
-    adapter_echoes: Annotated[bool, Field(description="whether the adapter hears what the host sends")] = False
+    adapter_echoes: Annotated[bool, Field(description="whether the adapter echoes what the host sends")] = False
     servos: Annotated[
         tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")
     ]
-    arm: Annotated[Arm | None, Field(description="links and drives")] = None
-    chain: Annotated[ChainArm | None, Field(description="an arm in space, from a URDF, instead of arm")] = None
+    arm: Annotated[Arm | None, Field(description="links and drives of a planar arm")] = None
+    chain: Annotated[ChainArm | None, Field(description="a spatial arm described by a URDF, instead of arm")] = None
     plant: Annotated[
         str | None,
-        Field(description='"module:factory" of another mechanism instead of arm; see hil.fakes.plants.plant'),
+        Field(description='"module:factory" of a custom mechanism, instead of arm; see hil.fakes.plants.plant'),
     ] = None
-    plant_options: Annotated[dict[str, Any], Field(description="what the factory is called with")] = {}
-    supply: Annotated[Supply | None, Field(description="resistance of the supply; none unless given")] = None
-    faults: Annotated[tuple[Fault, ...], Field(strict=False, description="what goes wrong, and when")] = ()
+    plant_options: Annotated[dict[str, Any], Field(description="arguments of the factory")] = {}
+    supply: Annotated[Supply | None, Field(description="resistance of the supply; none by default")] = None
+    faults: Annotated[tuple[Fault, ...], Field(strict=False, description="faults to inject")] = ()
     moves: Annotated[
-        tuple[Move, ...], Field(strict=False, description="what a hand does to limp joints, and when")
+        tuple[Move, ...], Field(strict=False, description="movements by hand of joints whose torque is off")
     ] = ()
 
     @model_validator(mode="after")
@@ -131,7 +131,7 @@ class FakeArm(BaseModel):
         if len(set(ids)) < len(ids):
             raise ValueError(f"servos: IDs {', '.join(map(str, ids))}: each servo on a bus needs an ID of its own")
         if sum(each is not None for each in (self.arm, self.chain, self.plant)) != 1:
-            raise ValueError('give one of the table arm, the table chain and plant = "module:factory"')
+            raise ValueError('give exactly one of the table arm, the table chain and plant = "module:factory"')
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
@@ -150,7 +150,7 @@ class FakeArm(BaseModel):
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """Which joint each servo moves, counted from 0."""
+        """Index of the joint that each servo moves."""
         moved: list[int] = []
         for servo in self.servos:
             behind = moved[-1] + 1 if moved else 0
@@ -158,7 +158,7 @@ class FakeArm(BaseModel):
         return tuple(moved)
 
     def make_plant(self) -> Plant:
-        """The mechanism, at its start at time 0; raises PlantError."""
+        """Return the mechanism in its initial state at time 0; raises PlantError."""
         if self.arm is not None:
             return make_plant(self.arm)
         if self.chain is not None:
@@ -173,9 +173,9 @@ class FakeArm(BaseModel):
 
 
 def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The same [fake] table with the path of its chain's URDF made absolute: beside the file it is in.
+    """Return the [fake] table with the path of its chain's URDF made absolute, relative to the TOML file's folder.
 
-    A copy of that file, as in a run folder, has the URDF right beside it, whatever folder it named.
+    If that file does not exist, a file of the same name in the TOML file's own folder is used, as in a run folder.
     """
     chain = values.get("chain")
     if not isinstance(chain, dict) or not isinstance(chain.get("urdf"), str):
@@ -184,15 +184,15 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """The file that a TOML file in `folder` means by this path."""
+    """Return the file meant by the path `name` in a TOML file in `folder`: that path, or the same name in `folder`."""
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 
 
 def load_fake(path: Path | str) -> FakeArm:
-    """The [fake] table of a TOML file, or of the arm of that bare name (`hil.fakes.names`); raises `DescriptionError`.
+    """Return the [fake] table of a TOML file or of a bundled arm given by name (see `hil.fakes.names`).
 
-    The file's other tables are not looked at.
+    Other tables of the file are ignored. Raises `DescriptionError`.
     """
     try:
         text = find_arm(path).read_text(encoding="utf-8")
@@ -213,12 +213,12 @@ def load_fake(path: Path | str) -> FakeArm:
 
 
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
-    """The described servos, switched on at the clock's present time with the arm at rest in its starting pose.
+    """Return the described bus: servos switched on at the clock's current time, the arm at rest in its initial pose.
 
-    Raises PlantError when another plant than an arm is described and cannot be made.
+    Raises PlantError if a custom plant is described and cannot be created.
     """
     servos = [
-        Servo(
+        EmulatedServo(
             load_model(servo.model, servo.firmware),
             servo.id,
             zero_ticks=servo.zero_ticks,

@@ -1,4 +1,4 @@
-"""Fake arms by name: those shipped with hil for use by other programs, and the arms of its own configurations."""
+"""Fake arms by name: those shipped for use by other programs, and those of hil's own configurations."""
 
 from pathlib import Path
 
@@ -8,19 +8,19 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def configs_folder() -> Path:
-    """Where hil's own configurations lie: in the installed package, or beside it in a checkout."""
+    """Return the folder of hil's own configurations: in the installed package, or next to it in a checkout."""
     installed = _PACKAGE / "configs"
     return installed if installed.is_dir() else _PACKAGE.parent / "configs"
 
 
 def arm_names() -> tuple[str, ...]:
-    """Every name that `find_arm` knows: ready arms first, then hil's own fake arms."""
+    """Return every name that `find_arm` accepts: the arms for other programs first, then hil's own fake arms."""
     ready = sorted(path.stem for path in ARMS.glob("*.toml"))
     return (*ready, *sorted(path.stem for path in configs_folder().glob("fake_*.toml")))
 
 
 def find_arm(path: Path | str) -> Path:
-    """`path` itself or, if it is a bare name and not a file, the file of the arm of that name."""
+    """Return `path` itself, or the file of the arm of that name if `path` is a bare name and not a file."""
     path = Path(path)
     if path.name != str(path) or path.suffix or path.exists():
         return path

@@ -1,16 +1,17 @@
 """The pyserial URL `fake://ARM`: a serial port with a fake arm behind it, in virtual or real time.
 
-After `fakes.register()`, `serial.serial_for_url("fake://configs/fake_two_link.toml")` opens the arm of that file's
-[fake] table; a path without a leading slash is relative to the working directory, and a bare name that is no file is an
-arm that comes with hil (`fake://koch`; `hil.fakes.names`). `open_fake` does the same from Python
+After `fakes.register()`, `serial.serial_for_url("fake://configs/fake_two_link.toml")` opens the arm described in that
+file's [fake] table. A path without a leading slash is relative to the working directory; a bare name that is not a file
+is one of the arms bundled with hil (`fake://koch`; see `hil.fakes.names`). `open_fake` does the same from Python
 without a file. pyserial finds this module by its name.
 
-Everything happens on `port.clock`: a program that waits must wait on that clock (or in `read`), because wall-clock time
-does not move the arm. In particular dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
-sees no answers. With `fake://PATH/TO/ARM.toml?time=real` the arm lives in real time and any program will do.
+Time is that of `port.clock`: a program that waits must wait on that clock (or in `read`), because wall-clock time does
+not move the arm. In particular dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
+receives no replies. With `fake://PATH/TO/ARM.toml?time=real` the arm runs in real time and works with any program.
 
-A pulled cable (see `hil.fakes.bus.faults`) fails as on Linux: writing and reading raise `serial.SerialException`,
-`reset_input_buffer` raises `termios.error`. The port then has to be closed and, once the cable is back, opened again.
+An unplugged cable (see `hil.fakes.bus.faults`) fails as on Linux: writing and reading raise `serial.SerialException`,
+`reset_input_buffer` raises `termios.error`. The port must then be closed and, once the cable is replugged, opened
+again.
 """
 
 import errno
@@ -33,7 +34,7 @@ REAL_TIME = "?time=real"
 
 
 class _Unplugged(serial.SerialException):
-    """The cable was pulled since the port was opened."""
+    """The cable has been unplugged since the port was opened."""
 
     def __init__(self) -> None:
         super().__init__(f"[Errno {errno.EIO}] {os.strerror(errno.EIO)}: the fake adapter was unplugged")
@@ -42,10 +43,10 @@ class _Unplugged(serial.SerialException):
 class FakeSerial(SerialBase):
     """A pyserial port onto a fake bus.
 
-    The arm is built when the port is first opened and lives as long as the port object: closing and reopening finds it
-    as it was left, with time gone on, as real servos would be. Two port objects never share an arm.
+    The arm is created when the port is first opened and lives as long as the port object: after closing and reopening
+    it is as it was left, with time having passed, as with real servos. Two port objects never share an arm.
 
-    Beside pyserial's interface it has `clock` and `bus`.
+    It has the attributes `clock` and `bus` in addition to pyserial's interface.
     """
 
     def __init__(
@@ -65,20 +66,20 @@ class FakeSerial(SerialBase):
 
     @property
     def bus(self) -> FakeBus:
-        """The bus and its servos; `serial.PortNotOpenError` before the port is opened for the first time."""
+        """The bus and its servos; raises `serial.PortNotOpenError` before the port is opened for the first time."""
         if self._bus is None:
             raise serial.PortNotOpenError
         return self._bus
 
     def open(self) -> None:
-        """Open the port; `serial.SerialException` says why the arm cannot be built."""
+        """Open the port; raises `serial.SerialException` if the arm cannot be created."""
         if self.is_open:
             raise serial.SerialException(f"{self.name or SCHEME} is already open")
         if self._bus is None:
             self._bus = self._build()
         self._bus.notice_faults()
         if self._bus.cable_is_out:
-            raise serial.SerialException(f"could not open port {self.name or SCHEME}: the cable is pulled")
+            raise serial.SerialException(f"could not open port {self.name or SCHEME}: the cable is unplugged")
         self._pulls = self._bus.pulls
         self._reconfigure_port()
         self.is_open = True
@@ -93,24 +94,24 @@ class FakeSerial(SerialBase):
         self.is_open = False
 
     def _reconfigure_port(self, force_update: bool = False) -> None:
-        """Take over the settings that mean something here: the baud rate. The frame is always 8N1."""
+        """Apply the only setting that has an effect here: the baud rate. The frame format is always 8N1."""
         if self.baudrate <= 0:
             raise ValueError(f"a baud rate of {self.baudrate} is not positive")
         if self._bus is not None:
             self._bus.baud = self.baudrate
 
     def read(self, size: int = 1) -> bytes:
-        """Up to `size` bytes, waiting on `clock` for them, at most the port's timeout.
+        """Return up to `size` bytes, waiting on `clock` for at most the port's timeout.
 
-        With timeout None a real port would wait for ever for bytes that are not coming. Here nothing else can send
-        them, so that wait is refused with `serial.SerialException`; bytes already received stay to be read.
+        With timeout None a real port would wait forever for bytes that never arrive. Since nothing else can send them
+        here, such a read raises `serial.SerialException`; bytes that have already been received can still be read.
         """
         bus = self._open_bus()
         timeout = self.timeout
         if timeout is None and bus.on_the_way < size:
             raise serial.SerialException(
-                f"reading {size} bytes without a timeout would wait for ever: "
-                f"{bus.on_the_way} are there or on their way; set a timeout"
+                f"reading {size} bytes without a timeout would block forever: "
+                f"{bus.on_the_way} have arrived or are in transit; set a timeout"
             )
         taken = bus.read(size, math.inf if timeout is None else timeout)
         if len(taken) < size and self._pulls != bus.pulls:
@@ -118,21 +119,21 @@ class FakeSerial(SerialBase):
         return taken
 
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
-        """Put bytes on the wire; returns at once, as a driver with a buffer does."""
+        """Put bytes on the wire; returns immediately, like a driver with a buffer."""
         self._open_bus().write(bytes(data))
         return len(data)
 
     def flush(self) -> None:
-        """Wait on `clock` until everything written has left."""
+        """Wait on `clock` until everything written has been sent."""
         self.clock.wait_until(self._open_bus().sent_by)
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that have arrived by now and were not read."""
+        """Number of bytes that have arrived and have not been read."""
         return self._open_bus().in_waiting
 
     def reset_input_buffer(self) -> None:
-        """Drop what has arrived. Bytes still on the wire are not dropped: they arrive later."""
+        """Drop the bytes that have arrived. Bytes still in transit are not dropped: they arrive later."""
         try:
             bus = self._open_bus()
         except _Unplugged as error:
@@ -140,7 +141,7 @@ class FakeSerial(SerialBase):
         bus.discard_input()
 
     def reset_output_buffer(self) -> None:
-        """Do nothing but check that the port is open: what was written is already on its way."""
+        """Do nothing except check that the port is open: what was written is already being sent."""
         self._open_bus()
 
     def _open_bus(self) -> FakeBus:
@@ -152,38 +153,38 @@ class FakeSerial(SerialBase):
         return self._bus
 
     def _unplugged(self, bus: FakeBus) -> _Unplugged:
-        """The error of a pulled cable, raised when it is pulled: the bus may know of it a packet's length ahead."""
+        """Return the error for an unplugged cable, at the time of unplugging, of which the bus may know in advance."""
         self.clock.wait_until(bus.pulled_at)
         return _Unplugged()
 
     def _update_rts_state(self) -> None:
-        """No such line on this port; pyserial calls this when the setting changes."""
+        """Ignore: this port has no RTS line. pyserial calls this when the setting changes."""
 
     def _update_dtr_state(self) -> None:
-        """No such line on this port; pyserial calls this when the setting changes."""
+        """Ignore: this port has no DTR line. pyserial calls this when the setting changes."""
 
     def _update_break_state(self) -> None:
-        """No such line on this port; pyserial calls this when the setting changes."""
+        """Ignore: this port has no break state. pyserial calls this when the setting changes."""
 
 
 def open_fake(
     description: FakeArm, clock: Clock | None = None, *, baud: int = 1_000_000, timeout_s: float | None = 0.1
 ) -> FakeSerial:
-    """An open port onto the arm described, on `clock` (a new `VirtualClock` unless given)."""
+    """Return an open port onto the described arm, on `clock` (by default a new `VirtualClock`)."""
     port = FakeSerial(None, description=description, clock=clock, baudrate=baud, timeout=timeout_s)
     port.open()
     return port
 
 
 def serial_class_for_url(url: str) -> tuple[str, type[FakeSerial]]:
-    """What pyserial asks of a module that handles a URL: the port's name and its class."""
+    """Return the port's name and class for a URL, as pyserial requires of a protocol handler module."""
     return url, FakeSerial
 
 
 def _path(url: str | None) -> Path:
     path = (url or "").removeprefix(SCHEME).removesuffix(REAL_TIME)
     if not path:
-        raise DescriptionError(f'"{url or ""}" names no file: write {SCHEME}PATH/TO/ARM.toml')
+        raise DescriptionError(f'"{url or ""}" does not name a file; use {SCHEME}PATH/TO/ARM.toml')
     if "?" in path:
-        raise DescriptionError(f'"{url}": behind the path only "{REAL_TIME}" is allowed')
+        raise DescriptionError(f'"{url}": only "{REAL_TIME}" is allowed after the path')
     return Path(path)

@@ -1,7 +1,7 @@
-"""A fake arm behind a real terminal device, in real time: for any program in any language.
+"""A fake arm on a terminal device, in real time, for programs in any language.
 
-The host opens `path` as it would open a serial adapter. Its baud rate is the one the host sets on the terminal. A
-pulled cable hangs the terminal up; put back it is another terminal, to which the link points again.
+The host opens `path` like a serial adapter and sets the baud rate on the terminal. An unplugged cable hangs up the
+terminal; replugging creates a new terminal, to which the symbolic link then points.
 """
 
 import ctypes
@@ -22,13 +22,13 @@ from hil.fakes.description import FakeArm, make_bus
 from hil.fakes.remote_hand import HandSocket
 
 OVERRUN_S = 1e-3
-"""A reply handed over later than this after it was due counts as a real-time overrun [s]."""
+"""A reply delivered later than this after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""When some of the arm's time took the machine longer than itself by more than this, the rest is lost [s]."""
+"""If computing the arm takes this much longer than the time simulated, the excess is lost [s]."""
 
 LONGEST_SLEEP_S = 0.05
-"""How long the server waits at most before it looks at faults, watchdogs and its own end [s]."""
+"""Longest wait before the server checks faults, watchdogs and whether to stop [s]."""
 
 _TCGETS2 = 0x802C542A
 _PR_SET_TIMERSLACK = 29
@@ -36,25 +36,25 @@ _CHUNK = 4096
 
 
 class LinkError(OSError):
-    """The link path cannot be used. The message says why and what to do."""
+    """The path of the symbolic link cannot be used. The message gives the reason and the remedy."""
 
 
-class Clock:
-    """The machine's monotonic clock, less the time that was lost. Nothing here waits on it but the server itself."""
+class ServerClock:
+    """The machine's monotonic clock minus the time lost. Only the server itself waits on it."""
 
     def __init__(self) -> None:
         self.lost_s = 0.0
-        """How much time the arm did not live through, because the machine was too slow for it."""
+        """Time that was not simulated because the machine was too slow [s]."""
 
     def now(self) -> float:
         return time.monotonic() - self.lost_s
 
     def wait_until(self, deadline: float) -> None:
-        """Return at once: bytes are handed over when they are due."""
+        """Return immediately: bytes are delivered when they are due."""
 
 
 class Counts(NamedTuple):
-    """Statistics of a server."""
+    """Statistics of a server: packets, damaged packets, collisions, overruns, faults; worst delay and time lost [s]."""
 
     packets: int
     damaged: int
@@ -66,16 +66,16 @@ class Counts(NamedTuple):
 
 
 class PtyServer:
-    """Serves one fake arm on a pseudo terminal. `serve` runs until `stop` is called, from any thread or a signal.
+    """Serves one fake arm on a pseudo-terminal; `serve` runs until `stop` is called from a thread or signal handler.
 
-    link: a symbolic link to be made to the terminal; LinkError when there is something already.
-    `bus` may be looked at, and its hand told to move, from another thread while `lock` is held; from another process
-    `hil hand` moves it.
+    link: symbolic link to create for the terminal; raises LinkError if the path already exists.
+    `bus` may be inspected, and its hand moved, from another thread while holding `lock`; from another process, `hil
+    hand` moves it.
     """
 
     def __init__(self, description: FakeArm, link: Path | None = None) -> None:
         self.lock = Lock()
-        self._clock = Clock()
+        self._clock = ServerClock()
         self.bus: FakeBus = make_bus(description, self._clock)
         self.path = ""
         self._link = link
@@ -110,7 +110,7 @@ class PtyServer:
         )
 
     def serve(self, watch: Callable[[Counts], None] | None = None, watch_every_s: float = 0.5) -> None:
-        """Answer until stopped. `watch` is called now and then with the counts."""
+        """Serve until stopped. `watch` is called periodically with the statistics."""
         _wake_up_in_time()
         now = self._clock.now
         next_watch = now() + watch_every_s
@@ -134,7 +134,7 @@ class PtyServer:
                 elif not ready:
                     self.bus.advance(now())
                 self._mind_the_cable()
-                # A machine too slow for the arm would answer later and later: rather let the arm live more slowly.
+                # On a machine too slow for the arm the delay would keep growing, so the arm's time slows down instead.
                 taken = time.monotonic() - began
                 lived = self.bus.advanced_to - reached
                 self._clock.lost_s += max(0.0, taken - lived - TOO_SLOW_S)
@@ -143,12 +143,12 @@ class PtyServer:
                 next_watch = now() + watch_every_s
 
     def stop(self) -> None:
-        """Let `serve` return. Safe in a signal handler."""
+        """Make `serve` return. Safe in a signal handler."""
         self._stopped = True
         os.write(self._wake_write, b"x")
 
     def close(self) -> None:
-        """Take the terminal and the link away. May be called twice."""
+        """Remove the terminal and the link. May be called twice."""
         self._unplug()
         self._close_wake()
 
@@ -169,7 +169,7 @@ class PtyServer:
             try:
                 os.write(self._master, data)
             except BlockingIOError:
-                self._overruns += 1  # nobody reads: lost, as in a full adapter
+                self._overruns += 1  # nobody reads: lost, as with a full adapter buffer
 
     def _mind_the_cable(self) -> None:
         self.bus.notice_faults()
@@ -180,7 +180,7 @@ class PtyServer:
 
     def _plug_in(self) -> None:
         self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)  # held open, so that the terminal outlives every host that closes it
+        tty.setraw(self._slave)  # kept open, so that the terminal survives when a host closes it
         os.set_blocking(self._master, False)
         self.path = os.ttyname(self._slave)
         self._hand = HandSocket(self.path)
@@ -188,15 +188,18 @@ class PtyServer:
             try:
                 self._link.symlink_to(self.path)
             except FileExistsError:
-                self._link, taken = None, self._link  # somebody else's: not to be removed at the end either
+                self._link, taken = (
+                    None,
+                    self._link,
+                )  # created by another program, so it must not be removed at the end either
                 self.close()
                 raise LinkError(
-                    f"{taken} was made by somebody else while the cable was out; it is left as it is. Remove it or "
-                    "choose another --link"
+                    f"{taken} was created by another program while the cable was unplugged and is left as it is. "
+                    "Remove it or choose another --link"
                 ) from None
             except OSError as error:
                 self.close()
-                raise LinkError(f"{self._link}: cannot be made: {error.strerror}") from error
+                raise LinkError(f"{self._link}: cannot be created: {error.strerror}") from error
 
     def _unplug(self) -> None:
         for descriptor in (self._master, self._slave):
@@ -217,9 +220,9 @@ class PtyServer:
 
 
 def _baud_of(master: int) -> int:
-    """The baud rate that the host has set on the other end; 0 when it cannot be told.
+    """Return the baud rate that the host has set on the other end; 0 if it cannot be determined.
 
-    termios gives standard rates only; this is Linux's own call, which knows 4.5 M too.
+    termios only returns standard rates; the Linux-specific call used here also returns others, such as 4.5 MBd.
     """
     try:
         settings = fcntl.ioctl(master, _TCGETS2, bytes(44))
@@ -229,7 +232,7 @@ def _baud_of(master: int) -> int:
 
 
 def _wake_up_in_time() -> None:
-    """Ask Linux for timers to the microsecond; without it each wait ends some 50 us late."""
+    """Request timers with microsecond resolution from Linux; otherwise each wait ends about 50 us late."""
     try:
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     except (OSError, AttributeError):

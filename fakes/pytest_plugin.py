@@ -1,4 +1,4 @@
-"""Fake Dynamixel arms for any test suite. pytest finds this plugin by itself where hil is installed.
+"""pytest fixtures with fake Dynamixel arms. pytest finds this plugin automatically if hil is installed.
 
     def test_my_driver(fake_arm):
         port = fake_arm()                          # a pyserial port onto two XM430-W350, IDs 1 and 2, in virtual time
@@ -11,10 +11,11 @@
         with arm.lock:
             assert arm.bus.servos[1].hardware_error == 0
 
-Both take the path of a TOML file with a [fake] table, the name of a ready arm ("koch", "viperx_300",
-"open_manipulator_x"), a `hil.fakes.description.FakeArm`, or nothing, and `seed` and `faults` to change of it.
+Both accept the path of a TOML file with a [fake] table, the name of a bundled arm ("koch", "viperx_300",
+"open_manipulator_x"), a `hil.fakes.description.FakeArm`, or nothing for the default arm. `seed` and `faults` override
+those of the description.
 
-pytest loads this module in every session of an environment with hil, so it imports nothing that pytest has not.
+pytest loads this module in every session of an environment with hil, so it imports only what pytest itself needs.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -50,7 +51,7 @@ _DEFAULT = {
 
 
 def default_arm() -> "FakeArm":
-    """Two links that hang at rest, moved by two XM430-W350 with IDs 1 and 2 at 1 Mbaud."""
+    """Return a two-link arm hanging at rest, driven by two XM430-W350 with IDs 1 and 2 at 1 MBd."""
     from hil.fakes.description import FakeArm
 
     return FakeArm.model_validate(_DEFAULT)
@@ -58,7 +59,7 @@ def default_arm() -> "FakeArm":
 
 @pytest.fixture
 def fake_arm() -> Iterator[Callable[..., "FakeSerial"]]:
-    """Makes open pyserial ports onto fake arms in virtual time; closes them after the test."""
+    """Return a function that opens pyserial ports onto fake arms in virtual time, closed after the test."""
     from hil.fakes.protocol_fake import open_fake
 
     with ExitStack() as opened:
@@ -80,7 +81,7 @@ def fake_arm() -> Iterator[Callable[..., "FakeSerial"]]:
 
 @pytest.fixture
 def fake_pty() -> Iterator[Callable[..., "PtyServer"]]:
-    """Makes fake arms on terminal devices in real time, served by a thread; takes them away after the test."""
+    """Return a function that starts fake arms on terminal devices in real time, served by threads during the test."""
     from hil.fakes.pty_server import PtyServer
 
     with ExitStack() as opened:

@@ -1,6 +1,6 @@
-"""The hand of a fake arm that another process serves on a terminal: a socket beside that terminal.
+"""Access to the hand of a fake arm that another process serves on a terminal, through a socket.
 
-A request is the text `move ID:to=ANGLE,...` or `release ID` (or `release`), the answer "" or what is wrong with it.
+A request is the text `move ID:to=ANGLE,...`, `release ID` or `release`; the reply is empty, or the error message.
 """
 
 import os
@@ -18,21 +18,21 @@ _PATIENCE_S = 5.0
 
 
 class NoHand(OSError):
-    """No fake arm is served at this terminal. The message says which and what to do."""
+    """No fake arm is served on this terminal. The message names the terminal and the remedy."""
 
 
 def socket_path(terminal: str) -> Path:
-    """Where the socket of a terminal lies that is served for this user."""
+    """Return the path of the socket that belongs to a terminal served for this user."""
     name = terminal.strip("/").replace("/", "-")
     return Path(tempfile.gettempdir()) / f"hil-hand-{os.getuid()}-{name}"
 
 
 class HandSocket:
-    """The server's end. `fileno` becomes readable when something is asked; `answer` then does it."""
+    """The server's end of the socket. `fileno` becomes readable when a request arrives; `answer` then executes it."""
 
     def __init__(self, terminal: str) -> None:
         self.path = socket_path(terminal)
-        self.path.unlink(missing_ok=True)  # of a server that was killed
+        self.path.unlink(missing_ok=True)  # left behind by a server that was killed
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self._socket.bind(str(self.path))
         self.path.chmod(0o600)
@@ -41,21 +41,21 @@ class HandSocket:
         return self._socket.fileno()
 
     def answer(self, bus: FakeBus) -> None:
-        """Carry out the request and report the outcome."""
+        """Execute the request and reply with the result."""
         with suppress(BlockingIOError):
             request, asker = self._socket.recvfrom(_MOST_BYTES)
             said = _do(request.decode("utf-8", "replace"), bus)
-            with suppress(OSError):  # whoever asked may be gone
+            with suppress(OSError):  # the client may be gone
                 self._socket.sendto(said.encode(), asker)
 
     def close(self) -> None:
-        """Take it away. May be called twice."""
+        """Remove the socket. May be called twice."""
         self._socket.close()
         self.path.unlink(missing_ok=True)
 
 
 def ask_hand(device: Path | str, request: str) -> None:
-    """Send a request to the hand at a terminal, or a link to it.
+    """Send a request to the hand of the arm served on a terminal, given by its path or a link to it.
 
     Raises NoHand if no arm is served there, ValueError for an invalid request.
     """

@@ -1,12 +1,12 @@
-"""Identify the dynamics of servo arms: the experiment, its safety, its files, its command line, its Python functions.
+"""Identify the dynamics of servo arms: experiments, safety, files, command line and Python functions.
 
     import hil
 
     result = hil.identify("fake_two_link")
     result.parameters["inertia_1"].value
 
-The functions do what the commands of the same names do. They are loaded when they are first used, so that `import hil`
-costs next to nothing.
+The functions do what the commands of the same names do. They are loaded on first use, so that `import hil` takes
+almost no time.
 """
 
 from __future__ import annotations
@@ -69,15 +69,15 @@ _HOME = {
     "record": "hil.api.experiment",
 }
 
-# A library says nothing unless its user asks for it: logging.basicConfig(level=logging.INFO).
+# A library logs nothing unless the user enables it: logging.basicConfig(level=logging.INFO).
 logging.getLogger("hil").addHandler(logging.NullHandler())
 
 
 def load_model(path: str | PathLike[str]) -> ArmModel:
-    """The identified arm of a run folder, of its result.json, or of a file that `hil export` wrote as TOML or JSON.
+    """Read the identified arm from a run folder, its result.json, or a TOML or JSON file written by `hil export`.
 
-    Needs numpy only. Raises hil.errors.ResultError, which names the file and what is wrong with it: not there, half
-    written, damaged, or from a newer hil.
+    Needs numpy only. Raises hil.errors.ResultError, whose message names the file and the problem: missing, incomplete,
+    damaged, or from a newer version of hil.
     """
     from hil.model_file import read_model
 
@@ -85,7 +85,7 @@ def load_model(path: str | PathLike[str]) -> ArmModel:
 
 
 def __getattr__(name: str) -> Any:
-    """The functions and classes of `__all__`, loaded on first use."""
+    """Load a function or class of `__all__` on first use."""
     if name not in _HOME:
         raise AttributeError(f"module 'hil' has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOME[name]), name)

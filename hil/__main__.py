@@ -1,4 +1,4 @@
-"""`python -m hil` is the `hil` command."""
+"""Run the `hil` command as `python -m hil`."""
 
 from hil.cli.app import main
 

@@ -1,7 +1,7 @@
-"""An identified arm as a model to use: torques of a motion, gravity, friction, accelerations. Needs numpy only.
+"""An identified arm as a model: inverse and forward dynamics, gravity and friction. Needs numpy only.
 
-Equations and names are those of docs/model.md. Every array has the joints on its last axis and any shape before it, so
-one pose, a trajectory and a batch of trajectories are all taken as they are.
+Equations and names are those of docs/model.md. The last axis of every array is the joints; any axes may come before it,
+so a single pose, a trajectory and a batch of trajectories are all accepted.
 """
 
 from collections.abc import Mapping
@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-_CHUNK = 16384  # samples worked on together: their temporaries stay in the processor's cache
+_CHUNK = 16384  # samples per block, chosen so that temporaries stay in the processor's cache
 
 
 @dataclass(frozen=True)
 class JointFacts:
     """What a model knows about a joint besides its dynamics.
 
-    mode: "current", whose goals are A, or "pwm", whose goals are V. torque_per_goal: N m/A or N m/V at the output
-    shaft. goal_limit: A or V. position_limit: rad. velocity_limit: rad/s.
+    mode: "current" (goals in A) or "pwm" (goals in V). torque_per_goal: N m/A or N m/V at the output shaft. goal_limit:
+    A or V. position_limit: rad. velocity_limit: rad/s.
     """
 
     name: str
@@ -41,7 +41,8 @@ class JointFacts:
 class ArmModel:
     """The dynamics of an identified arm of one or two joints.
 
-    values, stds: base parameters and the terms of friction and drive, by name [SI]. gravity: m/s^2 in the arm's plane.
+    values, stds: base parameters, friction terms and drive terms, by name [SI]. gravity: gravitational acceleration in
+    the plane of the arm [m/s^2].
     """
 
     values: Mapping[str, float]
@@ -51,10 +52,15 @@ class ArmModel:
     joints: tuple[JointFacts, ...]
 
     def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Motor torques (..., joints) [N m] of a motion: inertia, Coriolis, gravity, friction, offset.
+        """Motor torques (..., joints) [N m] for a motion: inertia, Coriolis, gravity, friction and offset.
 
-        q [rad], dq [rad/s], ddq [rad/s^2]: (..., joints). Raises ValueError when their shapes differ or do not end in
-        the number of joints.
+        Args:
+            q: angles (..., joints) [rad].
+            dq: velocities (..., joints) [rad/s].
+            ddq: accelerations (..., joints) [rad/s^2].
+
+        Raises:
+            ValueError: the shapes differ or do not end in the number of joints.
         """
         q, dq, ddq = self._motion(q=q, dq=dq, ddq=ddq)
         flat = [values.reshape(-1, len(self.joints)) for values in (q, dq, ddq)]
@@ -65,18 +71,19 @@ class ArmModel:
         return torque.reshape(q.shape)
 
     def rigid_body_torque(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """As `inverse_dynamics`, without friction and offset: the torque that a simulator's links alone need."""
+        """Torques of the rigid links alone: `inverse_dynamics` without friction and offset."""
         q, dq, ddq = self._motion(q=q, dq=dq, ddq=ddq)
         return np.asarray(np.moveaxis(self._rigid_body(*(_joints_first(x) for x in (q, dq, ddq))), 0, -1))
 
     def gravity_torque(self, q: ArrayLike) -> Array:
-        """Torques (..., joints) [N m] that hold the pose q (..., joints) [rad] against gravity alone."""
+        """Torques (..., joints) [N m] that balance gravity in the poses q (..., joints) [rad]."""
         (q,) = self._motion(q=q)
         return np.asarray(np.moveaxis(self._gravity(_joints_first(q)), 0, -1))
 
     def friction_torque(self, dq: ArrayLike) -> Array:
-        """Friction (..., joints) [N m] at velocities dq (..., joints) [rad/s], without offset and load-dependent
-        friction.
+        """Friction torques (..., joints) [N m] at velocities dq (..., joints) [rad/s].
+
+        Offset and load-dependent friction are not included.
         """
         (dq,) = self._motion(dq=dq)
         velocity = _joints_first(dq)
@@ -99,10 +106,9 @@ class ArmModel:
         return matrix
 
     def forward_dynamics(self, q: ArrayLike, dq: ArrayLike, torque: ArrayLike) -> Array:
-        """Accelerations (..., joints) [rad/s^2] under motor torques (..., joints) [N m] of joints that move.
+        """Accelerations (..., joints) [rad/s^2] of moving joints under motor torques (..., joints) [N m].
 
-        At rest, static friction takes any value that holds the joint, which no function of velocity can give: it is
-        taken as zero.
+        Static friction at zero velocity is taken as zero: its value depends on the applied torque, not on the velocity.
         """
         q, dq, torque = self._motion(q=q, dq=dq, torque=torque)
         torque = torque * np.stack([self._ripple(j, q[..., j - 1]) for j in range(1, len(self.joints) + 1)], axis=-1)
@@ -116,15 +122,19 @@ class ArmModel:
         return np.asarray(torque / [self.torque_per_goal(number) for number in range(1, len(self.joints) + 1)])
 
     def torque_scale(self, joint: int) -> float:
-        """Of `joint`, from 1: ratio of true to assumed torque, given that the first joint's is correct."""
+        """Ratio of true to assumed torque of `joint` (numbered from 1), given that the first joint's assumed torque is
+        correct.
+        """
         return self.values.get(f"torque_scale_{joint}", 1.0)
 
     def torque_per_goal(self, joint: int) -> float:
-        """Of `joint`, from 1: the assumed value times torque_scale [N m/A, or N m/V in pwm mode]."""
+        """Identified torque per goal of `joint` (numbered from 1): the assumed value times torque_scale [N m/A or N
+        m/V].
+        """
         return self.joints[joint - 1].torque_per_goal * self.torque_scale(joint)
 
     def _motion(self, **arrays: ArrayLike) -> list[Array]:
-        """The arguments as arrays of one shape; raises ValueError."""
+        """Convert the arguments to arrays and check that their shapes agree. Raises ValueError."""
         taken = {name: np.asarray(values, dtype=np.float64) for name, values in arrays.items()}
         shapes = {values.shape for values in taken.values()}
         count = len(self.joints)
@@ -134,14 +144,14 @@ class ArmModel:
         return list(taken.values())
 
     def _inverse(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Motor torques, joints first."""
+        """Motor torques (joints, ...) [N m]; arguments also have the joints first."""
         torque = self._rigid_body(q, dq, ddq)
         for joint, v in enumerate(dq, start=1):
             step = self._step(joint, v)
             moving = self._viscous(joint, v) + step * self._level(joint, v)
             total = torque[joint - 1] + moving + self.values[f"offset_{joint}"]
             load = self.values.get(f"load_{joint}", 0.0)
-            # total + step load |torque| = torque, whose sign is that of total while load < 1.
+            # Solves total + step * load * |torque| = torque; its sign is that of total as long as load < 1.
             applied = total / (1 - load * step * np.sign(total)) if load else total
             torque[joint - 1] = applied / self._ripple(joint, q[joint - 1])
         return torque
@@ -168,13 +178,13 @@ class ArmModel:
         return np.stack((p["gravity_1"] * np.cos(shoulder) + second, second))
 
     def _viscous(self, joint: int, v: Array) -> Array:
-        """Friction that grows with speed, and differs with its direction where that was identified."""
+        """Viscous friction [N m], including its dependence on direction where that was identified."""
         moving = self.values[f"viscous_{joint}"] * v
         asymmetry = self.values.get(f"viscous_asymmetry_{joint}", 0.0)
         return np.asarray(moving + asymmetry * v * self._step(joint, v)) if asymmetry else moving
 
     def _ripple(self, joint: int, q: Array) -> Array:
-        """Motor torque over what the current stands for, at the angles q."""
+        """Ratio of motor torque to nominal torque at the angles q [rad]."""
         cycles = self.values.get(f"ripple_cycles_{joint}", 0.0) * q
         sine, cosine = (self.values.get(f"ripple_{part}_{joint}", 0.0) for part in ("sin", "cos"))
         return np.asarray(1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles))

@@ -1,7 +1,7 @@
-"""An identified arm in space as a model to use; see `hil.arm_model`. Needs numpy only.
+"""An identified spatial arm as a model; see `hil.arm_model`. Needs numpy only.
 
-Newton-Euler equations with base parameters instead of the links' own: all others are zero, which gives the
-same dynamics. A mass of zero therefore says nothing about a link.
+Newton-Euler equations with the base parameters in place of the links' own inertial parameters, and zero for all
+parameters that were eliminated: the dynamics are the same. A mass of zero therefore says nothing about a link.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,11 @@ _INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2)
 
 @dataclass(frozen=True)
 class Geometry:
-    """Joint geometry: rotation (3, 3) and translation (3,) [m] of each joint's frame relative to the previous link's at
-    angle
-    zero, and the joint axis in its own frame; gravity in the base's frame (3,) [m/s^2]."""
+    """Joint geometry, for all joints in order.
+
+    rotation, translation: pose of the joint's frame relative to the previous link's frame at angle zero: (joints, 3, 3)
+    and (joints, 3) [m]. axis: joint axis in its own frame (joints, 3). gravity: in the base frame (3,) [m/s^2].
+    """
 
     rotation: Array
     translation: Array
@@ -28,9 +30,9 @@ class Geometry:
 
 @dataclass(frozen=True)
 class ChainArmModel(ArmModel):
-    """The dynamics of an identified arm in space.
+    """The dynamics of an identified spatial arm.
 
-    `values` holds its base parameters; `groups` gives the linear combination that each stands for.
+    `values` holds its base parameters; `groups` gives the linear combination that each of them stands for.
     """
 
     geometry: Geometry
@@ -55,7 +57,7 @@ class ChainArmModel(ArmModel):
         return self._torque(q, nothing, nothing, self.geometry.gravity)
 
     def _torque(self, q: Array, dq: Array, ddq: Array, gravity: Array) -> Array:
-        """Joints first; vectors have their three components last."""
+        """Joint torques (joints, ...) [N m] without friction; q, dq and ddq have the joints first."""
         count, shape = len(q), q.shape[1:]
         turn, place = np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3))
         spin, spun = np.zeros((*shape, 3)), np.zeros((*shape, 3))

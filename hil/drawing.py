@@ -1,4 +1,4 @@
-"""matplotlib figures, made without pyplot: they need no screen, hold no state, and show themselves in a notebook."""
+"""matplotlib figures created without pyplot: they need no display, keep no global state, and render in notebooks."""
 
 import io
 from typing import TYPE_CHECKING, Any
@@ -10,12 +10,12 @@ if TYPE_CHECKING:
 
 
 def new_figure(width: float, height: float, dpi: int = 130) -> "Figure":
-    """An empty figure, width and height in inches; raises MissingExtra where matplotlib is not installed."""
+    """Create an empty figure; width and height in inches. Raises MissingExtra if matplotlib is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingExtra("Drawing needs the package matplotlib: pip install 'hil[png]'.") from error
+        raise MissingExtra("Plotting needs the package matplotlib: pip install 'hil[png]'.") from error
 
     class ShownFigure(Figure):
         """A figure that IPython can display without pyplot."""

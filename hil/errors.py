@@ -1,30 +1,31 @@
-"""Everything that can stop hil, as one tree; each leaf names a situation.
+"""All exceptions of hil, as a tree, with their exit codes.
 
 HilError                    exit code
 ├── ConfigError             2   the TOML is unreadable, or a key, value or combination in it is wrong
-├── CsvError                2   a CSV file lacks columns, or fields that should be numbers are none
+├── CsvError                2   a CSV file lacks columns or has fields that are not numbers
 ├── MissingExtra            2   an optional package is not installed
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
-├── ResultError             2   no result.json, half written, damaged, or from a newer hil
+├── ResultError             2   result.json is missing, incomplete, damaged, or from a newer hil
 ├── ExportError             2   the format cannot hold this arm, or a package for it is not installed
+├── SchedulerLost           1   a study's scheduler answers no more
 └── ExperimentError         1   the experiment could not be finished
-    ├── SafetyStop          1   the guard saw a limit passed and stopped the arm
+    ├── SafetyStop          1   the guard stopped the arm because a limit was exceeded
     ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
     ├── NotSettled          1   the motion never became periodic
-    ├── DidNotMove          1   friction or something harder holds a joint
-    ├── NoSafeTorque        1   a dry run found none that keeps the arm within its limits
+    ├── DidNotMove          1   a joint did not move: friction, or it is blocked
+    ├── NoSafeTorque        1   a dry run found no torque that keeps the arm within its limits
     └── RecordingCutShort   1   the recording holds no settled period
 
-hil.drivers.errors.DriverError  1   between computer and servos; its leaves are listed there.
-                                UnknownModel, PortNotOpened, WrongModel and WrongSetting are input: 2
-hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; leaves listed there
+hil.drivers.errors.DriverError  1   communication with the servos; subclasses are listed there.
+                                UnknownModel, PortNotOpened, WrongModel and WrongSetting exit with 2
+hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; subclasses there
 """
 
 from enum import Enum
 
 
 class Cause(Enum):
-    """What the guard saw. Where sensing and drive still work, a stop may brake first."""
+    """What the guard detected. If measurement and drive still work, the stop may brake first."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"
@@ -48,14 +49,19 @@ class Cause(Enum):
 
     @property
     def allows_braking(self) -> bool:
-        """Whether measured velocity and commanded current can still be trusted."""
+        """Whether the measured velocity and the commanded current can still be trusted."""
         return self in {Cause.POSITION, Cause.VELOCITY, Cause.TEMPERATURE, Cause.VOLTAGE}
+
+    @property
+    def allows_lowering(self) -> bool:
+        """Whether the servos still take commands, so that an arm may be lowered, watched all the way."""
+        return self.allows_braking or self in {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER}
 
 
 class HilError(Exception):
-    """Root of hil's own errors.
+    """Base class of hil's own errors.
 
-    last_samples: the last rows recorded before it (see hil.runs.recording), if an experiment was running.
+    last_samples: the last recorded rows (see hil.runs.recording) if an experiment was running.
     """
 
     exit_code = 1
@@ -63,7 +69,7 @@ class HilError(Exception):
 
 
 class ConfigError(HilError):
-    """The configuration is wrong. Example: `rate = "fast"`, or a peak torque above what the current limit gives."""
+    """The configuration is wrong. Example: `rate = "fast"`, or a peak torque above what the current limit allows."""
 
     exit_code = 2
 
@@ -74,20 +80,24 @@ class RunFolderError(HilError):
     exit_code = 2
 
 
+class SchedulerLost(HilError):
+    """The scheduler of a study answers no more. Example: its machine was switched off; --resume goes on."""
+
+
 class CsvError(HilError):
-    """A CSV file cannot be read as a recording. Example: no column "q1", which [columns] names."""
+    """A CSV file cannot be read as a recording. Example: [columns] names a column "q1" that does not exist."""
 
     exit_code = 2
 
 
 class MissingExtra(HilError):
-    """An optional package is not installed. Example: `hil compare --peers mujoco` without the extra `peers`."""
+    """An optional package is not installed. Example: `hil compare --mujoco` without the extra `peers`."""
 
     exit_code = 2
 
 
 class ResultError(HilError):
-    """There is no result to work with. Example: `hil report` of a run that was stopped before its estimate."""
+    """There is no result to work with. Example: `hil report` for a run that was stopped before its estimate."""
 
     exit_code = 2
 
@@ -103,7 +113,7 @@ class ExperimentError(HilError):
 
 
 class SafetyStop(ExperimentError):
-    """The guard stopped the arm, or a dry run forbids it to start. Example: joint 2 passed its position limit."""
+    """The guard stopped the arm, or a dry run forbade starting it. Example: joint 2 exceeded its position limit."""
 
     def __init__(self, message: str, cause: Cause) -> None:
         super().__init__(message)
@@ -115,15 +125,15 @@ class StopRequested(ExperimentError):
 
 
 class NoSafeTorque(ExperimentError):
-    """A dry run found no torque that is safe for all arms that might be this one. Example: a prior of 100 % spread."""
+    """A dry run found no torque that is safe for all plausible arms. Example: a prior with a spread of 100 %."""
 
 
 class NotSettled(ExperimentError):
-    """The motion never became periodic. Example: a joint that slips, or a cable that drags."""
+    """The motion never became periodic. Example: a slipping joint, or a dragging cable."""
 
 
 class DidNotMove(ExperimentError):
-    """A joint stood still for a whole period. Example: torque below static friction; a jammed gear."""
+    """A joint stood still for a whole period. Example: torque below static friction, or a jammed gear."""
 
 
 class RecordingCutShort(ExperimentError):

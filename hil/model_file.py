@@ -1,4 +1,4 @@
-"""From a run folder, result.json or exported TOML/JSON to an `ArmModel`. Standard library and numpy only."""
+"""Reads an `ArmModel` from a run folder, result.json or exported TOML/JSON. Standard library and numpy only."""
 
 import json
 import math
@@ -21,7 +21,7 @@ from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The object in a run folder's result.json, or in the JSON or TOML file `path`; raises ResultError."""
+    """The object in a run folder's result.json, or in the JSON or TOML file `path`. Raises ResultError."""
     file = _file(path)
     if path.is_dir() and not file.is_file():
         raise ResultError(
@@ -41,14 +41,14 @@ def _read(path: Path) -> dict[str, Any]:
         raise ResultError(f"{file}: is not a result file of hil: it has no schema.")
     if result["schema"] != SCHEMA:
         raise ResultError(
-            f"{file}: schema {result['schema']!r} is not {SCHEMA}, which this hil reads; it was written by "
-            f"{'a newer' if _newer(result['schema']) else 'another'} hil. Install that version, or estimate again."
+            f"{file}: schema is {result['schema']!r}, but this version of hil reads {SCHEMA}; it was written by "
+            f"{'a newer' if _newer(result['schema']) else 'another'} version. Install that version, or estimate again."
         )
     return result
 
 
 def read_result(path: Path) -> Result:
-    """The result of a run folder or of its result.json; raises ResultError."""
+    """Read the result of a run folder or of a result.json. Raises ResultError."""
     try:
         return result_from_json(_read(path))
     except FormError as error:
@@ -56,7 +56,7 @@ def read_result(path: Path) -> Result:
 
 
 def read_settled_result(path: Path) -> SettledResult:
-    """The same, of an estimate from settled periods; raises ResultError for any other."""
+    """Read a result that was estimated from settled periods. Raises ResultError, also for any other result."""
     result = read_result(path)
     if not isinstance(result, SettledResult):
         raise ResultError(
@@ -66,7 +66,7 @@ def read_settled_result(path: Path) -> SettledResult:
 
 
 def read_model(path: str | PathLike[str]) -> ArmModel:
-    """See `hil.load_model`."""
+    """Read the identified arm of a run folder or file; see `hil.load_model`. Raises ResultError."""
     try:
         saved = from_json(_SavedModel, _read(Path(path)))
     except FormError as error:
@@ -74,14 +74,26 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
     return _model(saved.arm, {**saved.parameters, **saved.extra}, saved.chain, Path(path))
 
 
-def model_of(result: SettledResult, path: Path) -> ArmModel:
+def read_usable_result(path: Path) -> Result:
+    """The same, of an estimate that says enough of the arm for a model; raises ResultError for any other."""
+    result = read_result(path)
+    if result.arm is None:
+        raise ResultError(
+            f"{path}: was estimated by multiple shooting without a settled period; this command needs one."
+        )
+    return result
+
+
+def model_of(result: Result, path: Path) -> ArmModel:
     """The model in a result that was read from `path`; raises ResultError."""
+    if result.arm is None:
+        raise ResultError(f"{path}: holds no facts of the arm's joints. Run hil estimate again.")
     return _model(result.arm, result.quantities, result.chain, path)
 
 
 @dataclass(frozen=True)
 class _SavedModel:
-    """As much of a result as a model needs: what `hil export` keeps, too."""
+    """The parts of a result that a model needs; `hil export` writes them too."""
 
     arm: ArmFacts
     parameters: Mapping[str, Quantity]
@@ -101,7 +113,7 @@ def _model(arm: ArmFacts, found: Mapping[str, Quantity], chain: ChainFacts | Non
 
 
 def _check_chain(values: dict[str, float], geometry: Geometry, chain: ChainFacts, joints: int, path: Path) -> None:
-    """The geometry is of as many joints, and every base parameter and friction is there."""
+    """Check that the geometry has the right number of joints and that no base parameter or friction term is missing."""
     shapes = tuple(each.shape for each in (geometry.rotation, geometry.translation, geometry.axis, geometry.gravity))
     if shapes != ((joints, 3, 3), (joints, 3), (joints, 3), (3,)):
         raise ResultError(f"{path}: is damaged: the geometry of its {joints} joints has the shapes {shapes}.")
@@ -123,7 +135,7 @@ def _file(path: Path) -> Path:
 
 
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
-    """Every term must be present and known: a model that dropped one would be silently wrong."""
+    """Check that every term is present and known: a model without one of its terms would be silently wrong."""
     if joints not in RIGID_BODY:
         raise ResultError(f"{path}: an arm of {joints} joints; this version of hil has models of one and two.")
     needed = set(base_names(joints))

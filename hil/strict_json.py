@@ -1,4 +1,4 @@
-"""JSON as every reader understands it: there is no infinity in it, so a number that is none becomes null."""
+"""Strict JSON: numbers that are infinite or NaN, which JSON cannot represent, are written as null."""
 
 import json
 import math

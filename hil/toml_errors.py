@@ -1,4 +1,4 @@
-"""What is wrong with a TOML file, in words: key, value, and what is allowed."""
+"""Error messages for TOML files: key, value, and what is allowed."""
 
 import difflib
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 UNSAID = "~"
-"""How the names of alternatives begin that pydantic puts into a location and nobody wrote in a file."""
+"""Prefix of alternatives that pydantic adds to a location although they do not appear in the file."""
 
 _EXPECTED = {
     "float_type": "must be a number",
@@ -25,7 +25,7 @@ _EXPECTED = {
 
 
 def describe(error: ValidationError, path: Path | str, root: type[BaseModel], table: str = "") -> str:
-    """All faults of one file, a line each. table: where in the file the checked model stands, "" for all of it."""
+    """All errors of one file, one per line; table: location of the checked model in the file, "" for the whole file."""
     details = _without_consequences(_joined_alternatives(error.errors(include_url=False)))
     faults = [_fault(detail, root, table) for detail in details]
     if len(faults) == 1:
@@ -35,7 +35,7 @@ def describe(error: ValidationError, path: Path | str, root: type[BaseModel], ta
 
 
 def _joined_alternatives(details: Sequence[Any]) -> list[Any]:
-    """A value that fits none of several alternatives is one fault with all of them, not one for each."""
+    """Merge the errors of a value that matches none of several alternatives."""
     joined: dict[tuple[Any, ...], Any] = {}
     for detail in details:
         if detail["type"] != "literal_error":
@@ -51,7 +51,7 @@ def _joined_alternatives(details: Sequence[Any]) -> list[Any]:
 
 
 def _without_consequences(details: Sequence[Any]) -> list[Any]:
-    """A list whose entries are wrong is not said to be too short as well."""
+    """Drop "too short" errors of lists that also have invalid entries."""
     places = [tuple(detail["loc"]) for detail in details]
     return [
         detail
@@ -69,7 +69,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
     if kind == "extra_forbidden":
         return f"{key} is not a known key; {_allowed_keys(detail['loc'], root)}"
     if kind == "value_error":
-        # A whole table's fault names its keys itself.
+        # The message about a whole table already names its keys.
         about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
         return f"{about}: {context['error']}" if key else str(context["error"])
     message = _EXPECTED.get(kind) or _constraint(kind, context) or str(detail["msg"])
@@ -102,7 +102,7 @@ def _constraint(kind: str, context: dict[str, Any]) -> str | None:
 
 
 def _key(location: Sequence[str | int]) -> str:
-    """`("joints", 1, "id")` as `joints[2].id`: people count joints from one."""
+    """Format `("joints", 1, "id")` as `joints[2].id`: users count joints from one."""
     text = ""
     for part in location:
         if isinstance(part, str) and part.startswith(UNSAID):

@@ -1,4 +1,4 @@
-"""A fake arm with a short experiment, and the ports that a test opened, to look at the servos themselves."""
+"""Fixtures: a fake arm with a short experiment, and the ports that a test opened, for inspecting the servos."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -12,12 +12,13 @@ from hil.config.schema import Config, load_config
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What programs keep of servos' settings goes where the tests' user does not see it."""
+    """Redirect saved servo settings to a temporary state folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -25,7 +26,7 @@ def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A state folder of the test's own; that of servos' settings is in it."""
+    """A state folder for this test only; returns the folder of saved servo settings in it."""
     folder = tmp_path / "state"
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
     return folder / "hil" / "servos"
@@ -47,14 +48,12 @@ def ports(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 @pytest.fixture
 def arm_file(tmp_path: Path) -> Callable[..., Path]:
-    """Writes the ideal fake arm with a 2 s period and the changes asked for, (old, new) each; gives its path."""
+    """Writes a file of the ideal fake arm with a 2 s period and the given (old, new) changes; returns its path."""
 
     def write(*changes: tuple[str, str], base: str = "fake_two_link_ideal") -> Path:
         text = (CONFIGS / f"{base}.toml").read_text(encoding="utf-8")
         short = (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
-        for old, new in (*short, *changes):
-            assert old in text, f"{old!r} is not in {base}.toml"
-            text = text.replace(old, new, 1)
+        text = replaced(text, *short, *changes)
         path = tmp_path / "arm.toml"
         path.write_text(text, encoding="utf-8")
         return path
@@ -64,7 +63,7 @@ def arm_file(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def arm(arm_file: Callable[..., Path]) -> Callable[..., Config]:
-    """The same as a checked configuration."""
+    """As `arm_file`, but returns the checked configuration."""
     return lambda *changes, **options: load_config(arm_file(*changes, **options))
 
 
@@ -78,7 +77,7 @@ def _identify(path: Path, folder: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def identified_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder of the ideal fake arm with a short period, shared by all tests: only to be read."""
+    """A run folder of the ideal fake arm with a short period, shared by all tests; read-only."""
     folder = tmp_path_factory.mktemp("identified")
     text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
     text = text.replace("period = 10.0 ", "period = 2.0 ").replace("band = [0.1, 5.0]", "band = [0.5, 6.0]")

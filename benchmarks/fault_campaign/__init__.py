@@ -1,1 +1,1 @@
-"""Faults drawn at random against the whole program, judged by what the emulated servos themselves did."""
+"""Random faults against the complete program, judged by what the emulated servos themselves recorded."""

@@ -1,4 +1,4 @@
-"""Shipped configurations made ready for a campaign: another rate, short periods, a fake arm where there is none."""
+"""Bundled configurations adapted for a campaign: other rates, short periods, and a fake arm if there is none."""
 
 import json
 import tomllib
@@ -12,37 +12,37 @@ PERIOD_S = 2.0
 SCHEME = "campaign://"
 
 _DONOR = "fake_two_link"
-_DONOR_TORQUE = 0.312  # N m: the first joint's in xm430_two_link.toml, whose arm the donor's could be
+_DONOR_TORQUE = 0.312  # N m, peak torque of joint 1 in xm430_two_link.toml, an arm like the donor's
 _FAST_BAUD = 4_000_000  # 1 kHz does not fit on a wire of 1 Mbaud
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One shipped configuration at one rate [Hz]."""
+    """One bundled configuration at one rate [Hz]."""
 
     name: str
     rate: int
 
 
 def names() -> list[str]:
-    """The shipped configurations of planar arms, by file name; arms in space have no safe stop to be tried yet."""
+    """The bundled configurations of planar arms, by file name; spatial arms have no safe stop that could be tested."""
     return sorted(path.stem for path in CONFIGS.glob("*.toml") if "urdf = " not in path.read_text(encoding="utf-8"))
 
 
 def settings() -> list[Setting]:
-    """Every shipped configuration at every rate."""
+    """Every bundled configuration at every rate."""
     return [Setting(name, rate) for name in names() for rate in RATES]
 
 
 def make_document(setting: Setting, period: float = PERIOD_S) -> dict[str, Any]:
-    """The configuration as a document, at this rate, with multisines of `period` [s] that count as settled soon.
+    """The configuration as a document, at this rate, with multisines of `period` [s] that soon count as settled.
 
-    What is lowered is the experiment's length; limits, torques, models and safety stay as they are shipped.
+    Only the experiment is shortened; limits, torques, models and safety settings are unchanged.
     """
     document = _load(setting.name)
     experiment: dict[str, Any] = document["experiment"]
     if experiment.pop("pilot", False):
-        # A pilot's steps are runs as any other; finding their torques takes the time of hundreds of injections.
+        # A pilot's steps are ordinary runs, but finding their torques takes as long as hundreds of injections.
         experiment["peak_torque"] = _load(_DONOR)["experiment"]["peak_torque"]
     experiment.pop("lines", None)
     experiment.pop("design", None)
@@ -66,7 +66,7 @@ def make_document(setting: Setting, period: float = PERIOD_S) -> dict[str, Any]:
 
 
 def dump(document: dict[str, Any]) -> str:
-    """The document as TOML; tables below the first level are written inline."""
+    """Format the document as TOML; tables below the first level are written inline."""
     lines = []
     for key, value in document.items():
         if isinstance(value, dict):
@@ -89,7 +89,7 @@ def _load(name: str) -> dict[str, Any]:
 
 
 def _fake_arm(document: dict[str, Any]) -> dict[str, Any]:
-    """An arm for a configuration of real servos: the donor's links and friction, as heavy as its torques can move."""
+    """A fake arm for a configuration of real servos: the donor's arm, scaled to the configured torques."""
     arm = _load(_DONOR)["fake"]["arm"]
     share = document["experiment"]["peak_torque"][0] / _DONOR_TORQUE
     for link in arm["links"]:
@@ -98,7 +98,7 @@ def _fake_arm(document: dict[str, Any]) -> dict[str, Any]:
     for drive, joint in zip(arm["drives"], document["joints"], strict=True):
         for key in ("mass", "rotor_inertia", "viscous", "coulomb", "offset"):
             drive[key] *= share
-        # A voltage-driven servo's motor is emulated by its own resistance and back-EMF, a current by this constant.
+        # A voltage-driven motor is emulated by resistance and back-EMF, a current-driven one by this constant.
         drive["torque_constant"] = joint.get("torque_constant", 1.8)
     arm["start"] = document["arm"]["rest_pose"]
     servos = [

@@ -1,4 +1,4 @@
-"""What a man in the middle does to the bytes between host and servos, and what a hand does to the servos themselves."""
+"""Attacks on the bytes between host and servos by a man in the middle, and attacks on the servos themselves."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,7 +10,7 @@ PRESENT = {"current": (126, 2), "velocity": (128, 4), "position": (132, 4)}
 
 
 class Kind(StrEnum):
-    """What can be done. Of replies first, then of instructions, of servos, and of the program's own surroundings."""
+    """Kinds of attack: on replies, on instructions, on servos, and on the program's environment."""
 
     HOLD = "hold"
     SPLIT = "split"
@@ -23,12 +23,33 @@ class Kind(StrEnum):
     FREEZE = "freeze"
     SCALE = "scale"
     REPLAY = "replay"
+    BIAS = "bias"
+    CREEP = "creep"
+    LAG = "lag"
+    JITTER = "jitter"
+    STUCK_BIT = "stuck_bit"
+    CONSTANT = "constant"
+    COLLISION = "collision"
     DEAF = "deaf"
     DEAF_TO_GOALS = "deaf_to_goals"
     TWICE_TOLD = "twice_told"
     TORQUE_TAKEN = "torque_taken"
     WATCHDOG_TRIPPED = "watchdog_tripped"
     STRANGE_GOAL = "strange_goal"
+    RAISED_LIMIT = "raised_limit"
+    LOWERED_LIMIT = "lowered_limit"
+    WATCHDOG_OFF = "watchdog_off"
+    WATCHDOG_LONG = "watchdog_long"
+    TURNED_ROUND = "turned_round"
+    SLOW_REPLIES = "slow_replies"
+    NEW_ID = "new_id"
+    NEW_BAUD = "new_baud"
+    CLOCK_RATE = "clock_rate"
+    CLOCK_WRAP = "clock_wrap"
+    WEAK = "weak"
+    SATURATED = "saturated"
+    PUSHED = "pushed"
+    DISK_FULL = "disk_full"
     STALL = "stall"
     SIGINT = "SIGINT"
     SIGTERM = "SIGTERM"
@@ -36,20 +57,23 @@ class Kind(StrEnum):
     KILLED = "killed"
 
 
-ON_REPLIES = frozenset(
-    {Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.SWAP, Kind.FREEZE, Kind.SCALE}
-) | {Kind.REPLAY}
+ON_REPLIES = frozenset({Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.COLLISION})
+FORGED = frozenset({Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY, Kind.BIAS, Kind.CREEP, Kind.LAG, Kind.JITTER}) | {
+    Kind.STUCK_BIT,
+    Kind.CONSTANT,
+}
+ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED})
 ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD})
-AT_ONCE = frozenset(set(Kind) - ON_REPLIES - ON_INSTRUCTIONS - {Kind.ECHO})
-"""These happen once, at their beginning."""
+AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - {Kind.ECHO})
+"""Attacks that happen once, at their start time."""
 
 
 @dataclass(frozen=True)
 class Attack:
-    """One thing that is done from `start` to `end` [s on the port's clock].
+    """One attack, from `start` to `end` [s on the port's clock].
 
-    servo: bus ID, None for all. chance: that it strikes a packet. amount: seconds, bits or a factor, by kind.
-    field: the register that is forged, "state" for all three.
+    servo: bus ID, None for all. chance: probability of affecting a packet. amount: seconds, bits, ticks or a factor,
+    depending on the kind. field: the register that is forged, "state" for all three.
     """
 
     kind: Kind
@@ -66,7 +90,9 @@ class Attack:
 
 @dataclass(frozen=True)
 class Request:
-    """The group read that is being answered: where its block begins, how long it is, whom it asks."""
+    """The group read that is being answered: start address and length of the block, the IDs, and whether it is a fast
+    read.
+    """
 
     address: int
     length: int
@@ -75,13 +101,13 @@ class Request:
 
 
 def packets_of(data: bytes) -> list[bytes]:
-    """The packets of one write, each with its bytes; what is no packet stands with the one before it."""
+    """Split one write into packets; bytes that belong to no packet stay with the one before."""
     starts = [at for at in range(len(data)) if data.startswith(HEADER, at)]
     return [data[at:end] for at, end in zip(starts, [*starts[1:], len(data)], strict=True)] or [data]
 
 
 def request_in(data: bytes) -> Request | None:
-    """The group read in these bytes of the host, if there is one."""
+    """The group read in these bytes of the host; None if there is none."""
     for packet in Framer().feed(data):
         if packet.instruction in (0x82, 0x8A) and len(packet.body) > 4:
             address, length = int.from_bytes(packet.body[:2], "little"), int.from_bytes(packet.body[2:4], "little")
@@ -101,7 +127,7 @@ def goals_in(packet: Packet) -> dict[int, tuple[int, int]]:
 
 
 def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
-    """ID to (ERR, block of registers) of the whole answers to `request` in these bytes."""
+    """ID to (error byte, register block) of the complete answers to `request` in these bytes."""
     if request.fast:
         return _fast_blocks_in(data, request)
     found: dict[int, tuple[int, bytes]] = {}
@@ -114,10 +140,10 @@ def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
 
 
 def _fast_blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
-    """The same of a fast answer, which is never stuffed; as far as its CRCs are right."""
+    """The same for a fast answer, which is never byte-stuffed, as far as its CRCs are correct."""
     found: dict[int, tuple[int, bytes]] = {}
     start = data.rfind(HEADER + b"\xfe")
-    at = start + 8  # ERR ID data CRC for each, behind header, ID, LEN and INST
+    at = start + 8  # ERR, ID, data and CRC of each servo, after header, ID, LEN and INST
     for servo_id in request.ids if start >= 0 else ():
         end = at + 2 + request.length
         if len(data) < end + 2 or crc(data[start:end]) != int.from_bytes(data[end : end + 2], "little"):
@@ -129,7 +155,7 @@ def _fast_blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes
 
 
 def field_of(block: bytes, request: Request, name: str) -> int | None:
-    """The present register `name` in a block, in ticks; None when the block does not cover it."""
+    """The present register `name` in a block [ticks]; None if the block does not contain it."""
     address, size = PRESENT[name]
     at = address - request.address
     if at < 0 or at + size > request.length:
@@ -138,7 +164,7 @@ def field_of(block: bytes, request: Request, name: str) -> int | None:
 
 
 def with_field(block: bytes, request: Request, name: str, value: int) -> bytes:
-    """The block with another value of one present register."""
+    """The block with one present register replaced."""
     address, size = PRESENT[name]
     at = address - request.address
     if at < 0 or at + size > request.length:
@@ -149,7 +175,7 @@ def with_field(block: bytes, request: Request, name: str, value: int) -> bytes:
 
 
 def forged(answers: dict[int, tuple[int, bytes]], request: Request) -> bytes:
-    """The bytes of answers in which somebody has changed values; every CRC is right."""
+    """The bytes of answers with forged values; every CRC is correct."""
     if not request.fast:
         return b"".join(encode_status(servo_id, error, block) for servo_id, (error, block) in answers.items())
     length = 1 + (request.length + 4) * len(request.ids)

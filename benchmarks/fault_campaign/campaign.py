@@ -1,4 +1,4 @@
-"""One injection after another: the whole command in this process, on a virtual arm behind a man in the middle."""
+"""Executes injections: the complete command in this process, on a virtual arm behind a man in the middle."""
 
 import contextlib
 import io
@@ -21,8 +21,9 @@ from benchmarks.fault_campaign.arms import PERIOD_S, Setting
 from benchmarks.fault_campaign.attack import Kind
 from benchmarks.fault_campaign.draw import Drawn, draw
 from benchmarks.fault_campaign.judge import Story, Verdict, describe, judge
-from benchmarks.fault_campaign.middle import Killed, Middle, Traffic
+from benchmarks.fault_campaign.middle import Middle, Traffic
 from benchmarks.fault_campaign.protocol_campaign import Bench
+from benchmarks.fault_campaign.touch import Killed
 from benchmarks.fault_campaign.witness import Witness
 from hil.cli.app import main
 from hil.config.schema import Config, parse_config
@@ -35,7 +36,7 @@ from hil.runs.recording import load_samples
 from hil.setup import bus_rate
 
 AFTER_S = 1.5
-"""How long the arm is watched after the program has ended [s]."""
+"""Time for which the arm is observed after the program has ended [s]."""
 
 STATE = "XDG_STATE_HOME"
 FREE = frozenset({"Goal Position", "Registered Instruction"})
@@ -44,17 +45,19 @@ FREE = frozenset({"Goal Position", "Registered Instruction"})
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = 12
 _CHECKED_CYCLES = 8
-"""The next start's `hil check` is after the settings; how fast the bus is tells nothing here."""
+"""Cycles per mode in the next start's `hil check`, which only has to restore settings here."""
 
 
 class DoesNotRun(Exception):
-    """A configuration that cannot be played at a rate even without faults: nothing can be learnt from it there."""
+    """A configuration cannot be played at this rate even without faults, so it cannot be tested."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One injection. not_restored: registers that differ from before, after the next start; unreadable: neither a
-    foreseen message nor a recording that can be read.
+    """The outcome of one injection.
+
+    not_restored: registers that differ from before, after the next start. unreadable: neither an expected message nor a
+    readable recording.
     """
 
     setting: Setting
@@ -82,7 +85,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Ready:
-    """A configuration at a rate, and how it goes undisturbed."""
+    """A configuration at a rate, with its undisturbed run."""
 
     setting: Setting
     path: Path
@@ -93,10 +96,10 @@ class Ready:
 
 @cache
 def prepare(setting: Setting, period: float = PERIOD_S) -> Ready:
-    """Play it once without faults; raises DoesNotRun when that does not end well."""
+    """Play the configuration once without faults. Raises DoesNotRun if that fails."""
     if _PACKAGE not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append(_PACKAGE)
-    # The same waves again and again: designing them takes as long as playing them.
+    # Cache the waves, which are always the same: designing them takes as long as playing them.
     if not hasattr(plan_module.design_multisine, "cache_info"):
         plan_module.design_multisine = _cached(plan_module.design_multisine)
     bus_rate.CYCLES = _CHECKED_CYCLES
@@ -112,14 +115,14 @@ def prepare(setting: Setting, period: float = PERIOD_S) -> Ready:
 
 
 def inject(setting: Setting, seed: int, period: float = PERIOD_S) -> Outcome:
-    """Draw faults and let them happen in one run."""
+    """Draw faults and inject them into one run."""
     ready = prepare(setting, period)
     drawn = draw(f"{setting.name} {setting.rate} {seed}", ready.undisturbed.ended, [j.id for j in ready.config.joints])
     return inject_drawn(ready, drawn, seed)
 
 
 def inject_drawn(ready: Ready, drawn: Drawn, seed: int) -> Outcome:
-    """Let these faults happen in one run."""
+    """Inject these faults into one run."""
     story, readable, changed = _play(ready, drawn, seed)
     verdict = judge(ready.config, drawn, story, ready.undisturbed)
     beyond = bool((verdict.beyond > 0).any()) and bool((verdict.beyond > _allowed(ready)).any())
@@ -129,7 +132,7 @@ def inject_drawn(ready: Ready, drawn: Drawn, seed: int) -> Outcome:
 
 
 def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str, ...]]:
-    """One `hil record`; its story, whether its recording can be read, and which registers it left otherwise."""
+    """Run `hil record` once; return its story, whether its recording is readable, and which registers it changed."""
     witnesses: list[Witness] = []
     before: dict[int, dict[str, int]] = {}
 
@@ -147,7 +150,7 @@ def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str
         port = Bench.port
         if port is None:  # the command ended before it opened the port
             return Story(np.empty(0), Traffic(), 0.0, code, text), True, ()
-        port.over = True
+        port.let_be()
         ended = port.clock.now()
         port.bus.faults.clear()
         port.clock.wait_until(ended + AFTER_S)
@@ -163,7 +166,7 @@ def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str
 
 
 def _command(*arguments: str) -> tuple[int | None, str]:
-    """Exit code and what a user reads; no code where it ended in an error that the command does not foresee."""
+    """Run a command; return its exit code and output. The code is None after an unexpected exception."""
     said = io.StringIO()
     kept, sys.argv = sys.argv, ["hil", *arguments]
     try:
@@ -226,7 +229,7 @@ def _allowed_of(path: Path) -> Any:
 
 
 def _allowed(ready: Ready) -> Any:
-    """How far a stopped joint may get beyond its limit, as the dry run promises (joints,) [rad]."""
+    """Largest overshoot beyond the position limits predicted by the dry run (joints,) [rad]."""
     return _allowed_of(ready.path)
 
 
@@ -244,7 +247,7 @@ def _cached(design: Any) -> Any:
 
 @contextlib.contextmanager
 def _environment(state: Path) -> Iterator[None]:
-    """What the program keeps for its user lies where the campaign can throw it away."""
+    """Redirect the program's persistent state to a temporary folder."""
     kept = os.environ.get(STATE)
     os.environ[STATE] = str(state)
     try:
@@ -257,7 +260,7 @@ def _environment(state: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _signals_ignored() -> Iterator[None]:
-    """A signal outside the experiment must not end the campaign."""
+    """Ignore signals outside the experiment, so that they do not end the campaign."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     kept = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
     try:

@@ -1,27 +1,27 @@
-"""Which faults befall a run, drawn at random in kind, time, length, strength and combination; the words for them."""
+"""Random faults of a run (kind, time, duration, strength, combination) and the words by which messages name causes."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from random import Random
 
-from benchmarks.fault_campaign.attack import AT_ONCE, Attack, Kind
+from benchmarks.fault_campaign.attack import AT_ONCE, FORGED, ON_MOTORS, Attack, Kind
 from hil.fakes.bus.faults import INSTRUCTION_FAULTS, REPLY_FAULTS, Fault, FaultKind
 
 PAIRS = 0.35
-"""Share of injections that are two faults."""
+"""Probability that an injection consists of two faults."""
 
 TOGETHER_S = 0.3
-"""Half of the pairs follow each other this closely [s]."""
+"""Half of the pairs follow each other within this time [s]."""
 
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
-REFUSED, STRANGER = "refused", "stranger"
+REFUSED, STRANGER, DISK = "refused", "stranger", "disk"
 
 WORDS = {
-    SILENCE: r"heard nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl|no response"
-    r"|repl(y|ies).{0,30}(missing|lost)",
+    SILENCE: r"heard nothing|received nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl"
+    r"|no response|repl(y|ies).{0,30}(missing|lost)",
     GARBLED: r"damaged|corrupt|\bCRC|not an answer|not one to the question|garbled|broken packet|incorrect|echo",
     LATE: r"\blate\b|\blater\b|deadlines?\b|latency|too slow",
     CABLE: r"[Pp]ort .{0,80}(failed|closed|lost)|unplugged|cable (is|was)|Is the cable|adapter",
@@ -41,9 +41,10 @@ WORDS = {
     MODEL: r"any arm|than (the )?model|predicted|not as planned|foreseen|the dry run",
     REFUSED: r"refus|alert, hardware error: none|answers? with an? error",
     STRANGER: r"another (program|master)|somebody else|not asked for|collision|other master",
+    DISK: r"\bdisk\b|no space|File too large|cannot be written",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
 }
-"""What a message has to say for a cause to count as named."""
+"""A message names a cause if it matches this pattern."""
 
 _FORGED = frozenset({ENCODER, STUCK, MODEL, TORQUE, SIGN})
 _LOST_GOALS = frozenset({TORQUE, MODEL, STUCK})
@@ -62,12 +63,33 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.FREEZE: _FORGED,
     Kind.SCALE: _FORGED | {LIMIT},
     Kind.REPLAY: _FORGED | {LATE},
+    Kind.BIAS: _FORGED | {LIMIT, POSE},
+    Kind.CREEP: _FORGED | {LIMIT, POSE},
+    Kind.LAG: _FORGED | {LIMIT},
+    Kind.JITTER: _FORGED | {LIMIT, POSE},
+    Kind.STUCK_BIT: _FORGED | {LIMIT, POSE},
+    Kind.CONSTANT: _FORGED | {LIMIT, POSE},
+    Kind.COLLISION: _BYTES,
     Kind.DEAF: frozenset({SILENCE}),
     Kind.DEAF_TO_GOALS: _LOST_GOALS,
     Kind.TWICE_TOLD: _BYTES,
     Kind.TORQUE_TAKEN: _LOST_GOALS,
     Kind.WATCHDOG_TRIPPED: _LOST_GOALS,
     Kind.STRANGE_GOAL: _LOST_GOALS | {LIMIT},
+    Kind.RAISED_LIMIT: frozenset(),
+    Kind.LOWERED_LIMIT: _LOST_GOALS | {LIMIT},
+    Kind.WATCHDOG_OFF: frozenset({TORQUE, STRANGER}),
+    Kind.WATCHDOG_LONG: frozenset({TORQUE, STRANGER}),
+    Kind.TURNED_ROUND: _FORGED | {LIMIT, POSE, REFUSED},
+    Kind.SLOW_REPLIES: _SLOW | _BYTES,
+    Kind.NEW_ID: frozenset({SILENCE}),
+    Kind.NEW_BAUD: frozenset({SILENCE}),
+    Kind.CLOCK_RATE: frozenset({LATE}),
+    Kind.CLOCK_WRAP: frozenset(),
+    Kind.WEAK: _FORGED | {LIMIT},
+    Kind.SATURATED: _FORGED | {LIMIT},
+    Kind.PUSHED: _FORGED | {LIMIT},
+    Kind.DISK_FULL: frozenset({DISK}),
     Kind.STALL: frozenset({PROGRAM, LATE}),
     Kind.SIGINT: frozenset({SIGNAL}),
     Kind.SIGTERM: frozenset({SIGNAL}),
@@ -92,29 +114,38 @@ CAUSES: dict[str, frozenset[str]] = {
     FaultKind.STATUS_ERROR: frozenset({REFUSED, SILENCE, TORQUE}),
     FaultKind.OTHER_MASTER: _BYTES | {STRANGER, LATE},
 }
-"""What each fault may rightly be called. Held fast and a dead encoder cannot be told apart from the host's side."""
+"""Causes that a message may name for each fault. The host cannot distinguish a jammed joint from a dead encoder."""
 
 _INSTRUCTIONS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
 UNHEARD = _INSTRUCTIONS | {
     Kind.DEAF,
     Kind.STALL,
     Kind.KILLED,
+    Kind.NEW_ID,
+    Kind.NEW_BAUD,
     FaultKind.CABLE_PULLED,
     FaultKind.SILENT_SERVO,
     FaultKind.REBOOT,
     FaultKind.STATUS_ERROR,
 }
-"""Where the program cannot reach a servo, the watchdog's time counts."""
+"""Faults during which the program cannot reach a servo, so that the watchdog's timeout applies."""
 
 SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SPLIT, FaultKind.LATE_REPLY})
-"""After these the program may rightly play its plan later than undisturbed."""
+"""Faults after which the program may play its plan later than in an undisturbed run."""
+
+HARMLESS = frozenset({Kind.CLOCK_WRAP, Kind.RAISED_LIMIT})
+"""After these a run ends as if nothing had been done to it."""
+
+_OF_ONE_FIELD = frozenset({Kind.BIAS, Kind.CREEP, Kind.JITTER, Kind.STUCK_BIT, Kind.CONSTANT})
 
 _LAST = frozenset({Kind.KILLED})
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is done to one run: attacks of the man in the middle, faults of the fake bus, timed from its start."""
+    """The faults of one run: attacks by the man in the middle and faults of the fake bus, timed from the start of the
+    run.
+    """
 
     attacks: tuple[Attack, ...]
     faults: tuple[Fault, ...]
@@ -142,7 +173,7 @@ class Drawn:
 
 
 def draw(seed: object, until: float, ids: Sequence[int]) -> Drawn:
-    """One fault or two within an undisturbed run that lasts `until` [s]; the same seed draws the same."""
+    """Draw one or two faults for a run that lasts `until` [s] undisturbed; the same seed gives the same faults."""
     random = Random(f"drawn {seed}")
     first = random.uniform(0.0, until)
     times = [first]
@@ -161,7 +192,7 @@ def draw(seed: object, until: float, ids: Sequence[int]) -> Drawn:
 
 
 def _length(random: Random) -> float:
-    """Of a fault [s]: from some milliseconds to the end of the run."""
+    """Duration of a fault [s]: from a few milliseconds to the end of the run."""
     return math.inf if random.random() < 0.4 else 10 ** random.uniform(-2.3, 0.7)
 
 
@@ -170,33 +201,58 @@ def _chance(random: Random) -> float:
 
 
 def _attack(kind: Kind, at: float, ids: Sequence[int], random: Random) -> Attack:
-    if kind in AT_ONCE:
-        amount = {
-            Kind.STALL: 10 ** random.uniform(-2, 0.5),
-            Kind.STRANGE_GOAL: random.choice((-1, 1)) * random.uniform(0.05, 1.0),
-        }.get(kind, 0.0)
-        return Attack(kind, at, at, random.choice((None, *ids)), amount=amount)
-    amounts = {
+    servo = random.choice((None, *ids))
+    # Forged values stay forged: an intermittent forgery would be a new fault at every sample.
+    chance = 1.0 if kind in FORGED | ON_MOTORS | {Kind.ECHO} else _chance(random)
+    fields = ("position", "velocity", "current")
+    field = random.choice(fields if kind in _OF_ONE_FIELD else ("state", *fields))
+    amount = _amount(kind, field, random)
+    return Attack(kind, at, at if kind in AT_ONCE else at + _length(random), servo, chance, amount, field)
+
+
+def _amount(kind: Kind, field: str, random: Random) -> float:
+    """How much of it; what that means depends on the kind."""
+    sign = random.choice((-1.0, 1.0))
+    ticks = {"position": 10 ** random.uniform(1.0, 3.6), "velocity": 10 ** random.uniform(0.3, 2.3)}.get(field, 100.0)
+    return {
         Kind.HOLD: 10 ** random.uniform(-3, -0.7),
         Kind.SPLIT: 10 ** random.uniform(-4, -1.3),
         Kind.FLIP: float(random.randrange(1, 9)),
         Kind.SCALE: random.choice((-1.0, 0.0, 0.5, 0.8, 1.25, 2.0)),
         Kind.REPLAY: random.uniform(0.02, 0.5),
-    }
-    # A forged value stays forged: one that comes and goes is another fault at every sample.
-    chance = 1.0 if kind in (Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY, Kind.ECHO) else _chance(random)
-    field = random.choice(("state", "position", "velocity", "current"))
-    return Attack(kind, at, at + _length(random), random.choice((None, *ids)), chance, amounts.get(kind, 0.0), field)
+        Kind.BIAS: sign * ticks,
+        Kind.CREEP: sign * 10 ** random.uniform(1.0, 2.7),
+        Kind.LAG: 10 ** random.uniform(-2.0, -0.3),
+        Kind.JITTER: 0.1 * ticks,
+        Kind.STUCK_BIT: float(random.randrange(13 if field == "position" else 9)),
+        Kind.CONSTANT: random.choice((0.0, -1.0, 1023.0, 4095.0)),
+        Kind.STALL: 10 ** random.uniform(-2, 0.5),
+        Kind.STRANGE_GOAL: sign * random.uniform(0.05, 1.0),
+        Kind.LOWERED_LIMIT: random.uniform(0.02, 0.9),
+        Kind.CLOCK_RATE: sign * 10 ** random.uniform(-4.0, -2.3),
+        Kind.WEAK: random.choice((-1.0, 0.0, 0.3, 0.5, 0.8, 1.3)),
+        Kind.SATURATED: random.uniform(0.02, 0.8),
+        Kind.PUSHED: sign * random.uniform(0.1, 2.0),
+    }.get(kind, 0.0)
 
 
 def _fault(kind: FaultKind, at: float, ids: Sequence[int], random: Random) -> Fault:
     servo = random.choice((None, *ids))
+    amount = {
+        FaultKind.LATE_REPLY: 10 ** random.uniform(-3, -1),
+        FaultKind.STATUS_ERROR: float(random.choice((1, 2, 3, 4, 5, 6, 7, 128))),
+        FaultKind.OTHER_MASTER: 10 ** random.uniform(-2.7, -0.7),
+        FaultKind.REBOOT: 10 ** random.uniform(-2.0, -0.2),
+        FaultKind.LOW_VOLTAGE: random.uniform(0.2, 3.0),
+        FaultKind.ENCODER_JUMP: float(
+            random.choice((-1, 1)) * random.choice((1024, 2048, 4096, random.randrange(60, 2049)))
+        ),
+    }.get(kind)
+    length = _length(random)
     if kind == FaultKind.CABLE_PULLED:
-        return Fault(kind=kind, at=at)
-    if kind in REPLY_FAULTS | INSTRUCTION_FAULTS:
-        return Fault(kind=kind, at=at, duration=_length(random), servo=servo, probability=_chance(random))
-    amount = None
-    if kind == FaultKind.ENCODER_JUMP:
-        amount = float(random.choice((-1, 1)) * random.randrange(60, 2049))
+        return Fault(kind=kind, at=at, duration=length)
+    if kind in REPLY_FAULTS | INSTRUCTION_FAULTS | {FaultKind.STATUS_ERROR, FaultKind.OTHER_MASTER}:
+        chance = _chance(random)
+        return Fault(kind=kind, at=at, duration=length, servo=servo, probability=chance, amount=amount)
     lasting = kind in (FaultKind.STUCK_JOINT, FaultKind.SILENT_SERVO, FaultKind.LOW_VOLTAGE, FaultKind.ENCODER_JUMP)
-    return Fault(kind=kind, at=at, duration=_length(random) if lasting else math.inf, servo=servo, amount=amount)
+    return Fault(kind=kind, at=at, duration=length if lasting else math.inf, servo=servo, amount=amount)

@@ -1,8 +1,8 @@
-"""The second oracle: what a run owed its arm, and whether the emulated servos' own record says that it kept it.
+"""Judges a run by the emulated servos' own record, independently of the program's view.
 
-It knows no kinds of faults. From the record it takes, millisecond by millisecond, whether the program was told the
-truth, heard anything, was obeyed, and had the arm within its limits and near its undisturbed motion. From the first
-moment on at which one of these failed for good, current has `BOUND_MS` to end.
+The judge does not depend on the kind of fault. For every millisecond it determines from the record whether the program
+received correct data, received anything, was obeyed, and kept the arm within its limits and near its undisturbed
+motion. From the first moment at which one of these fails permanently, the current must end within `BOUND_MS`.
 """
 
 import re
@@ -13,31 +13,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_in
-from benchmarks.fault_campaign.draw import CAUSES, SHIFTED, UNHEARD, WORDS, Drawn
+from benchmarks.fault_campaign.draw import CAUSES, HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn
 from benchmarks.fault_campaign.middle import Traffic
+from benchmarks.fault_campaign.visible import Heard, visible_from
 from benchmarks.fault_campaign.witness import STEP_S
 from hil.config.schema import Config
 from hil.drivers.packet import Framer
+from hil.estimator.models.momentum_observer import NAMES
+from hil.experiment.model_watch import known_arm
 from hil.fakes.bus.faults import FaultKind
 
 BOUND_MS = 100.0
 TRIP_MS = 40.0
-"""Beyond a watchdog's time: its step of 20 ms, and the packet that fed it last."""
+"""Allowance beyond the watchdog's timeout [ms]: its step of 20 ms, and the last packet that restarted it."""
 
 LASTING_MS = 100
-"""A failure that passes sooner may be ridden out."""
+"""A failure that lasts less than this may be tolerated [ms]."""
 
 GAP_MS = 50
-"""A failure that pauses for less has not passed; but whoever hears a servo now and then is not deaf to it."""
+"""Failures separated by less than this count as one [ms], except for missing replies, which any reply ends."""
 
 LIE_RAD, LIE_RAD_S, LIE_SHARE = 0.1, 0.5, 0.1
-"""A position, a velocity that the program was told may be wrong by so much; the velocity by a share of itself too."""
+"""Tolerances for the position and velocity reported to the program; the velocity also has a relative tolerance."""
 
 OBEYED = 0.1
-"""Of the largest goal of the run: how far a servo's goal may be from what was sent."""
+"""Tolerance for a servo's goal, relative to the largest goal of the run."""
 
 ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
-"""From the undisturbed motion a joint may be so far away, and by so much of that motion's range."""
+"""Tolerance for the deviation from the undisturbed motion, absolute and relative to the range of that motion."""
+
+TO_BE_SEEN = (
+    "is not where the program was told",
+    "is not as fast as told",
+    "is beyond a limit",
+    "is not where it would be",
+)
+"""Deviations that no program can detect before they show in the replies it receives."""
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
 _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
@@ -45,7 +56,7 @@ _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
 
 @dataclass(frozen=True)
 class Story:
-    """Everything about one run: the servos' record, the bytes, when the program ended, and what its user read."""
+    """Everything about one run: the servos' record, the bytes, when the program ended, its exit code and its output."""
 
     record: NDArray[Any]
     traffic: Traffic
@@ -56,10 +67,12 @@ class Story:
 
 @dataclass(frozen=True)
 class Verdict:
-    """owed: why current had to end, "" where nothing asked for it; late_ms: how long it flowed from then on.
+    """The judgement of one run.
 
-    beyond: way of each joint beyond its limit (joints,) [rad]. named: whether the user reads the cause, None where
-    nothing stopped. misleading: the user reads causes that it was not, and not the one that it was.
+    owed: why the current had to end, "" if there was no reason. late_ms: how long it flowed after that. beyond:
+    overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
+    stopped the run. misleading: the output names only wrong causes. unseen: late_ms counts from the moment at which the
+    fault became observable (`fault_campaign.visible`), later than it began.
     """
 
     owed: str
@@ -68,40 +81,64 @@ class Verdict:
     beyond: NDArray[np.float64]
     named: bool | None
     misleading: bool
+    unseen: bool = False
 
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
-    """What the run of `story`, to which `drawn` was done, owed and kept."""
+    """Judge the run of `story`, into which `drawn` was injected."""
     reasons = _reasons(config, drawn, story, undisturbed)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
     driven = story.record["driven"].any(axis=1)
     time = story.record["time"][:, 0]
-    ends = time[driven]
-    flowed = ends[ends >= since]
-    late_ms = 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
     bound = BOUND_MS
     if set(drawn.kinds) & UNHEARD:
         bound = max(bound, 1e3 * config.safety.watchdog + TRIP_MS)
+    late_ms, unseen = _flowed_ms(time[driven], since), False
+    if late_ms > bound:
+        seen = visible_from(*_shown(config, story, undisturbed))
+        later = [(what, max(when, seen) if what.endswith(TO_BE_SEEN) else when) for what, when in reasons]
+        owed, since = min(later, key=lambda reason: reason[1])
+        late_ms, unseen = _flowed_ms(time[driven], since), late_ms > _flowed_ms(time[driven], since)
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
-    return Verdict(owed, late_ms, late_ms > bound or left_on, beyond, named, misleading)
+    return Verdict(owed, late_ms, late_ms > bound or left_on, beyond, named, misleading, unseen)
+
+
+def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:
+    """For how long current flowed from a moment on; driven: the moments at which it did [s]."""
+    flowed = driven[driven >= since]
+    return 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
+
+
+def _shown(
+    config: Config, story: Story, undisturbed: Story
+) -> tuple[Config, tuple[NDArray[np.float64], NDArray[np.float64]], Heard, Heard]:
+    """What `visible_from` needs: the prior is that of the program."""
+    told, usual = (
+        Heard(config, every.heard, every.sent)
+        for every in (_Told(config, each.traffic, 0.0) for each in (story, undisturbed))
+    )
+    mean, covariance = known_arm(config, np.abs(usual.torque).max(axis=0), None)
+    return config, (np.array([mean.get(name, 0.0) for name in NAMES]), covariance), told, usual
 
 
 def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
-    """Whether a message names the cause among at most three it offers, and whether it offers others only."""
+    """Whether the message names the cause among at most three causes, and whether it names only wrong ones."""
     offered = causes_in(text)
+    if set(drawn.kinds) <= HARMLESS:
+        return False, True  # whatever it says: it should not have stopped
     right = frozenset().union(*(CAUSES[kind] for kind in drawn.kinds))
     if not right:
-        return True, False  # nothing of it had to stop the run: what did is not for words to tell
+        return True, False  # none of the faults had to stop the run, so the message is not judged
     told = offered & right
     return bool(told) and len(told) * 3 >= len(offered), bool(offered) and not told
 
 
 def causes_in(text: str) -> set[str]:
-    """The causes that a message speaks of; what came before the error, and whether torque is off, are no causes."""
+    """The causes that a message names, ignoring lines about the torque state."""
     said = [line for line in text.splitlines() if not re.match(r"Torque is off|TORQUE OFF", line.strip())]
     return {cause for cause, words in WORDS.items() if any(re.search(words, line, re.IGNORECASE) for line in said)}
 
@@ -110,7 +147,7 @@ Reason = tuple[str, float]
 
 
 def _reasons(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> list[Reason]:
-    """Why current had to end, and since when [s]."""
+    """Reasons why the current had to end, each with its time [s]."""
     record = story.record
     time = record["time"][:, 0]
     told = _Told(config, story.traffic, drawn.start)
@@ -142,15 +179,15 @@ def _reasons(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> 
         ]
     for attack in drawn.attacks:
         if attack.kind in (Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP) and attack.start < story.ended:
-            found.append(("somebody asked for it", attack.start))
+            found.append(("a stop was requested", attack.start))
     for fault in drawn.faults:
         if fault.kind == FaultKind.CABLE_PULLED and fault.at < story.ended:
-            found.append(("the cable is out", fault.at))
+            found.append(("the cable was unplugged", fault.at))
     return [reason for reason in found if reason is not None]
 
 
 def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int, gap_ms: int) -> Reason | None:
-    """Since when [s] something was wrong for at least `hold_ms`, pauses of at most `gap_ms` included."""
+    """When [s] a failure began that lasted at least `hold_ms`, including interruptions of up to `gap_ms`."""
     at = np.flatnonzero(wrong)
     if not at.size:
         return None
@@ -161,12 +198,12 @@ def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int
 
 
 class _Told:
-    """What the program was told and what it told the servos, read off the bytes, from the first fault on."""
+    """What the program received and what it sent, decoded from the bytes from the first fault on."""
 
     def __init__(self, config: Config, traffic: Traffic, start: float) -> None:
         self._joints = config.joints
-        self._sent: list[list[tuple[float, int]]] = [[] for _ in config.joints]
-        self._heard: list[list[tuple[float, float, float]]] = [[] for _ in config.joints]
+        self.sent: list[list[tuple[float, int]]] = [[] for _ in config.joints]
+        self.heard: list[list[tuple[float, ...]]] = [[] for _ in config.joints]
         self._begun = np.inf
         self._largest = [1] * len(config.joints)
         index = {joint.id: number for number, joint in enumerate(config.joints)}
@@ -192,7 +229,7 @@ class _Told:
             for servo_id, (_, goal) in goals_in(packet).items():
                 if servo_id in index:
                     self._begun = min(self._begun, time)
-                    self._sent[index[servo_id]].append((time, goal))
+                    self.sent[index[servo_id]].append((time, goal))
                     self._largest[index[servo_id]] = max(self._largest[index[servo_id]], abs(goal))
 
     def _keep_answers(self, time: float, data: bytes, request: Request, index: dict[int, int]) -> None:
@@ -202,18 +239,19 @@ class _Told:
             if servo_id not in index or velocity is None or position is None or error & 0x7F:
                 continue
             joint = self._joints[index[servo_id]]
-            heard = self._heard[index[servo_id]]
+            heard = self.heard[index[servo_id]]
             told = (
                 time,
                 joint.direction * (position - joint.zero_ticks) / _TICKS_PER_RAD,
                 joint.direction * velocity / _TICKS_PER_RAD_S,
+                (field_of(block, request, "current") or 0) * joint.joint.drive_unit(12.0),
             )
             if not heard or heard[-1][1:] != told[1:] or time - heard[-1][0] > 5e-4:
                 heard.append(told)
 
     def lies(self, joint: int, time: NDArray[Any], own: NDArray[Any], what: str, interval: float) -> NDArray[np.bool_]:
         wrong = np.zeros(time.size, bool)
-        heard = np.array(self._heard[joint]).reshape(-1, 3)
+        heard = np.array(self.heard[joint]).reshape(-1, 4)
         if not heard.size:
             return wrong
         at = np.clip(np.searchsorted(time, heard[:, 0]), 0, time.size - 1)
@@ -228,7 +266,7 @@ class _Told:
         return wrong
 
     def silent(self, joint: int, time: NDArray[Any], interval: float, ended: float) -> NDArray[np.bool_]:
-        heard = np.array([each[0] for each in self._heard[joint]])
+        heard = np.array([each[0] for each in self.heard[joint]])
         if not heard.size or not np.isfinite(self._begun):
             return np.zeros(time.size, bool)
         latest = heard[np.clip(np.searchsorted(heard, time, "right") - 1, 0, None)]
@@ -236,13 +274,13 @@ class _Told:
         return running & (time - latest > interval + 2e-3)
 
     def disobeys(self, joint: int, time: NDArray[Any], own: NDArray[Any], interval: float) -> NDArray[np.bool_]:
-        if not self._sent[joint]:
+        if not self.sent[joint]:
             return np.zeros(time.size, bool)
-        when = np.array([each[0] for each in self._sent[joint]])
-        goals = np.array([each[1] for each in self._sent[joint]])
+        when = np.array([each[0] for each in self.sent[joint]])
+        goals = np.array([each[1] for each in self.sent[joint]])
         done = np.where(own["torque"], own["goal"], 0)
         tolerance = OBEYED * self._largest[joint] + 1
-        # On its way, a goal may be this or the one before.
+        # While a goal is in transit, the servo may still hold the previous one.
         latest = np.searchsorted(when, time, "right") - 1
         off = np.full(time.size, np.inf)
         for back in (0, 1):
@@ -270,7 +308,8 @@ def _astray(drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[An
 
 
 def describe(verdict: Verdict) -> str:
-    """One line."""
+    """The verdict on one line."""
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
+    said += ["seen only later"] * verdict.unseen
     said += ["UNSAFE"] * verdict.unsafe + ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
     return ", ".join(said)

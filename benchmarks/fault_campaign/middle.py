@@ -1,13 +1,10 @@
-"""The man in the middle: a serial port between the program and the fake bus that does to the bytes what attacks say.
+"""The man in the middle: a serial port between program and fake bus that modifies bytes as the attacks demand.
 
-Outside an attack's time bytes pass as they are, at no cost. Within it every reply is taken apart, changed, and handed
-on when it is due; what the host reads and writes is kept with its time either way.
+Outside an attack's time bytes pass unchanged, at no cost. During an attack every reply is parsed, modified, and passed
+on when it is due. In either case, everything the host reads and writes is stored with its time.
 """
 
-import contextlib
 import math
-import os
-import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -16,43 +13,42 @@ from typing import Any
 
 from benchmarks.fault_campaign.attack import (
     AT_ONCE,
+    FORGED,
     ON_INSTRUCTIONS,
+    ON_MOTORS,
     ON_REPLIES,
     Attack,
     Kind,
     Request,
-    blocks_in,
-    field_of,
-    forged,
     packets_of,
     request_in,
-    with_field,
 )
-from hil.drivers.packet import HEADER
+from benchmarks.fault_campaign.forger import Forger
+from benchmarks.fault_campaign.touch import Killed, happen, prepare
+from hil.drivers.packet import HEADER, encode_status
 from hil.fakes.protocol_fake import FakeSerial
 
-FORGED = {Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY}
 LOOK_BACK_S = 0.5
-"""How long before a replay replies are kept for it."""
+"""Time before a replay attack from which replies are stored for it [s]."""
 
 
 @dataclass
 class Traffic:
-    """What went over the port: (time [s], bytes) of every write and every read."""
+    """Bytes that passed the port: (time [s], bytes) of every write and every read."""
 
     written: list[tuple[float, bytes]] = field(default_factory=list)
     read: list[tuple[float, bytes]] = field(default_factory=list)
 
 
 class Middle(FakeSerial):
-    """A port onto a fake arm with somebody in between."""
+    """A port of a fake arm with a man in the middle."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.traffic = Traffic()
         self.over = False
-        """The program is done: nothing is done to it any more."""
+        """The program has ended, so no further attacks are made."""
         self.dead = False
-        """The program was killed, though its clean-up still runs in this process."""
+        """The program was killed, although its clean-up still runs in this process."""
         self._attacks: Sequence[Attack] = ()
         self._random = Random(0)
         self._wakes = math.inf
@@ -62,18 +58,27 @@ class Middle(FakeSerial):
         self._raw = bytearray()
         self._request: Request | None = None
         self._forger = Forger()
+        self._undo: list[Callable[[], None]] = []
         super().__init__(*args, **kwargs)
 
     def attack(self, attacks: Sequence[Attack], seed: int) -> None:
-        """Do these, with chance drawn from `seed`."""
+        """Schedule these attacks; chance is drawn from `seed`."""
         self._attacks = attacks
         self._random = Random(seed)
         self._to_come = sorted((each for each in attacks if each.kind in AT_ONCE), key=lambda each: each.start)
-        on_bytes = [each for each in attacks if each.kind not in AT_ONCE]
+        on_bytes = [each for each in attacks if each.kind not in AT_ONCE | ON_MOTORS]
+        for each in attacks:
+            prepare(each, self)
         self._wakes = min(
             (each.start - LOOK_BACK_S * (each.kind == Kind.REPLAY) for each in on_bytes), default=math.inf
         )
         self._sleeps = max((each.end for each in on_bytes), default=-math.inf)
+
+    def let_be(self) -> None:
+        """The program is done: nothing is done to it any more, and the servos are as they were but for what it did."""
+        self.over = True
+        while self._undo:
+            self._undo.pop()()
 
     # What the program calls
 
@@ -147,7 +152,7 @@ class Middle(FakeSerial):
         return taken
 
     def _take(self, byte: bytes) -> None:
-        """A byte from the servos: hand on the packet that it completes, changed."""
+        """Take a byte from the servos; pass on the packet that it completes, with its changes."""
         raw = self._raw
         raw += byte
         if len(raw) >= 7 and raw.startswith(HEADER):
@@ -164,11 +169,11 @@ class Middle(FakeSerial):
             self._queue.append((due, data))
 
     def _changed(self, packet: bytes, now: float) -> Iterator[tuple[float, bytes]]:
-        """What becomes of a reply: seconds that it is held, and bytes."""
+        """The (delay [s], bytes) pairs that a reply turns into."""
         servo_id = packet[4] if len(packet) > 4 else None
         packet = self._forger.keep_and_forge(packet, self._request, now, self._forging(now))
         wait, copies, gap = 0.0, 1, None
-        for each in self._lasting(now, ON_REPLIES - FORGED):
+        for each in self._lasting(now, ON_REPLIES):
             if servo_id not in (None, 0xFE) and not each.concerns(servo_id):
                 continue
             if not self._strikes(each, now):
@@ -180,13 +185,10 @@ class Middle(FakeSerial):
                     gap = each.amount
                 case Kind.DROP:
                     copies = 0
-                case Kind.CUT:
-                    at = self._random.randrange(len(packet))
-                    packet = packet[:at] + packet[at + self._random.randrange(1, 5) :]
                 case Kind.REPEAT:
                     copies *= 2
-                case Kind.FLIP:
-                    packet = self._flipped(packet, max(1, round(each.amount)))
+                case _:
+                    packet = self._spoilt(each, packet)
         for _ in range(copies):
             if gap is None:
                 yield wait, packet
@@ -198,11 +200,25 @@ class Middle(FakeSerial):
     def _forging(self, now: float) -> list[Attack]:
         return [each for each in self._lasting(now, FORGED) if self._strikes(each, now)]
 
+    def _spoilt(self, attack: Attack, packet: bytes) -> bytes:
+        """Bytes that no checksum passes any more."""
+        if attack.kind == Kind.CUT:
+            at = self._random.randrange(len(packet))
+            return packet[:at] + packet[at + self._random.randrange(1, 5) :]
+        if attack.kind == Kind.COLLISION:
+            return self._collided(packet)
+        return self._flipped(packet, max(1, round(attack.amount)))
+
     def _flipped(self, data: bytes, bits: int) -> bytes:
         changed = bytearray(data)
         for _ in range(bits if changed else 0):
             changed[self._random.randrange(len(changed))] ^= 1 << self._random.randrange(8)
         return bytes(changed)
+
+    def _collided(self, data: bytes) -> bytes:
+        """What is left where another servo answers at the same time: a line that either of them pulls down is down."""
+        other = encode_status(data[4], 0, self._random.randbytes(max(0, len(data) - 11))) if len(data) > 4 else b""
+        return bytes(own & its for own, its in zip(data, other.ljust(len(data), b"\xff"), strict=False))
 
     # Instructions
 
@@ -224,7 +240,7 @@ class Middle(FakeSerial):
         while self._to_come and self._to_come[0].start <= now:
             each = self._to_come.pop(0)
             if not self.over:
-                _do(each, self)
+                self._undo += happen(each, self)
 
     def _lasting(self, now: float, kinds: frozenset[Kind] | set[Kind]) -> Iterator[Attack]:
         if self.over:
@@ -237,87 +253,4 @@ class Middle(FakeSerial):
         return attack.chance >= 1.0 or self._random.random() < attack.chance
 
 
-def _do(attack: Attack, port: Middle) -> None:
-    if attack.kind in (Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP):
-        os.kill(os.getpid(), signal.Signals[attack.kind])
-        return
-    if attack.kind == Kind.KILLED:
-        port.dead = True
-        raise Killed
-    if attack.kind == Kind.STALL:
-        port.clock.wait_until(port.clock.now() + attack.amount)
-        return
-    for servo_id, servo in port.bus.servos.items():
-        if not attack.concerns(servo_id):
-            continue
-        if attack.kind == Kind.TORQUE_TAKEN:
-            servo.write(64, b"\x00")
-        elif attack.kind == Kind.WATCHDOG_TRIPPED and servo.torque_enabled:
-            servo.trip_watchdog()
-        elif attack.kind == Kind.STRANGE_GOAL:
-            with contextlib.suppress(KeyError):
-                goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
-                servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
-
-
-class Forger:
-    """Changes values inside whole answers and seals them again, so that nothing but their content tells."""
-
-    def __init__(self) -> None:
-        self._latest: dict[int, tuple[int, bytes]] = {}
-        self._history: deque[tuple[float, int, bytes]] = deque(maxlen=4000)
-        self._frozen: dict[tuple[int, int, str], int] = {}
-
-    def keep_and_forge(self, packet: bytes, request: Request | None, now: float, attacks: Sequence[Attack]) -> bytes:
-        if request is None:
-            return packet
-        answers = blocks_in(packet, request)
-        if not answers:
-            return packet
-        for servo_id, (_, block) in answers.items():
-            self._history.append((now, servo_id, block))
-        changed = dict(answers)
-        for number, each in enumerate(attacks):
-            for servo_id, (error, block) in changed.items():
-                if each.concerns(servo_id):
-                    changed[servo_id] = error, self._block(each, number, servo_id, block, request, now)
-        self._latest.update(answers)
-        if changed == answers or (request.fast and set(answers) != set(request.ids)):
-            return packet
-        return forged(changed, request)
-
-    def _block(self, attack: Attack, number: int, servo_id: int, block: bytes, request: Request, now: float) -> bytes:
-        if attack.kind == Kind.SWAP:
-            others = [kept for other, (_, kept) in self._latest.items() if other != servo_id]
-            return others[0] if others and len(others[0]) == len(block) else block
-        names = ("current", "velocity", "position") if attack.field == "state" else (attack.field,)
-        for name in names:
-            value = field_of(block, request, name)
-            if value is None:
-                continue
-            key = (number, servo_id, name)
-            if attack.kind == Kind.REPLAY:
-                value = self._earlier(servo_id, len(block), name, request, now - attack.amount, value)
-            elif attack.kind == Kind.FREEZE:
-                value = self._frozen.setdefault(key, value)
-            elif name == "position":
-                origin = self._frozen.setdefault(key, value)
-                value = origin + round(attack.amount * (value - origin))
-            else:
-                value = round(attack.amount * value)
-            block = with_field(block, request, name, value)
-        return block
-
-    def _earlier(self, servo_id: int, length: int, name: str, request: Request, then: float, value: int) -> int:
-        for when, other, block in self._history:
-            if other == servo_id and when >= then and len(block) == length:
-                earlier = field_of(block, request, name)
-                return value if earlier is None else earlier
-        return value
-
-
 Opened = Callable[[Middle], None]
-
-
-class Killed(BaseException):
-    """The program is gone: whatever it still tries on this port, nothing leaves it any more."""

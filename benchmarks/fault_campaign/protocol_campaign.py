@@ -1,6 +1,6 @@
 """The pyserial URL `campaign://`: the arm under test behind a man in the middle. pyserial finds this module by name.
 
-To the program it is a port as any other: nothing in its name says that the arm is a fake.
+To the program it is an ordinary port: nothing in its name reveals that the arm is a fake.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ from hil.fakes.description import FakeArm
 
 
 class Bench:
-    """The one arm on the bench: what it is, since when, and whom to tell when its port is opened for the first time."""
+    """The one arm under test, its port, and a callback for the first opening of the port."""
 
     arm: FakeArm | None = None
     port: Middle | None = None
@@ -19,12 +19,12 @@ class Bench:
 
     @classmethod
     def lay(cls, arm: FakeArm, opened: Opened) -> None:
-        """Put another arm there, switched on at its first opening."""
+        """Set another arm, which is switched on when its port is first opened."""
         cls.arm, cls.port, cls.opened = arm, None, staticmethod(opened)
 
 
 class BenchPort(Middle):
-    """A port onto the arm on the bench. Ports opened later find the arm as it was left."""
+    """A port of the arm under test; ports opened later find the arm in its current state."""
 
     def __init__(self, port: str | None = None, *args: Any, **kwargs: Any) -> None:
         kwargs["description"] = Bench.arm
@@ -43,5 +43,5 @@ class BenchPort(Middle):
 
 
 def serial_class_for_url(url: str) -> tuple[str, type[BenchPort]]:
-    """What pyserial asks of a module that handles a URL: the port's name and its class."""
+    """Entry point for pyserial: the port's name and class for a URL."""
     return url, BenchPort

@@ -1,4 +1,4 @@
-"""The emulated servos' own record: every millisecond of what each was told, what its motor carried and how it moved."""
+"""The emulated servos' own record: goals, motor currents and motion, every millisecond."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,11 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.fault_campaign.attack import Attack, Kind
 from hil.fakes.bus.bus import FakeBus
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
+PUSH_RISES_S = 0.03
+"""In which somebody's push comes to its strength: no hand is faster."""
 
 RECORD = np.dtype(
     [
@@ -26,13 +29,16 @@ RECORD = np.dtype(
 
 
 class Witness:
-    """Stands where the plant stands, sees every step of it, and changes nothing."""
+    """Stands where the plant stands and sees every step of it. It changes nothing but what `disturb` asks for."""
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant
-        self._servos: tuple[Servo, ...] = bus._servos
+        self._servos: tuple[EmulatedServo, ...] = bus._servos
         self._next = bus.time + STEP_S
         self._rows: list[list[tuple[Any, ...]]] = []
+        self._disturbed: list[tuple[int, Attack]] = []
+        self._missing = [0.0] * bus.plant.joints
+        self._largest = [0.0] * bus.plant.joints
         self.joints = bus.plant.joints
         bus.plant = self
 
@@ -46,7 +52,34 @@ class Witness:
 
     @property
     def current(self) -> Sequence[float]:
-        return self._plant.current
+        """As the servos' sensors have it: a weak motor carries its current, a push is none."""
+        if not self._disturbed:
+            return self._plant.current
+        return tuple(current + missing for current, missing in zip(self._plant.current, self._missing, strict=True))
+
+    def disturb(self, joint: int, attack: Attack) -> None:
+        """Let this befall the joint's motor from its start to its end."""
+        self._disturbed.append((joint, attack))
+
+    def _driven_by(self, current: Sequence[float], now: float) -> Sequence[float]:
+        """The currents that have the effect of these on the disturbed arm."""
+        felt = list(current)
+        self._missing = [0.0] * self.joints
+        for joint, each in self._disturbed:
+            self._largest[joint] = max(self._largest[joint], abs(current[joint]))
+            if not each.start <= now < each.end:
+                continue
+            before, most = felt[joint], each.amount * self._largest[joint]
+            match each.kind:
+                case Kind.WEAK:
+                    felt[joint] = each.amount * before
+                    self._missing[joint] += before - felt[joint]
+                case Kind.SATURATED:
+                    felt[joint] = max(-most, min(most, before))
+                case Kind.PUSHED:
+                    felt[joint] = before + most * min(1.0, (now - each.start) / PUSH_RISES_S)
+                    self._missing[joint] += before - felt[joint]
+        return felt
 
     def jam(self, joint: int, jammed: bool) -> None:
         self._plant.jam(joint, jammed)  # type: ignore[attr-defined]
@@ -54,7 +87,7 @@ class Witness:
     def advance(self, until: float, current: Sequence[float]) -> None:
         plant = self._plant
         while self._next <= until:
-            plant.advance(self._next, current)
+            plant.advance(self._next, self._driven_by(current, self._next) if self._disturbed else current)
             self._rows.append(
                 [
                     (self._next, *_told(servo), *state)
@@ -62,15 +95,15 @@ class Witness:
                 ]
             )
             self._next += STEP_S
-        plant.advance(until, current)
+        plant.advance(until, self._driven_by(current, until) if self._disturbed else current)
 
     def record(self) -> NDArray[Any]:
-        """The record so far, (milliseconds, joints) of `RECORD`."""
+        """The record so far (milliseconds, joints), with dtype `RECORD`."""
         return np.array(self._rows, dtype=RECORD).reshape(-1, self.joints)
 
 
-def _told(servo: Servo) -> tuple[bool, bool, int]:
-    """Whether the servo drives its motor, whether torque is on, and the goal of its mode [ticks]."""
+def _told(servo: EmulatedServo) -> tuple[bool, bool, int]:
+    """Whether the servo drives its motor, whether torque is on, and the goal in its mode [ticks]."""
     memory = servo.memory
     torque = memory.get("Torque Enable") == 1
     mode = memory.get("Operating Mode")
@@ -79,5 +112,5 @@ def _told(servo: Servo) -> tuple[bool, bool, int]:
     elif mode == PWM_MODE:
         goal = memory.get("Goal PWM")
     else:
-        goal = int(torque)  # position and velocity control drive as soon as torque is on
+        goal = int(torque)  # position and velocity control drive the motor whenever torque is on
     return torque and goal != 0, torque, goal

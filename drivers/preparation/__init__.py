@@ -1,1 +1,1 @@
-"""Servos made ready for an experiment: held arms, settings kept and put back, what each servo must be like."""
+"""Preparing servos for an experiment: held arms, saving and restoring settings, and checks of each servo."""

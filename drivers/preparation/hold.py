@@ -1,4 +1,4 @@
-"""Torque found already on: recognised and refused, or taken over so that the arm sinks slowly."""
+"""Torque that is found to be on already: detect it, and either refuse it or take over so that the arm sinks slowly."""
 
 from collections.abc import Mapping
 
@@ -13,16 +13,16 @@ FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""
 
 SINKING_S = 4.0
-"""How long a joint may go on sinking, braked by its own motor, before torque is cut [s]."""
+"""Longest time a joint may go on sinking, braked by its own motor, before torque is cut [s]."""
 
 _STEPS = 20
-_STILL_TICKS = 2  # of Present Velocity
+_STILL_TICKS = 2  # Present Velocity below which a joint counts as still
 
 
 def is_held(servo: Servo) -> bool:
-    """Whether it has torque on that holds or drives it; raises as `Servo.read`.
+    """Return whether the servo has torque on that holds or drives its joint; raises as `Servo.read`.
 
-    A tripped Bus Watchdog has zeroed its goal: in current and PWM mode its joint is free.
+    A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely.
     """
     if not servo.read("Torque Enable"):
         return False
@@ -31,21 +31,20 @@ def is_held(servo: Servo) -> bool:
 
 
 def refuse_held(servos: Mapping[Joint, Servo]) -> None:
-    """Raise TorqueHeld where a joint is held; raises as `Servo.read`."""
+    """Raise TorqueHeld if any joint is held; otherwise raises as `Servo.read`."""
     held = [joint for joint, servo in servos.items() if is_held(servo)]
     if held:
         raise TorqueHeld(
             f"{' and '.join(joint.title for joint in held)}: torque is on, so another program drives or holds the arm, "
-            "or "
-            "left it on. Switching it off would let the arm fall, so nothing was written. Stop that program; or hold "
-            "the arm by hand and take it over with --take-over (BusConfig.take_over), which lets it sink slowly."
+            "or left it on. Switching it off would let the arm fall, so nothing was written. Stop that program; or "
+            "hold the arm by hand and take it over with --take-over (BusConfig.take_over), which lets it sink slowly."
         )
 
 
 def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
-    """Take away what held servos give, step by step, wait until they no longer sink, and cut their torque.
+    """Reduce the output of held servos to zero step by step, wait until the joints no longer sink, then cut torque.
 
-    With its PWM at nothing and its torque on a motor is shorted and brakes. Raises as `Servo.write`.
+    With zero PWM and torque on, the motor's terminals are shorted and it brakes. Raises as `Servo.write`.
     """
     held = {joint: servo for joint, servo in servos.items() if is_held(servo)}
     goals = {joint: _what_drives(servo) for joint, servo in held.items()}
@@ -64,5 +63,5 @@ def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
 
 
 def _what_drives(servo: Servo) -> str:
-    """The goal that limits the motor's output in the servo's present mode."""
+    """Return the name of the goal that limits the motor's output in the servo's present mode."""
     return "Goal Current" if servo.read("Operating Mode") == Mode.CURRENT else "Goal PWM"

@@ -1,4 +1,4 @@
-"""Preparation for the control cycle: adapter delay, quiet bus, each servo in its mode without torque."""
+"""Preparation for the control cycle: measure adapter delay, check that the bus is quiet, set servo modes."""
 
 from contextlib import suppress
 
@@ -11,10 +11,10 @@ from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import Mode
 
 LISTEN_S = 0.05
-"""How long the bus must be quiet before this program speaks on it for good [s]."""
+"""How long the bus must be quiet before this program starts to use it [s]."""
 
 SLOWEST_S = 0.1
-"""The slowest adapter that is waited for [s]."""
+"""Delay of the slowest adapter that is supported [s]."""
 
 _TRIPS = 5
 _PING_BYTES = 24  # on the wire: the ping and its status
@@ -24,28 +24,28 @@ _MOST_HEARD_BYTES = 4096
 _SLOWER_THAN_KNOWN_S = 1.5e-3
 
 TIME_BASED_PROFILE = 0x04
-"""Bit of Drive Mode that changes profiles only, which current and PWM mode do not have."""
+"""Bit of Drive Mode that only affects motion profiles, which current and PWM mode do not use."""
 
 
 def learn_latency(servo: Servo) -> None:
-    """Wait longer for every later reply if this servo's replies are slow, as over Bluetooth or a network.
+    """Increase the port's reply timeout if this servo's replies are slow, as over Bluetooth or a network.
 
     The port's `latency` is raised to the measured value if that exceeds what this kind of adapter should need.
     """
     port, usual = servo.port, servo.port.latency
     trips = _trips(servo)
-    if not trips and port.read(_STATUS_BYTES, SLOWEST_S):  # nothing, but then something
+    if not trips and port.read(_STATUS_BYTES, SLOWEST_S):  # no reply in time, but a late one
         port.discard_input()
         port.latency = SLOWEST_S
         trips = _trips(servo)
     taken = min(trips, default=0.0) - port.wire_time(_PING_BYTES)
-    # Where nobody answers, whoever asks next says what is wrong.
+    # If nobody replies, the next request raises an error that says so.
     port.latency_measured = taken >= usual + _SLOWER_THAN_KNOWN_S
     port.latency = _MARGIN * taken if port.latency_measured else usual
 
 
 def _trips(servo: Servo) -> list[float]:
-    """How long some pings took [s], up to the first that had no answer."""
+    """Return the durations of a few pings [s], up to the first without a reply."""
     clock, trips = servo.port.clock, []
     with suppress(NoReply, WrongReply):
         for _ in range(_TRIPS):
@@ -59,13 +59,13 @@ def check_quiet(port: Port) -> None:
     """Raise BusShared if another master's instructions are received."""
     port.discard_input()
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
-    asked = sorted({packet.id for packet in heard if not packet.is_status})
-    if asked:
-        raise shared(f"asks ID {', '.join(map(str, asked))}")
+    targets = sorted({packet.id for packet in heard if not packet.is_status})
+    if targets:
+        raise shared(f"asks ID {', '.join(map(str, targets))}")
 
 
 def shared(what: str) -> BusShared:
-    """The error for a bus with another active master."""
+    """Return the error for a bus with another active master; `what` describes what that master does."""
     return BusShared(
         f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
         "other's packets, and the other's goals would move the arm too: end that program, or unplug that controller."
@@ -73,9 +73,9 @@ def shared(what: str) -> BusShared:
 
 
 def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
-    """Torque off, no fault, settings with which an experiment may start, and the joint's mode.
+    """Prepare a servo: torque off, no fault, settings that permit an experiment, and the joint's operating mode.
 
-    others: the IDs of the arm's other servos. Raises ServoFault, WrongSetting, and what `Servo.write` raises.
+    others: IDs of the arm's other servos. Raises ServoFault, WrongSetting, and whatever `Servo.write` raises.
     """
     servo.write("Torque Enable", 0)
     fault = servo.hardware_error()
@@ -84,7 +84,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     drive_mode = servo.read("Drive Mode")
     if drive_mode & ~TIME_BASED_PROFILE:
         raise WrongSetting(
-            f"{joint.title}: Drive Mode is {drive_mode}, it must be 0 (no reverse, no torque on by goal "
+            f"{joint.title}: Drive Mode is {drive_mode} but must be 0 (no reverse, no torque on by goal "
             "update). Set it with DYNAMIXEL Wizard 2.0; use `direction = -1` for a joint that turns the other way."
         )
     secondary = servo.read("Secondary(Shadow) ID")
@@ -102,13 +102,13 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
         servo.write("Operating Mode", joint.mode)
     if servo.read("Bus Watchdog"):
         servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
-    # Goal PWM limits the output in current mode too; what another program left there may be nothing.
+    # Goal PWM also limits the output in current mode, and another program may have left it at zero.
     if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
         servo.write("Goal PWM", servo.read("PWM Limit"))
 
 
 def fault_text(joint: Joint, cause: str) -> str:
-    """The message for a servo that raised its alert."""
+    """Return the message for a servo that has raised its alert."""
     return (
         f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
         "find the cause, then power-cycle it."

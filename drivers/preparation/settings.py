@@ -1,9 +1,9 @@
-"""What a servo is set to: the registers that an experiment changes, and those that the servo itself changes with them.
+"""Servo settings: the registers that an experiment changes, and those that the servo itself changes as a consequence.
 
-Operating Mode and Current Limit are EEPROM: values written there survive a power cycle, and the next
-program's plain Torque Enable drives the full current of the wrong mode. A change of Operating Mode resets goals and
-gains (ROBOTIS e-Manual, Operating Mode). Goal Position is left out: a servo takes its present position for it when
-torque comes on, and an old value must never move an arm.
+Operating Mode and Current Limit are in EEPROM: they survive a power cycle, so that another program that only sets
+Torque Enable would drive the motor in the wrong mode at full current. A change of Operating Mode resets goals and gains
+(ROBOTIS e-Manual, Operating Mode). Goal Position is left out: a servo sets it to its present position when torque is
+switched on, and an old value must never move an arm.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from hil.drivers.errors import DriverError, WrongSetting
 from hil.drivers.servo import Servo
 
 EEPROM = ("Current Limit", "Operating Mode")
-"""Each may be written twice in an experiment, set and put back; in this order, since the limit bounds the goal."""
+"""EEPROM registers that an experiment sets and restores, in this order, since the limit bounds the goal."""
 
 RAM = (
     "Velocity I Gain",
@@ -32,25 +32,26 @@ RAM = (
 )
 
 STARTUP_CONFIGURATION = Register("Startup Configuration", 60, 1)
-"""Not in the SDK's tables. Bit 0: torque on by itself after power-up or reboot; bit 1: RAM area restored then."""
+"""Not in the SDK's tables. Bit 0: torque on after power-up or reboot; bit 1: RAM registers restored then."""
 
 TORQUE_ON_AT_STARTUP = 0x01
 WATCHDOG_TRIPPED = 0xFF
 
 
 def read_settings(servo: Servo) -> dict[str, int]:
-    """The registers that an experiment may change, by name [ticks]; raises as `Servo.read`."""
+    """Return the registers that an experiment may change, by name [ticks]; raises as `Servo.read`."""
     settings = {name: servo.read(name) for name in (*EEPROM, *RAM) if name in servo.table}
     watchdog = servo.read("Bus Watchdog")
-    # A tripped one cannot be written; who clears it leaves it off.
+    # A tripped watchdog can only be cleared, which switches it off.
     settings["Bus Watchdog"] = 0 if watchdog == WATCHDOG_TRIPPED else watchdog
     return settings
 
 
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
-    """Write what differs from `settings`, each read back; what was written, from what to what.
+    """Restore the registers that differ from `settings`; return (old, new) for those that were written.
 
-    Raises WrongSetting while torque is on, else as `Servo.write`; everything that can be written is then written.
+    Each is read back. Raises WrongSetting while torque is on, otherwise as `Servo.write`, but only after all other
+    registers were tried.
     """
     if servo.read("Torque Enable"):
         raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
@@ -74,7 +75,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
 
 
 def arms_itself(servo: Servo) -> bool:
-    """Whether torque comes on by itself when this servo is switched on or rebooted; raises as `Servo.read`."""
+    """Return whether torque comes on by itself when this servo is powered up or rebooted; raises as `Servo.read`."""
     with suppress(DriverError):
         return bool(servo.read_entry(STARTUP_CONFIGURATION) & TORQUE_ON_AT_STARTUP)
     return False  # older firmware has no such register

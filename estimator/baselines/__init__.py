@@ -1,1 +1,1 @@
-"""Other published methods on the same data."""
+"""Other published identification methods, for comparison on the same data."""

@@ -1,9 +1,9 @@
 """Other methods on the same settled period, each tuned and timed, for comparison.
 
-All get the same positions and the same commands. Their torque is the command as it reaches the motors, with the
-delay found by this project's first stage, so that none has to guess it. Each method's settings (cut-off, width of
-the Coulomb step, process noise) are searched, and the one whose simulation is closest to the
-recording is kept; only its run time counts.
+All methods receive the same positions and commands. Their torque is the command delayed by the delay found in this
+project's first stage, so that none has to estimate it. The settings of each method (cut-off, width of the smoothed
+Coulomb step, process noise) are searched, and those whose simulation is closest to the recording are kept; only the run
+time with these settings counts.
 """
 
 import time
@@ -28,7 +28,7 @@ CUTOFFS = (6.0, 10.0, 15.0, 25.0, 40.0)  # Hz
 WIDTHS = (0.007, 0.02, 0.05, 0.15)  # rad/s
 VELOCITY_NOISES = (1e-4, 1e-3, 1e-2, 1e-1)  # rad/s per sqrt(s)
 SHORT = 0.5  # s of simulation by which settings are compared
-PERIODS = 3  # of the settled period joined end to end for the filters, which need time to settle
+PERIODS = 3  # repetitions of the settled period joined end to end for the filters, which need time to converge
 
 Fit = InverseDynamics | Filtered
 Setting = tuple[float, float]
@@ -40,19 +40,19 @@ class Peer:
 
     name: str
     parameters: dict[str, float]
-    """Base parameters, and what its simulation needs beside them, by name [SI]."""
+    """Base parameters, and what else its simulation needs, by name [SI]."""
     std: dict[str, float]
-    """Standard errors as reported by the method."""
+    """Standard errors as reported by the method, by name [SI]."""
     seconds: float
-    """Of the kept setting."""
+    """Run time with the chosen settings [s]."""
     settings: str
-    """The chosen settings, in words."""
+    """The chosen settings, as text."""
     tried: int
-    """Settings tried."""
+    """Number of settings tried."""
 
 
 def joined(period: SettledPeriod, periods: int) -> Recording:
-    """The settled period repeated `periods` times, as a recording of held commands."""
+    """Return the settled period repeated `periods` times, as a recording of held commands."""
     count = period.samples * periods
     return Recording(
         np.arange(count) / period.rate,
@@ -65,10 +65,10 @@ def joined(period: SettledPeriod, periods: int) -> Recording:
 
 
 def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -> Iterator[Peer]:
-    """IDIM-LS, RLS, EKF, UKF and the paper's linearised lines on one settled period, as each is done.
+    """Yield the results of IDIM-LS, RLS, EKF, UKF and the paper's linearised method on one settled period.
 
-    `length` [m] of link 1 and `gravity` [m/s^2] are for the paper's method, which needs them to tell inertias
-    apart; with None it is skipped on an arm of two joints.
+    length: length of link 1 [m]; gravity: acceleration of gravity [m/s^2]. The paper's method needs both to separate
+    the inertias; if `length` is None, it is skipped on an arm of two joints.
     """
     recording = joined(period, 1)
     delay = fit_lines(period).delay
@@ -113,7 +113,7 @@ def _best(
     delay: float,
 ) -> Peer:
     found: list[tuple[float, Peer]] = []
-    for setting in (settings[0], *settings):  # the first once more: compiled before the clock runs
+    for setting in (settings[0], *settings):  # the first one twice, so that compilation is not timed
         began = time.perf_counter()
         try:
             result = fit(setting)

@@ -1,11 +1,10 @@
-"""Filtered inverse-dynamics least squares (IDIM-LS), the standard method of the field, used for the initial guess and
-for comparison.
+"""Filtered inverse-dynamics least squares (IDIM-LS), the field's standard method, for initial guesses and comparison.
 
-Position is low-pass filtered forwards and backwards, differentiated by central differences, the regressor
-evaluated, regressor and torque filtered identically and decimated, and one weighted linear least squares solved:
-Gautier and Poignet, "Extended Kalman filtering and weighted least squares dynamic identification of robot",
-Control Engineering Practice 9 (2001) 1361; Swevers, Verdonck, De Schutter, "Dynamic model identification
-for industrial robots", IEEE Control Systems 27 (2007) 58.
+Position is low-pass filtered forwards and backwards and differentiated by central differences, and the regressor is
+evaluated. Regressor and torque are filtered identically and decimated, and one weighted linear least-squares problem is
+solved: Gautier and Poignet, "Extended Kalman filtering and weighted least squares dynamic identification of robot",
+Control Engineering Practice 9 (2001) 1361; Swevers, Verdonck, De Schutter, "Dynamic model identification for industrial
+robots", IEEE Control Systems 27 (2007) 58.
 """
 
 from collections.abc import Sequence
@@ -20,20 +19,20 @@ from hil.estimator.errors import RecordingError, UnidentifiableError
 from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
 
-ORDER = 4  # of the Butterworth filter, doubled by running it both ways
-TRIM = 1.5  # cycles of the cut-off left out at either end, where the filter sees nothing beyond
-PER_CYCLE = 5.0  # samples kept per cycle of the cut-off
+ORDER = 4  # of the Butterworth filter, doubled by filtering in both directions
+TRIM = 1.5  # cycles of the cut-off frequency discarded at either end because of filter transients
+PER_CYCLE = 5.0  # samples kept per cycle of the cut-off frequency
 WORST_CONDITION = 1e8
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Filtered regressors and torques, at about the rate at which they hold new information."""
+    """Filtered regressors and torques, decimated to about the rate at which they contain new information."""
 
     regressor: Array
-    """(joints, samples, parameters)."""
+    """Regressors (joints, samples, parameters)."""
     torque: Array
-    """(joints, samples) [N m]."""
+    """Torques (joints, samples) [N m]."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +40,19 @@ class InverseDynamics:
     """Result of the regression."""
 
     names: tuple[str, ...]
-    """Base parameters."""
+    """Names of the base parameters."""
     value: Array
-    """(parameters,) [SI]."""
+    """Values (parameters,) [SI]."""
     std: Array
-    """Standard errors if the residual were white (parameters,)."""
+    """Standard errors assuming a white residual (parameters,)."""
     relative_residual: Array
-    """RMS of the torque residual over that of the torque (joints,)."""
+    """RMS of the torque residual relative to that of the torque (joints,)."""
 
 
 def uniform(recording: Recording, delay: float = 0.0) -> tuple[Array, Array, float]:
-    """Positions and torques (joints, samples) at equal intervals, and the interval [s].
+    """Return positions and torques (joints, samples) at equal intervals, and the interval [s].
 
-    A torque is the mean over the interval around its position, so that a held command lags by nothing.
+    Each torque is the mean over the interval centred on its position sample, so that holding the command adds no lag.
     """
     dt = recording.interval
     count = int((recording.time[-1] - recording.time[0]) / dt)
@@ -71,7 +70,10 @@ def filtered_rows(
     delay: float = 0.0,
     position_cutoff: float | None = None,
 ) -> Rows:
-    """Rows of the regression; arguments as of `fit_inverse_dynamics`. Raises RecordingError when nothing is left."""
+    """Return the rows of the regression; arguments as in `fit_inverse_dynamics`.
+
+    Raises RecordingError if the recording is too short or too slow for the filter.
+    """
     position, torque, dt = uniform(recording, delay)
     trim = int(np.ceil(TRIM / (cutoff * dt)))
     keep = max(1, int(1.0 / (PER_CYCLE * cutoff * dt)))
@@ -97,11 +99,13 @@ def fit_inverse_dynamics(
     delay: float = 0.0,
     position_cutoff: float | None = None,
 ) -> InverseDynamics:
-    """IDIM-LS over all `recordings`, each joint weighted by its torque residual in a first solution.
+    """Fit all `recordings` by IDIM-LS, weighting each joint by its torque residual in the previous solution.
 
-    `cutoff` [Hz] of regressors and torques, `position_cutoff` [Hz] of the positions that the regressors are made of
-    (the same if none is given), `coulomb_width` [rad/s] of the Coulomb step, `delay` [s] of the torque. Raises
-    RecordingError, UnidentifiableError.
+    cutoff: cut-off frequency for regressors and torques [Hz].
+    coulomb_width: width of the smoothed Coulomb step [rad/s].
+    delay: delay of the torque [s].
+    position_cutoff: cut-off frequency for the positions from which regressors are computed [Hz]; by default `cutoff`.
+    Raises RecordingError, UnidentifiableError.
     """
     rows = [filtered_rows(recording, cutoff, coulomb_width, delay, position_cutoff) for recording in recordings]
     Y = np.concatenate([row.regressor for row in rows], axis=1)

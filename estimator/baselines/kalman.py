@@ -1,13 +1,13 @@
 """Extended and unscented Kalman filters whose state includes the parameters: baselines that use positions only.
 
-State: angles, velocities, base parameters. Between samples the arm is integrated by Runge-Kutta steps under the
-mean motor torque; parameters are constant except for a little process noise; each sample corrects the whole state. EKF:
-Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with a Jacobian by differences of the integrated
-step. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric points.
+State: angles, velocities, base parameters. Between samples the arm is integrated by Runge-Kutta steps under the mean
+motor torque; the parameters are constant except for a little process noise; each sample corrects the whole state. EKF:
+Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the Jacobian of the integrated step by finite
+differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
-The filters get every fair advantage: the likelihood's dynamics, a start from filtered
-least squares with honest spread, the recording several times over with what the last pass found, and noise
-levels that a caller may search (`hil.estimator.baselines.compare` does).
+The filters get every fair advantage: the same dynamics as the likelihood, an initial guess from filtered least squares
+with a realistic spread, several passes over the recording, each starting from the last pass's result, and noise levels
+that a caller may search (as `hil.estimator.baselines.compare` does).
 """
 
 from collections.abc import Callable
@@ -25,10 +25,10 @@ from hil.estimator.models.terms import base_names
 
 PASSES = 3
 LONGEST_STEP = 1.3e-3  # s
-SPREAD = 0.1  # of a parameter at its start, as standard deviation; the UKF looks four times as far
-LEAST_SPREAD = 0.02  # of the largest parameter of its kind
+SPREAD = 0.1  # initial standard deviation as a fraction of the parameter; the UKF's sigma points are four times as far
+LEAST_SPREAD = 0.02  # minimum of it, as a fraction of the largest parameter of the same kind
 DIFFERENCE = 1e-6
-# The twelve slots that the compiled arm takes; a pendulum fills five of them.
+# The twelve constants of the compiled arm; a one-joint arm uses five of them.
 SLOTS = CONSTANTS[:12]
 TORQUES = ("gravity", "coulomb", "offset")
 
@@ -37,13 +37,13 @@ Filter = Literal["ekf", "ukf"]
 
 @dataclass(frozen=True)
 class Filtered:
-    """State of the filter after its last sample."""
+    """Result of the filter after the last sample."""
 
     names: tuple[str, ...]
     value: Array
     """Base parameters (parameters,) [SI]."""
     std: Array
-    """By the filter's own covariance (parameters,)."""
+    """Standard errors from the filter's own covariance (parameters,)."""
 
 
 def fit_by_kalman(
@@ -56,9 +56,12 @@ def fit_by_kalman(
 ) -> Filtered:
     """Run the filter over `recording` PASSES times.
 
-    `start`: base parameters (parameters,) [SI]. `coulomb_width` [rad/s] of friction's step. `velocity_noise`
-    [rad/s per sqrt(s)]: the process noise, which accounts for model error. `delay` [s] of the torque. Raises
-    ConvergenceError when the filter diverges.
+    start: initial base parameters (parameters,) [SI].
+    kind: "ekf" or "ukf".
+    coulomb_width: width of the smoothed Coulomb step [rad/s].
+    velocity_noise: process noise that accounts for model errors [rad/s per sqrt(s)].
+    delay: delay of the torque [s].
+    Raises ConvergenceError if the filter diverges.
     """
     joints = recording.joints
     names = base_names(joints)
@@ -90,7 +93,7 @@ def fit_by_kalman(
 
 
 def _scales(names: tuple[str, ...], start: Array) -> Array:
-    """The largest parameter of each kind, as the scale for all of that kind."""
+    """Return for each parameter the largest magnitude among parameters of its kind, as its scale."""
     groups = dict.fromkeys(("coupling", "armature"), "inertia") | dict.fromkeys(TORQUES, "torque")
     kinds = [groups.get(name.split("_")[0], name.split("_")[0]) for name in names]
     largest = {kind: max(abs(v) for v, k in zip(start, kinds, strict=True) if k == kind) for kind in kinds}
@@ -98,7 +101,10 @@ def _scales(names: tuple[str, ...], start: Array) -> Array:
 
 
 def _accelerations(p: Any, width: float, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> Any:
-    """Accelerations under the twelve `p`, kept finite where a filter's parameters leave the physical range."""
+    """Return the accelerations for the twelve constants `p`.
+
+    The determinant is bounded below, so that they stay finite if a filter's parameters leave the physical range.
+    """
     across = p[1] * np.cos(q2)
     turning = p[1] * np.sin(q2)
     weight = p[5] * np.cos(q1 + q2)
@@ -113,7 +119,7 @@ def _accelerations(p: Any, width: float, q1: float, q2: float, v1: float, v2: fl
 
 
 def _advance(x: Any, t1: float, t2: float, dt: float, substeps: int, p: Any, width: float, joints: int) -> None:
-    """Advance the angles and velocities at the head of `x` by `dt`, classical Runge-Kutta."""
+    """Advance the angles and velocities at the head of `x` by `dt` with the classical Runge-Kutta method."""
     q1, v1 = x[0], x[joints]
     q2 = x[1] if joints == 2 else 0.0
     v2 = x[joints + 1] if joints == 2 else 0.0
@@ -146,7 +152,7 @@ def _constants(x: Any, scale: Any, slots: Any, fixed: Any, joints: int, p: Any) 
 
 
 def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
-    """A position sample, one joint after the other: their errors are independent."""
+    """Apply a position sample, one joint after the other, since their errors are independent."""
     n = x.size
     for j in range(measured.size):
         s = P[j, j] + R[j]
@@ -162,7 +168,7 @@ def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
 
 
 def _root(P: Any) -> Any:
-    """Lower triangular root of a covariance that rounding may have made slightly indefinite."""
+    """Return the lower triangular root of a covariance that rounding errors may have made slightly indefinite."""
     n = P.shape[0]
     root = np.zeros((n, n))
     for j in range(n):

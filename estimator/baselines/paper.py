@@ -1,11 +1,11 @@
 """The seed paper's method on its own arm: as printed, and by maximum likelihood on the same Fourier coefficients.
 
 Zhu, Man, Cao, Zheng, Wang, "Parameter Estimation for Robotic Manipulator Systems", Machines 10 (2022) 392. Numbers in
-brackets are its equations; docs/paper.md walks through them and lists the errors in print.
+parentheses are its equations; docs/paper.md explains them and lists the errors in print.
 
-The arm is two point masses at the ends of two links, linearised about hanging. As printed, (16) and (17), it obeys
-q' = A q + B u: first order. The correct form is q'' = A q + B u, which never settles without friction; so the corrected
-arm has viscous friction, (s^2 D + s F + K) q = u. `order` chooses between the two.
+The arm consists of two point masses at the ends of two links, linearised about the hanging pose. As printed, in (16)
+and (17), it obeys the first-order equation q' = A q + B u. The correct form, q'' = A q + B u, never settles without
+friction, so the corrected arm has viscous friction, (s^2 D + s F + K) q = u. `order` chooses between the two.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ Order = Literal[1, 2]
 FUNDAMENTAL = 0.01  # Hz, Table 2
 LINES = (3, 5, 7, 9, 11, 13, 17, 21, 27, 42)
 AMPLITUDES = (0.2, 1.5, 0.3, 0.5, 0.7, 0.8, 1.0, 1.2, 1.4, 2.0)  # N m
-NOISE = 0.1  # rad: "white noise 0.1*rand()", uniform from 0 to this
+NOISE = 0.1  # rad: "white noise 0.1*rand()", uniformly distributed from 0 to this value
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class PaperArm:
     """Friction of each joint [N m s/rad]; the paper has none."""
 
     def mass_matrix(self) -> Array:
-        """D (2, 2) of (3) at q2 = 0, with J1 and J2, which (14) and (15) lose [kg m^2]."""
+        """Return D (2, 2) of (3) at q2 = 0, including J1 and J2, which are missing from (14) and (15) [kg m^2]."""
         alpha = (self.mass_1 + self.mass_2) * self.length_1**2 + self.inertia_1
         beta = self.mass_2 * self.length_1 * self.length_2
         delta = self.mass_2 * self.length_2**2
         return np.array([[alpha + delta + 2.0 * beta, delta + beta], [delta + beta, delta + self.inertia_2]])
 
     def stiffness(self) -> Array:
-        """K (2, 2): gravity, (7) with cos q1 in its first term, linearised about hanging [N m/rad]."""
+        """Return K (2, 2): gravity, (7) with cos q1 in its first term, linearised about the hanging pose [N m/rad]."""
         first = (self.mass_1 + self.mass_2) * self.length_1 * self.gravity
         second = self.mass_2 * self.length_2 * self.gravity
         return np.array([[first + second, second], [second, second]])
@@ -57,7 +57,7 @@ class PaperArm:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Cosines of torque: the harmonics, and the amplitudes per joint."""
+    """Torque as a sum of cosines: the harmonics, and the amplitudes per joint."""
 
     lines: npt.NDArray[np.int64]
     """Harmonics of FUNDAMENTAL (lines,)."""
@@ -66,15 +66,16 @@ class Excitation:
 
     @property
     def frequency(self) -> Array:
-        """Angular (lines,) [rad/s]."""
+        """Angular frequencies (lines,) [rad/s]."""
         return np.asarray(2.0 * np.pi * FUNDAMENTAL * self.lines, dtype=np.float64)
 
 
 def own_lines() -> Excitation:
-    """Table 2 on joint 1, and on joint 2 the same amplitudes one harmonic higher.
+    """Return Table 2 on joint 1, and the same amplitudes one harmonic higher on joint 2.
 
-    As printed, (19), both joints have the same torque on the same lines; then only sums of the two columns of the
-    transfer function are seen and A1 of (33) is singular. One harmonic apart is the smallest change that resolves this.
+    As printed in (19), both joints have the same torque on the same lines, so only sums of the two columns of the
+    transfer function can be observed and A1 of (33) is singular. A shift by one harmonic is the smallest change that
+    resolves this.
     """
     lines, amplitude = np.array(LINES), np.array(AMPLITUDES)
     nothing = np.zeros_like(amplitude)
@@ -83,12 +84,12 @@ def own_lines() -> Excitation:
 
 
 def printed_lines() -> Excitation:
-    """Table 2 on both joints at once, as printed."""
+    """Return Table 2 on both joints at once, as printed."""
     return Excitation(np.array(LINES), np.array([AMPLITUDES, AMPLITUDES]))
 
 
 def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
-    """Complex amplitudes of the joint angles on the lines (2, lines) [rad], (30)."""
+    """Return the complex amplitudes of the joint angles on the lines (2, lines) [rad], (30)."""
     s = 1j * excitation.frequency
     D, K, F = arm.mass_matrix(), arm.stiffness(), np.eye(2) * arm.viscous
     terms = (s * D[:, :, None] if order == 1 else s * s * D[:, :, None] + s * F[:, :, None]) + K[:, :, None]
@@ -97,7 +98,7 @@ def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
 
 
 def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, seed: int) -> Array:
-    """One fundamental period of the settled angles (2, samples) [rad], with the paper's noise added."""
+    """Return one fundamental period of the settled angles (2, samples) [rad], with the paper's noise added."""
     samples = round(rate / FUNDAMENTAL)
     turn = np.exp(1j * np.outer(excitation.frequency, np.arange(samples) / rate))
     clean = (response(arm, excitation, order) @ turn).real
@@ -105,13 +106,13 @@ def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, see
 
 
 def coefficients(position: Array, excitation: Excitation) -> Complex:
-    """Complex Fourier coefficients on the lines (2, lines) of one period (2, samples), (48) and (60).
+    """Return the complex Fourier coefficients on the lines (2, lines) of one period (2, samples), (48) and (60).
 
-    The noise's mean of NOISE / 2 falls on line 0, which is not used. Raises ShapeError.
+    The mean of the noise, NOISE / 2, only affects line 0, which is not used. Raises ShapeError.
     """
     if position.ndim != 2 or position.shape[0] != 2 or position.shape[1] <= 2 * excitation.lines.max():
         raise ShapeError(
-            f"position is {position.shape}: one period of two joints (2, samples) is needed, with more than "
+            f"position has shape {position.shape}: one period of two joints (2, samples) is needed, with more than "
             f"{2 * excitation.lines.max()} samples"
         )
     samples = position.shape[1]
@@ -120,14 +121,16 @@ def coefficients(position: Array, excitation: Excitation) -> Complex:
 
 
 def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm) -> tuple[float, float]:
-    """m1 and m2 [kg] as the paper has them: ordinary least squares, then its masses from the coefficients.
+    """Return m1 and m2 [kg] by the paper's method: ordinary least squares, then the masses from the coefficients.
 
-    Joint i's coefficients obey (s^2 + a1 s + a0) q_i = (b11 s + b10) u1 + (b21 s + b20) u2 for the first-order
-    plant; (52) to (58) solve that for joint 1 and (63) to (69) for joint 2, line by line, real and imaginary part,
-    with the noisy q_i on both sides. m1 is then read from joint 1's six coefficients and m2 from joint 2's, as the
-    masses whose coefficients are closest in relative terms. `known`: lengths and inertias; its masses
-    only set the scale. Noise in the regressors drives the coefficients towards zero, however much data there is.
-    Raises ModelError when both joints share their lines: the columns of (33) coincide.
+    Joint i's coefficients obey (s^2 + a1 s + a0) q_i = (b11 s + b10) u1 + (b21 s + b20) u2 for the first-order plant.
+    Equations (52) to (58) solve this for joint 1 and (63) to (69) for joint 2, line by line, separately for real and
+    imaginary parts, with the noisy q_i on both sides. Then m1 is obtained from joint 1's six coefficients and m2 from
+    joint 2's, as the masses whose coefficients have the smallest relative error.
+
+    `known` provides lengths and inertias; its masses only set the scale. Noise in the regressors biases the
+    coefficients towards zero, however much data there is. Raises ModelError if both joints use the same lines, since
+    the columns of (33) then coincide.
     """
     s = 1j * excitation.frequency
     u1, u2 = excitation.torque
@@ -153,15 +156,15 @@ class MassEstimate:
     std: tuple[float, float]
     """Standard errors from the residual [kg]."""
     viscous: float
-    """Friction found beside them, second order only [N m s/rad]."""
+    """Viscous friction estimated along with the masses, only for the second order [N m s/rad]."""
 
 
 def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm, order: Order) -> MassEstimate:
-    """m1 and m2 (and friction, for the second order) that make the measured coefficients most likely.
+    """Return the masses (and for the second order the friction) that maximise the likelihood of the coefficients.
 
-    The noise of a Fourier coefficient is normal and alike on all lines, whatever it was in time, so the likelihood is
-    the sum of squared differences between measured and predicted coefficients. `known`: lengths, inertias and initial
-    guess.
+    The noise of a Fourier coefficient is normal with the same variance on all lines, whatever its distribution in time,
+    so maximising the likelihood means minimising the sum of squared differences between measured and predicted
+    coefficients. `known` provides lengths, inertias and the initial guess.
     """
 
     def arm(x: Array) -> PaperArm:
@@ -182,7 +185,7 @@ def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm
 
 
 def _nearest_masses(found: Array, joint: int, known: PaperArm) -> Array:
-    """The masses (2,) whose transfer coefficients are nearest to `found` (6,)."""
+    """Return the masses (2,) whose transfer coefficients are closest to `found` (6,)."""
     size = np.abs(_transfer(known, joint))
 
     def misfit(x: Array) -> Array:
@@ -193,7 +196,7 @@ def _nearest_masses(found: Array, joint: int, known: PaperArm) -> Array:
 
 
 def _transfer(arm: PaperArm, joint: int) -> Array:
-    """a1, a0, b11, b10, b21, b20 of one joint of the first-order plant, (25) to (28)."""
+    """Return a1, a0, b11, b10, b21, b20 of one joint of the first-order plant, (25) to (28)."""
     B = np.linalg.inv(arm.mass_matrix())
     A = -B @ arm.stiffness()
     adjugate = np.array([[-A[1, 1], A[0, 1]], [A[1, 0], -A[0, 0]]]) @ B

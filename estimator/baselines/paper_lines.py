@@ -1,8 +1,8 @@
-"""The seed paper's idea on a servo arm's settled period: linear response, line by line, about hanging.
+"""The seed paper's approach on a servo arm's settled period: linear response at each Fourier line, about hanging.
 
-Its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
-linearised at (-pi/2, 0). It applies to small swings without dry friction; elsewhere it shows the error
-of linearisation. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
+This is its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
+linearised at (-pi/2, 0). It is valid for small swings without dry friction; for others it shows the error of
+linearisation. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
 """
 
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ class LinearisedEstimate:
     """Estimate from the linear response."""
 
     parameters: dict[str, float]
-    """Base parameters by name [SI]; friction is viscous alone."""
+    """Base parameters by name [SI]; the friction is purely viscous."""
     std: dict[str, float]
     remark: str
-    """How far the motion exceeded the linear range."""
+    """States how large the swings were, compared with the linear range."""
 
 
 def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) -> LinearisedEstimate:
-    """Least squares on the lines of a period about the hanging pose.
+    """Fit the lines of a period about the hanging pose by least squares.
 
-    `length` [m] of link 1: the linear response of two joints holds three combinations of the four inertias, and
+    length: length of link 1 [m]. The linear response of two joints determines three combinations of the four inertias;
     coupling = length gravity_2 / gravity is the fourth equation. Raises ModelError without gravity or length.
     """
     if gravity <= 0.0:
-        raise ModelError("the paper's method linearises about hanging: without gravity there is no such equilibrium")
+        raise ModelError("the paper's method linearises about the hanging pose, which requires gravity")
     lines = lines_of(period.filled())
     count = cut_off(lines) + 1
     Q = lines[:, 1:count]
@@ -75,7 +75,7 @@ def _named(names: tuple[str, ...], values: Array) -> dict[str, float]:
 
 
 def _solve(A: Array, b: Array) -> tuple[Array, Array]:
-    """Ordinary least squares of complex `b` on `A`, and the covariance if the residual were white."""
+    """Solve A x = b (complex) by ordinary least squares; return x and its covariance assuming a white residual."""
     real, goal = np.concatenate((A.real, A.imag)), np.concatenate((b.real, b.imag))
     norm = np.linalg.norm(real, axis=0)
     x = np.linalg.lstsq(real / norm, goal, rcond=None)[0] / norm

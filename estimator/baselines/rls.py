@@ -1,8 +1,9 @@
 """Recursive least squares on causally filtered signals, the on-line baseline.
 
-Position passes a causal low-pass filter and is differenced, the regressor evaluated and filtered again; the torque
-passes the same filter twice, so that both have the same lag. Every sample then corrects the parameters once: Ljung,
-System Identification (1999), section 11.2, with a forgetting factor of 1, the best for an arm that does not change.
+Position passes through a causal low-pass filter and is differenced; the regressor is evaluated and filtered again. The
+torque passes through the same filter twice, so that both have the same lag. Every sample then corrects the parameters
+once: Ljung, System Identification (1999), section 11.2, with a forgetting factor of 1, which is optimal for an arm that
+does not change.
 """
 
 from collections.abc import Sequence
@@ -17,17 +18,18 @@ from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
 
 ORDER = 4  # of the filter
-WIDE = 1e3  # standard deviation of the parameters before the first sample, in units of SI
-WARM_UP = 2.0  # cycles of the cut-off before the filters have forgotten their start
+WIDE = 1e3  # standard deviation of the parameters before the first sample, in SI units
+WARM_UP = 2.0  # cycles of the cut-off frequency until the filters' initial transients have decayed
 
 
 def fit_recursively(
     recordings: Sequence[Recording], cutoff: float, coulomb_width: float, delay: float = 0.0
 ) -> InverseDynamics:
-    """RLS over all `recordings` in turn, both joints' torques at every sample, each weighted by its residual.
+    """Fit all `recordings` in turn by RLS, using all joints' torques at every sample, weighted by their residuals.
 
-    `cutoff` [Hz], `coulomb_width` [rad/s], `delay` [s] as in `hil.estimator.baselines.idim.fit_inverse_dynamics`. The
-    weights come from a first run through the data, which an on-line estimator could not have: to its advantage.
+    `cutoff` [Hz], `coulomb_width` [rad/s] and `delay` [s] are as in
+    `hil.estimator.baselines.idim.fit_inverse_dynamics`. The weights come from a first pass over the data, an advantage
+    that an on-line estimator does not have.
     """
     rows = [_causal_rows(recording, cutoff, coulomb_width, delay) for recording in recordings]
     Y = np.concatenate([row[0] for row in rows], axis=1)
@@ -48,7 +50,7 @@ def _causal_rows(recording: Recording, cutoff: float, width: float, delay: float
     tau, _ = sosfilt(filter_, torque, axis=1, zi=rest * torque[None, :, :1])
     velocity = np.diff(smooth, axis=1) / dt
     acceleration = np.diff(velocity, axis=1) / dt
-    # Differences belong to the middle of what they span: one sample back for the second, half for the first.
+    # A difference belongs to the middle of its interval: one sample back for the second derivative, half for the first.
     velocity = 0.5 * (velocity[:, 1:] + velocity[:, :-1])
     Y = regressor(smooth[:, 1:-1], velocity, acceleration, width)
     start = sosfilt_zi(filter_)[:, None, :, None]

@@ -1,7 +1,8 @@
-"""Reversed columns: a torque or a position with the wrong sign, found by inverse dynamics with every combination.
+"""Detection of reversed columns: torques or positions with the wrong sign, by inverse dynamics for each combination.
 
-A reversed torque of the only joint, or of all joints, leaves the residual as it was and makes inertias and friction
-negative; a reversed column of one joint among two contradicts the other joint's equations and leaves more residual.
+If the torque of the only joint, or of all joints, is reversed, the residual stays the same but inertias and friction
+become negative. If one of two joints is reversed, it contradicts the other joint's equations, which increases the
+residual.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,10 +18,10 @@ from hil.estimator.errors import EstimationError
 CUTOFF = 8.0  # Hz
 COULOMB_WIDTH = 0.05  # rad/s
 LESS_RESIDUAL = 0.6
-"""Of the residual as given: what a combination must leave at most to be more credible on its residual alone."""
+"""A combination is credible if its residual is below this fraction of the residual with the signs as given."""
 
 SAME_RESIDUAL = 1.05
-"""A combination that makes negative inertia or friction positive may leave this much more."""
+"""If it also makes negative inertia or friction positive, this fraction of that residual is sufficient."""
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0
@@ -28,33 +29,37 @@ _STANDARD_ERRORS = 3.0
 
 @dataclass(frozen=True)
 class Signs:
-    """A combination: +1 as given, -1 reversed, of each joint's torque and position (joints,)."""
+    """A combination of signs of each joint's torque and position (joints,): +1 as given, -1 reversed."""
 
     torque: tuple[int, ...]
     position: tuple[int, ...]
 
     @property
     def reversed_columns(self) -> tuple[str, ...]:
-        """What is reversed, in words."""
+        """The reversed columns, as text."""
         named = [f"the torque of joint {joint}" for joint, sign in enumerate(self.torque, start=1) if sign < 0]
         return (*named, *(f"the position of joint {joint}" for joint, sign in enumerate(self.position, 1) if sign < 0))
 
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Columns that seem reversed. residual, residual_given: relative RMS of the torque residual, worst joint."""
+    """Columns that seem reversed.
+
+    signs: the combination that explains the recordings.
+    residual, residual_given: relative RMS of the torque residual with it and with the signs as given, worst joint.
+    """
 
     signs: Signs
     residual: float
     residual_given: float
     impossible: tuple[str, ...]
-    """Parameters that come out negative with the signs as given."""
+    """Parameters that are significantly negative with the signs as given."""
 
 
 def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
-    """The reversal that explains the recordings much better than the signs given; None where there is none.
+    """Return the reversal that explains the recordings much better than the given signs; None if there is none.
 
-    Returns None, rather than raising, where filtered inverse dynamics cannot be solved.
+    Also returns None if filtered inverse dynamics cannot be solved.
     """
     joints = recordings[0].joints
     given = _fit(recordings, Signs((1,) * joints, (1,) * joints))
@@ -74,7 +79,7 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
 
 
 def _combinations(joints: int) -> Iterator[Signs]:
-    """All reversals, fewest columns first. A mirrored arm is the same arm: joint 1's position stays."""
+    """Yield all reversals, fewest columns first. A mirrored arm is equivalent, so joint 1's position keeps its sign."""
     every = (
         Signs(torque, (1, *position))
         for torque in product((1, -1), repeat=joints)
@@ -93,7 +98,7 @@ def _fit(recordings: Sequence[Recording], signs: Signs) -> InverseDynamics | Non
 
 
 def _impossible(fitted: InverseDynamics) -> tuple[str, ...]:
-    """Inertias and friction that are significantly negative."""
+    """Return the names of inertias and friction parameters that are significantly negative."""
     bad = fitted.value < -_STANDARD_ERRORS * fitted.std
     return tuple(
         name for name, negative in zip(fitted.names, bad, strict=True) if negative and name.startswith(_POSITIVE)

@@ -1,1 +1,1 @@
-"""Serial arms of any number of joints in space, from a description of their geometry."""
+"""Identification of spatial serial arms with any number of joints, given their geometry."""

@@ -1,9 +1,9 @@
-"""Base parameters of a chain: the combinations that torque and motion determine.
+"""Base parameters of a chain: the parameter combinations that torque and motion determine.
 
-Columns of the regressor of random motions are taken one after the other, from the base outwards and within a link
-first moments, inertias, rotor and mass. A column that depends linearly on those before it adds no information: its
-parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay short,
-`moment_x_3 + 0.124 mass_4`, since a link's mass is felt as a moment of the link before.
+The columns of the regressor for random motions are processed one by one, from the base outwards and within a link in
+the order first moments, inertias, rotor, mass. A column that depends linearly on the previous ones adds no information:
+its parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay
+short, such as `moment_x_3 + 0.124 mass_4`, since a link's mass acts like a moment of the previous link.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from hil.estimator.chain.geometry import Chain, parameter_names, unit_of
 
 ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, inertias, armature, mass
 SAMPLES = 150
-INDEPENDENT = 1e-7  # part of a column that the former ones leave of it
+INDEPENDENT = 1e-7  # fraction of a column's norm not explained by the previous ones above which it is independent
 NOTHING = 1e-9
 
 
@@ -30,13 +30,13 @@ class BaseParameters:
 
     chain: Chain
     columns: Columns
-    """Which of `parameter_names` (base parameters,)."""
+    """Indices of the base parameters in `parameter_names` (base parameters,)."""
     grouping: Array
-    """Base parameters of all parameters: grouping @ all (base parameters, all)."""
+    """Matrix from all parameters to base parameters (base parameters, all)."""
 
     @classmethod
     def of(cls, chain: Chain, seed: int = 1) -> "BaseParameters":
-        """The base parameters of this chain."""
+        """Return the base parameters of this chain."""
         Y = _random_regressor(chain, seed)
         norm = np.linalg.norm(Y, axis=0)
         kept: list[int] = []
@@ -47,7 +47,7 @@ class BaseParameters:
                 if norm[column] < NOTHING * norm.max():
                     continue
                 left = Y[:, column] / norm[column]
-                for _ in range(2):  # the second pass removes what rounding left of the first
+                for _ in range(2):  # the second pass removes rounding errors of the first
                     left = left - basis @ (basis.T @ left)
                 size = float(np.linalg.norm(left))
                 if size > INDEPENDENT:
@@ -60,39 +60,39 @@ class BaseParameters:
 
     @property
     def count(self) -> int:
-        """How many."""
+        """Number of base parameters."""
         return int(self.columns.size)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the base parameters."""
         every = parameter_names(self.chain.joints)
         return tuple(every[column] for column in self.columns)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of each."""
+        """Unit of each base parameter."""
         return tuple(map(unit_of, self.names))
 
     @cached_property
     def groups(self) -> tuple[str, ...]:
-        """The combination that each stands for, such as `moment_x_3 + 0.124 mass_4`."""
+        """The combination that each base parameter stands for, such as `moment_x_3 + 0.124 mass_4`."""
         every = parameter_names(self.chain.joints)
         return tuple(_sum(name, every, row) for name, row in zip(self.names, self.grouping, strict=True))
 
     def of_all(self, parameters: Array) -> Array:
-        """Base parameters (base parameters,) of all parameters (11 joints,)."""
+        """Return the base parameters (base parameters,) for a vector of all parameters (11 joints,)."""
         base: Array = self.grouping @ parameters
         return base
 
     def as_all(self, base: Array) -> Array:
-        """A full parameter vector (11 joints,) with the same dynamics as these base parameters: the others are zero."""
+        """Return a full parameter vector (11 joints,) with the same dynamics, where all other parameters are zero."""
         every = np.zeros(TERMS * self.chain.joints)
         every[self.columns] = base
         return every
 
     def regressor(self, position: Array, velocity: Array, acceleration: Array) -> Array:
-        """Y of the base parameters (joints, samples, base parameters); see `dynamics.regressor`."""
+        """Return the regressor of the base parameters (joints, samples, base parameters); see `dynamics.regressor`."""
         return regressor(self.chain, position, velocity, acceleration, self.columns)
 
 

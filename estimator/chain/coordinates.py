@@ -1,6 +1,6 @@
-"""Unconstrained coordinates of a chain's parameters: positive ones are exponentials, base parameters and offsets plain.
+"""Unconstrained coordinates of a chain's parameters: logarithms of positive ones, linear for the others.
 
-A base parameter is a sum that may have either sign; the fit must keep the mass matrix positive definite.
+A base parameter is a sum that may have either sign, so the fit itself must keep the mass matrix positive definite.
 """
 
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ POSITIVE = {
     "torque_scale": 1e-3,
     "lag": 1e-5,
 }
-"""Kinds of positive parameters and the least that each starts with [its unit]."""
+"""Kinds of positive parameters and the minimum initial value of each [its unit]."""
 SMALL = {"offset": 0.01, "zero": 0.02, "delay": 1e-3}
-"""Scales of the others that are no base parameters [their unit]."""
+"""Scales of the other parameters that are not base parameters [their unit]."""
 SHAPES = {
     "coulomb_width": (0.01, 2.5),
     "stribeck_rise": (0.3, 1.0),
@@ -40,11 +40,11 @@ LONGEST = 2.0  # of any coordinate, in one step
 
 @dataclass(frozen=True)
 class ChainCoordinates:
-    """The map between parameters and coordinates of about the size of 1."""
+    """The map between parameters and coordinates of order 1."""
 
     names: tuple[str, ...]
     scales: Array
-    """Of base parameters, in their place; ignored for others (parameters,)."""
+    """Scales of the base parameters, at their indices; ignored for others (parameters,)."""
     width_floor: float
     """The least width of every Coulomb step [rad/s]."""
 
@@ -79,7 +79,7 @@ class ChainCoordinates:
 
     @cached_property
     def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the shapes of friction, their likely coordinates and the standard deviations of these."""
+        """Indices of the friction-shape parameters, their typical coordinates and the standard deviations of these."""
         index = np.array([i for i, kind in enumerate(self._kinds) if kind in SHAPES], dtype=np.int64)
         pairs = np.array([SHAPES[self._kinds[i]] for i in index]).reshape(-1, 2)
         return index, np.log(pairs[:, 0]), pairs[:, 1]
@@ -109,6 +109,6 @@ class ChainCoordinates:
 
 
 def kind_of(name: str) -> str:
-    """A parameter's name without its joint's number."""
+    """Return a parameter's name without the joint number."""
     kind, _, number = name.rpartition("_")
     return kind if number.isdigit() else name

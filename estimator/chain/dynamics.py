@@ -1,4 +1,4 @@
-"""Rigid-body dynamics of a serial chain for whole motions: arrays in, arrays out."""
+"""Rigid-body dynamics of a serial chain for whole motions, with arrays as input and output."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,10 +17,10 @@ Columns = npt.NDArray[np.int64]
 
 
 def inverse_dynamics(chain: Chain, parameters: Array, position: Array, velocity: Array, acceleration: Array) -> Array:
-    """Joint torques (joints, samples) [N m] of a motion, friction not included.
+    """Return the joint torques (joints, samples) [N m] of a motion, without friction.
 
-    `parameters`: in the order of `parameter_names` (11 joints,) [SI]; the motion (joints, samples) [rad, rad/s,
-    rad/s^2]. Raises ShapeError.
+    `parameters`: in the order of `parameter_names` (11 joints,) [SI]; position, velocity and acceleration: (joints,
+    samples) [rad, rad/s, rad/s^2]. Raises ShapeError.
     """
     link, armature = split(chain, parameters)
     q, v, a = _motion(chain, position, velocity, acceleration)
@@ -30,7 +30,7 @@ def inverse_dynamics(chain: Chain, parameters: Array, position: Array, velocity:
 
 
 def mass_matrix(chain: Chain, parameters: Array, position: Array) -> Array:
-    """Mass matrix (joints, joints) [kg m^2] in one pose (joints,) [rad]."""
+    """Return the mass matrix (joints, joints) [kg m^2] in one pose (joints,) [rad]."""
     link, armature = split(chain, parameters)
     work = room(chain.joints)
     rotation, translation, axis, _ = chain.arrays
@@ -43,7 +43,10 @@ def mass_matrix(chain: Chain, parameters: Array, position: Array) -> Array:
 def torque_derivatives(
     chain: Chain, parameters: Array, position: Array, velocity: Array, acceleration: Array
 ) -> tuple[Array, Array]:
-    """Derivatives of the torques at one instant by angles and by velocities (joints, joints) [N m/rad, N m s/rad]."""
+    """Return the derivatives of the torques by angles and by velocities at one instant.
+
+    Both are (joints, joints) [N m/rad, N m s/rad].
+    """
     link, armature = split(chain, parameters)
     work = room(chain.joints)
     rotation, translation, axis, gravity = chain.arrays
@@ -58,9 +61,9 @@ def torque_derivatives(
 def regressor(
     chain: Chain, position: Array, velocity: Array, acceleration: Array, columns: Columns | None = None
 ) -> Array:
-    """Y of the inertial parameters: torque = Y parameters (joints, samples, parameters).
+    """Return the regressor Y of the inertial parameters (joints, samples, parameters), so that torque = Y parameters.
 
-    Arguments as of `inverse_dynamics`; `columns`: which of `parameter_names`, all unless given.
+    Arguments as in `inverse_dynamics`; `columns`: indices into `parameter_names`, by default all.
     """
     q, v, a = _motion(chain, position, velocity, acceleration)
     chosen = np.arange(TERMS * chain.joints) if columns is None else columns
@@ -70,14 +73,14 @@ def regressor(
 
 
 def places(joints: int, chosen: Columns) -> Columns:
-    """Index of each link's parameters among the chosen ones (joints, 11); the others point past the end."""
+    """Return the index of each link's parameters among the chosen ones (joints, 11); for others, the number chosen."""
     column = np.full(TERMS * joints, chosen.size)
     column[chosen] = np.arange(chosen.size)
     return column.reshape(joints, TERMS)
 
 
 def split(chain: Chain, parameters: Array) -> tuple[Array, Array]:
-    """Links (joints, 10) and armatures (joints,) of a vector of all parameters."""
+    """Split a vector of all parameters into links (joints, 10) and armatures (joints,)."""
     if parameters.shape != (TERMS * chain.joints,):
         raise ShapeError(f"parameters are {parameters.shape}, they must be ({TERMS * chain.joints},)")
     table = np.asarray(parameters, dtype=np.float64).reshape(chain.joints, TERMS)
@@ -85,7 +88,7 @@ def split(chain: Chain, parameters: Array) -> tuple[Array, Array]:
 
 
 def _motion(chain: Chain, *motion: Array) -> tuple[Array, ...]:
-    """Samples first, contiguous."""
+    """Return the arrays of a motion, contiguous, with samples as the first axis."""
     shapes = {each.shape for each in motion}
     if len(shapes) != 1 or motion[0].ndim != 2 or motion[0].shape[0] != chain.joints:
         raise ShapeError(

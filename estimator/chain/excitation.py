@@ -1,5 +1,4 @@
-"""A path that excites a chain: finite Fourier series of the joint angles (Swevers, Ganseman, Tukel, De Schutter, Van
-Brussel, IEEE Transactions on Robotics and Automation 13 (1997) 730).
+"""Excitation of a chain by paths that are finite Fourier series of the joint angles.
 
 Played as the torque that a rough model of the arm needs for it, with a spring and a damper in software around it. The
 series is optimised for what is wanted of the result: the torque of other motions in the same range, worst joint. Every
@@ -82,8 +81,12 @@ def design_path(
     speed: Array,
     seed: int,
 ) -> Path:
-    """A path about `centre` (joints,) [rad] with harmonics up to `highest` [Hz], each joint within `swing` (joints,)
-    [rad] of it and no faster than `speed` (joints,) [rad/s]. Raises ExcitationError."""
+    """Design a path with harmonics up to `highest` [Hz], in which each joint stays within limits.
+
+    The joints stay within `swing` (joints,) [rad] of `centre` (joints,) [rad] and below `speed` (joints,) [rad/s].
+    rate: samples per second; period [s]; prior: rough parameters, whose uncertainty weights the information. Raises
+    ExcitationError.
+    """
     count = int(np.floor(highest * period + 1e-9))
     if count < 2 or highest > rate / 8 or min(swing.min(), speed.min()) <= 0.0:
         raise ExcitationError(

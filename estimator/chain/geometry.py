@@ -1,4 +1,4 @@
-"""The geometry of a serial arm: the placement of its joints. Everything else is to be identified."""
+"""The geometry of a serial arm: the placement of its joints. Everything else is identified."""
 
 from dataclasses import dataclass
 
@@ -12,30 +12,31 @@ LINK_TERMS = (
     *("mass", "moment_x", "moment_y", "moment_z"),
     *("inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz"),
 )
-"""Inertial parameters of a link in its own frame: mass [kg], mass times centre of mass [kg m], inertia about the
-frame's origin [kg m^2]."""
+"""Inertial parameters of a link in its own frame.
+
+Mass [kg], mass times centre of mass [kg m], inertia about the frame's origin [kg m^2].
+"""
 UNITS = {"mass": "kg", "moment": "kg m", "inertia": "kg m^2", "armature": "kg m^2"}
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Revolute joints one after the other.
+    """A serial chain of revolute joints.
 
-    Link i's frame is that of joint i, which turns with it. At angle zero it stands at `translation[i]`, turned by
-    `rotation[i]`, in the frame of the link before, the first in the base's.
+    Link i's frame is attached to the link, at joint i. At angle zero it is located at `translation[i]` with orientation
+    `rotation[i]` in the frame of the previous link (for the first link, of the base).
 
-    Raises ShapeError for arrays that do not fit together, ModelError for too many joints and for invalid rotations
-    and axes.
+    Raises ShapeError for incompatible arrays, ModelError for too many joints and for invalid rotations and axes.
     """
 
     rotation: Array
-    """(joints, 3, 3)."""
+    """Orientations (joints, 3, 3)."""
     translation: Array
-    """(joints, 3) [m]."""
+    """Origins (joints, 3) [m]."""
     axis: Array
-    """Of each joint, in its own frame, of length 1 (joints, 3)."""
+    """Unit vector along the axis of each joint, in its own frame (joints, 3)."""
     gravity: Array
-    """In the base's frame (3,) [m/s^2]; (0, 0, -9.81) for a base that stands upright."""
+    """Gravity in the base's frame (3,) [m/s^2]; (0, 0, -9.81) for an upright base."""
 
     def __post_init__(self) -> None:
         joints = len(self.axis)
@@ -51,7 +52,7 @@ class Chain:
             raise ModelError("the joints' axes must have length 1")
         turned = self.rotation @ np.swapaxes(self.rotation, 1, 2)
         if np.abs(turned - np.eye(3)).max() > 1e-6 or np.any(np.linalg.det(self.rotation) < 0.0):
-            raise ModelError("rotation must hold proper rotation matrices")
+            raise ModelError("rotation must contain proper rotation matrices")
 
     @property
     def joints(self) -> int:
@@ -60,18 +61,20 @@ class Chain:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Rotation, translation, axis and gravity as the compiled code takes them."""
+        """Rotation, translation, axis and gravity in the form that the compiled code needs."""
         given = self.rotation, self.translation, self.axis, self.gravity
         rotation, translation, axis, gravity = (np.ascontiguousarray(each, dtype=np.float64) for each in given)
         return rotation, translation, axis, gravity
 
 
 def parameter_names(joints: int) -> tuple[str, ...]:
-    """Names of all inertial parameters: link by link the terms of LINK_TERMS, and `armature`, the rotor's inertia times
-    gear ratio squared."""
+    """Return the names of all inertial parameters.
+
+    Link by link these are the terms of LINK_TERMS and `armature`, the rotor's inertia times the gear ratio squared.
+    """
     return tuple(f"{term}_{joint + 1}" for joint in range(joints) for term in (*LINK_TERMS, "armature"))
 
 
 def unit_of(name: str) -> str:
-    """Unit of the parameter of this name."""
+    """Return the unit of the parameter with this name."""
     return UNITS[name.partition("_")[0]]

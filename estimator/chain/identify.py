@@ -13,64 +13,38 @@ from hil.estimator.chain.stage1 import fit_lines
 from hil.estimator.chain.stage2 import fit_periods
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError
+from hil.estimator.fit.fitted_parameters import FittedParameters
 
-BELIEVED = 0.5  # of the prior's standard deviation: what data leave wider than that comes from the prior
+BELIEVED = 0.5  # standard errors above this fraction of the prior's count as coming from the prior
 
 
 @dataclass(frozen=True)
-class ChainEstimate:
-    """Estimate of a spatial arm from settled periods; members as in `hil.estimator.identify.Estimate`."""
+class ChainEstimate(FittedParameters):
+    """Parameters of a spatial arm estimated from settled periods; see also `hil.estimator.identify.Estimate`."""
 
     model: ChainModel
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    value: Array
-    """(parameters,) [SI]."""
-    covariance: Array
-    """(parameters, parameters), robust against correlated errors."""
     linear_value: Array
-    """Stage 1's, in the order of `ChainModel.linear_names`."""
+    """Result of stage 1, in the order of `ChainModel.linear_names`."""
     start: Array
     """Angles and velocities at the first sample (2, joints)."""
     position: Array
     """One-step-ahead prediction (joints, samples) [rad]."""
-    residual: Array
-    """Measured minus predicted position (joints, samples) [rad]; NaN where a sample is missing."""
-    position_step: Array
-    """The encoders' steps (joints,) [rad]."""
     iterations: int
     outliers: int
     white_std: Array
     correlation_time: float
     softness: float
-    """Natural frequency of the observer that the simulation was drawn to the measurements by [Hz]."""
+    """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
     from_prior: tuple[str, ...]
-    """Base parameters that the data hardly determine: their values come from the description."""
-
-    @property
-    def std(self) -> Array:
-        """Standard errors (parameters,)."""
-        std: Array = np.sqrt(np.diag(self.covariance))
-        return std
-
-    @property
-    def residual_steps(self) -> Array:
-        """RMS of the residual in encoder steps (joints,); rounding alone leaves 0.2887."""
-        rms: Array = np.sqrt(np.nanmean(self.residual**2, axis=1)) / self.position_step
-        return rms
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Values by name [SI]."""
-        return dict(zip(self.names, self.value.tolist(), strict=True))
+    """Base parameters that the data hardly determine, so that their values come from the prior."""
 
 
 @one_blas_thread
 def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
-    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. Raises ModelError when `model`
-    has another number of joints than a period, ConvergenceError.
+    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. Raises ModelError if `model` and a
+    period differ in their number of joints, ConvergenceError if no minimum is found.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:
@@ -83,20 +57,20 @@ def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: Chai
     count = model.base.count
     wide = np.sqrt(np.diag(fit.covariance))[:count] > BELIEVED * prior.std
     return ChainEstimate(
-        model,
-        model.names,
-        model.units,
-        fit.value,
-        fit.covariance,
-        linear.value,
-        fit.starts[0],
-        fit.positions[0],
-        np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
-        used[0].position_step,
-        fit.iterations,
-        fit.outliers + spikes,
-        np.sqrt(np.diag(fit.white_covariance)),
-        fit.correlation_time,
-        fit.softness,
-        tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
+        names=model.names,
+        units=model.units,
+        value=fit.value,
+        covariance=fit.covariance,
+        residual=np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
+        position_step=used[0].position_step,
+        model=model,
+        linear_value=linear.value,
+        start=fit.starts[0],
+        position=fit.positions[0],
+        iterations=fit.iterations,
+        outliers=fit.outliers + spikes,
+        white_std=np.sqrt(np.diag(fit.white_covariance)),
+        correlation_time=fit.correlation_time,
+        softness=fit.softness,
+        from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
     )

@@ -1,17 +1,17 @@
 """Compiled rigid-body dynamics of a serial chain: torque, mass matrix, regressor, derivatives by angle and velocity.
 
-Recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008) with all spatial
-vectors written about the base's origin, where neither needs transforming from link to link: motions are (angular,
+Recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008), with all spatial
+vectors expressed about the base's origin, so that no transformation between links is needed: motions are (angular,
 linear), forces (moment, force). The derivatives follow Singh, Russo and Wensing, IEEE Robotics and Automation Letters 7
-(2022) 1776. Of their Coriolis matrix B only the product with a motion w is needed, in which, integrated over the mass,
+(2022) 1776. Of their Coriolis matrix B only the product with a motion w is needed; integrated over the mass it is
 
     2 B w = (2 (tr G - G) w_angular, 2 w_angular x l)       G = sum of dm velocity position^T, l the momentum,
 
-so that twelve numbers of each body stand for its 36. The regressor is that of Atkeson, An and Hollerbach, International
+so that twelve numbers per body replace its 36. The regressor is that of Atkeson, An and Hollerbach, International
 Journal of Robotics Research 5 (1986) 101, in link frames.
 
-Every formula is linear in the links' inertial parameters, so base parameters, with all others zero, work as well as
-those of real links.
+Every formula is linear in the links' inertial parameters, so a vector of base parameters, with all others zero, may be
+used instead of the parameters of real links.
 """
 
 import math
@@ -20,19 +20,19 @@ from typing import Any
 import numba
 import numpy as np
 
-# Rows of `Room.motion` by joint, six numbers each.
+# Rows of the array `motion` by joint, six numbers each.
 AXIS, VELOCITY, ACCELERATION, SWEPT, CARRIED, CARRIED_AGAIN = range(6)
-# Columns of `Room.body` by link: mass, first moment, inertia (xx xy xz yy yz zz) about the base's origin; linear
+# Columns of the array `body` by link: mass; first moment; inertia (xx xy xz yy yz zz) about the base's origin; linear
 # momentum; G by rows; force (moment, force).
 MASS, MOMENT, INERTIA, MOMENTUM, FLOW, FORCE, BODY = 0, 1, 4, 10, 13, 22, 28
 
 
 def room(joints: int) -> Any:
-    """Work arrays of the functions below: frames, motions, bodies and what follows from them.
+    """Return the work arrays of the functions below.
 
-    frame    of each link, rotation by rows and origin (joints, 12)
-    motion   joint axis; velocity; acceleration, gravity as one upwards; axis' derivative by time; axis carried by the
-             link before: velocity x axis, and what acceleration makes of it (joints, 6, 6)
+    frame    rotation by rows and origin of each link (joints, 12)
+    motion   joint axis; velocity; acceleration, with gravity as an upward acceleration; time derivative of the axis;
+             velocity of the previous link x axis; the corresponding term of its acceleration (joints, 6, 6)
     body     see above; single links, then composites (2, joints, BODY)
     seized   composite inertia times axis (joints, 6)
     mass     mass matrix (joints, joints)
@@ -45,7 +45,7 @@ def room(joints: int) -> Any:
 
 
 def _cross(a: Any, b: Any, out: Any) -> None:
-    """out = a x b of motions: how b changes in a body that moves as a."""
+    """Set out = a x b (motion cross product): the rate of change of b in a body moving with a."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
@@ -60,7 +60,7 @@ def _dot(a: Any, b: Any) -> float:
 
 
 def _push(b: Any, x: Any, out: Any) -> None:
-    """out = inertia of body b times the motion x."""
+    """Set out = inertia of body b times the motion x."""
     h0, h1, h2 = b[1], b[2], b[3]
     out[0] = b[4] * x[0] + b[5] * x[1] + b[6] * x[2] + h1 * x[5] - h2 * x[4]
     out[1] = b[5] * x[0] + b[7] * x[1] + b[8] * x[2] + h2 * x[3] - h0 * x[5]
@@ -71,7 +71,7 @@ def _push(b: Any, x: Any, out: Any) -> None:
 
 
 def place(rotation: Any, translation: Any, axis: Any, q: Any, frame: Any, motion: Any) -> None:
-    """Frames and joint axes at the angles q."""
+    """Compute frames and joint axes at the angles q."""
     for i in range(q.size):
         f = frame[i]
         if i == 0:
@@ -104,7 +104,7 @@ def place(rotation: Any, translation: Any, axis: Any, q: Any, frame: Any, motion
 
 
 def _carry(link: Any, f: Any, b: Any) -> None:
-    """A link's mass, moment and inertia from its own frame f to the base's origin and directions."""
+    """Transform a link's mass, moment and inertia from its own frame f to the base's origin and directions."""
     m = link[0]
     px, py, pz = f[9], f[10], f[11]
     hx = f[0] * link[1] + f[1] * link[2] + f[2] * link[3]
@@ -129,9 +129,10 @@ def _carry(link: Any, f: Any, b: Any) -> None:
 
 
 def move(link: Any, armature: Any, v: Any, room: Any) -> None:
-    """Velocities, bodies, composites and the mass matrix, once `place` has been called.
+    """Compute velocities, bodies, composites and the mass matrix; requires `place`.
 
-    link (joints, 10), armature (joints,), v (joints,)."""
+    link: (joints, 10). armature: (joints,). v: joint velocities (joints,).
+    """
     frame, motion, body, seized, mass, _, _, _ = room
     n = v.size
     for i in range(n):
@@ -167,7 +168,7 @@ def move(link: Any, armature: Any, v: Any, room: Any) -> None:
 
 
 def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
-    """Torques that the accelerations a (joints,) take, once `move` has been called."""
+    """Compute the torques required for the accelerations a (joints,); requires `move`."""
     _, motion, body, _, _, torque, _, _ = room
     n = a.size
     for i in range(n):
@@ -177,7 +178,7 @@ def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
             x[r] = before + motion[i, AXIS, r] * a[i] + motion[i, SWEPT, r] * v[i]
         f = b[FORCE:BODY]
         _push(b, x, f)
-        # v x* (I v), the momentum's linear part being there already.
+        # v x* (I v); the linear part of the momentum is already available.
         l0, l1, l2 = b[10], b[11], b[12]
         k0 = b[4] * w[0] + b[5] * w[1] + b[6] * w[2] + b[2] * w[5] - b[3] * w[4]
         k1 = b[5] * w[0] + b[7] * w[1] + b[8] * w[2] + b[3] * w[3] - b[1] * w[5]
@@ -195,7 +196,7 @@ def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
 
 
 def differentiate(gravity: Any, room: Any) -> None:
-    """Derivatives of the torques by angles and velocities, at the accelerations that `accelerate` was last given."""
+    """Compute the torques' derivatives by angles and velocities at the accelerations last given to `accelerate`."""
     _, motion, body, seized, _, _, by_q, by_v = room
     n = motion.shape[0]
     still = np.zeros(6)
@@ -245,7 +246,7 @@ def differentiate(gravity: Any, room: Any) -> None:
 
 
 def _flow(b: Any, trace: float, w: Any, out: Any) -> None:
-    """out += 2 B w."""
+    """Add 2 B w to out."""
     out[0] += 2.0 * (trace * w[0] - b[13] * w[0] - b[14] * w[1] - b[15] * w[2])
     out[1] += 2.0 * (trace * w[1] - b[16] * w[0] - b[17] * w[1] - b[18] * w[2])
     out[2] += 2.0 * (trace * w[2] - b[19] * w[0] - b[20] * w[1] - b[21] * w[2])
@@ -255,16 +256,17 @@ def _flow(b: Any, trace: float, w: Any, out: Any) -> None:
 
 
 def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
-    """Regressor Y (joints, columns) of the accelerations a that `accelerate` was last given.
+    """Compute the regressor Y (joints, columns) at the accelerations a last given to `accelerate`.
 
-    column (joints, 11): of each link's parameters and of the armature, where it stands in Y; unwanted columns
-    are written but never read. Entries that are always zero are left alone."""
+    column (joints, 11): column of Y for each of a link's parameters and the armature; unwanted columns are written but
+    never read. Entries that are always zero are not written.
+    """
     frame, motion = room[0], room[1]
     n = a.size
     for i in range(n):
         f, w, x, at = frame[i], motion[i, VELOCITY], motion[i, ACCELERATION], column[i]
         px, py, pz = f[9], f[10], f[11]
-        # Velocity and acceleration of the link's origin, then all in the link's own frame.
+        # Velocity and acceleration of the link's origin, then everything in the link's own frame.
         ux, uy, uz = w[3] + w[1] * pz - w[2] * py, w[4] + w[2] * px - w[0] * pz, w[5] + w[0] * py - w[1] * px
         gx = x[3] + x[1] * pz - x[2] * py + w[1] * uz - w[2] * uy
         gy = x[4] + x[2] * px - x[0] * pz + w[2] * ux - w[0] * uz
@@ -298,7 +300,7 @@ def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
 
 
 def _into(f: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Into the link's own frame."""
+    """Rotate a vector into the link's own frame."""
     return (
         f[0] * x + f[3] * y + f[6] * z,
         f[1] * x + f[4] * y + f[7] * z,
@@ -307,7 +309,7 @@ def _into(f: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
-    """Inverse of a symmetric positive definite matrix by its Cholesky factor; False when it is not one."""
+    """Invert a symmetric positive definite matrix by its Cholesky factor; return False if it is not one."""
     n = matrix.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -339,7 +341,7 @@ def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
     return True
 
 
-# Functions that only compiled code calls need no wrappers for C.
+# Functions called only from compiled code need no wrappers for C.
 compiled: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True
 )

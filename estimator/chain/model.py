@@ -20,10 +20,11 @@ DRIVE = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 
 @dataclass(frozen=True)
 class ChainModel:
-    """The chain's equations with these terms, which are those of `hil.estimator.models.model.Model`.
+    """The chain's equations with these friction and drive terms, as in `hil.estimator.models.model.Model`.
 
-    `zeros`: errors of the encoders' zeros, of all joints but the first, which shows under gravity only;
-    `torque_scale`: of all joints but the first, whose torque constant is trusted. Raises ModelError.
+    zeros: estimate zero errors of the encoders of all joints but the first, as far as gravity reveals them.
+    torque_scale: estimate torque scales of all joints but the first, whose torque constant is trusted.
+    Raises ModelError.
     """
 
     base: BaseParameters
@@ -34,7 +35,7 @@ class ChainModel:
 
     def __post_init__(self) -> None:
         if self.friction not in FRICTION:
-            raise ModelError(f"friction model {self.friction!r}: a chain has {', '.join(FRICTION)}")
+            raise ModelError(f"friction model {self.friction!r}: a chain supports {', '.join(FRICTION)}")
         if self.drive not in DRIVE:
             raise ModelError(f"drive model {self.drive!r}: choose one of {', '.join(DRIVE)}")
         if self.torque_scale and self.joints == 1:
@@ -47,12 +48,12 @@ class ChainModel:
 
     @property
     def linear_names(self) -> tuple[str, ...]:
-        """What a regression finds: base parameters, viscous and Coulomb friction, offsets."""
+        """Parameters found by the regression: base parameters, viscous and Coulomb friction, offsets."""
         return (*self.base.names, *(f"{term}_{joint}" for term in LINEAR for joint in self._numbers))
 
     @property
     def _terms(self) -> list[tuple[str, str]]:
-        """Names and units of what comes after `linear_names`."""
+        """Names and units of the parameters that follow `linear_names`."""
         terms = [(f"{term}_{joint}", unit) for term, unit in FRICTION[self.friction].items() for joint in self._numbers]
         if self.zeros:
             terms += [(f"zero_{joint}", "rad") for joint in self._numbers[1:]]
@@ -62,18 +63,18 @@ class ChainModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All parameters."""
+        """Names of all parameters."""
         return (*self.linear_names, *(name for name, _ in self._terms))
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of `names`."""
+        """Units of all parameters."""
         linear = (unit for unit in LINEAR.values() for _ in self._numbers)
         return (*self.base.units, *linear, *(unit for _, unit in self._terms))
 
     @property
     def description(self) -> str:
-        """Human-readable description."""
+        """Text naming the friction, options and drive."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 

@@ -1,10 +1,9 @@
-"""Objective of stage 2 for a chain: squared one-step-ahead prediction errors of positions, plus squared deviations of
-base parameters from the prior.
+"""Objective of stage 2 for a chain: squared one-step-ahead position prediction errors, plus the prior.
 
-An observer keeps the simulation close to the measured angles, even for an arm that is unstable without feedback:
-each position is predicted from past measurements and the model (the prediction error method; Ljung, System
-Identification, 2nd ed. 1999, chapter 7). Its gains are the estimator's own, whatever feedback the robot had. Stiff
-gains follow any motion but carry little information; soft gains carry nearly as much as an open-loop simulation.
+An observer keeps the simulation close to the measured angles, even for an arm that is unstable without feedback: each
+position is predicted from past measurements and the model (the prediction error method; Ljung, System Identification,
+2nd ed. 1999, chapter 7). Its gains are chosen by the estimator, regardless of the feedback the robot had. Stiff gains
+follow any motion but carry little information; soft gains carry nearly as much as an open-loop simulation.
 """
 
 from collections.abc import Iterator
@@ -29,18 +28,21 @@ MINIMISER = MinimiserOptions()
 
 @dataclass(frozen=True)
 class ChainProblem:
-    """Residuals of several periods under one model, by coordinates: the parameters', then each period's first state."""
+    """Residuals of several periods under one model.
+
+    The coordinates are those of the parameters, followed by each period's initial state.
+    """
 
     periods: tuple[SettledPeriod, ...]
     model: ChainModel
     coordinates: ChainCoordinates
     prior: Prior
     state_scale: Array
-    """Of the state at the first sample (2 joints,) [rad, rad/s]."""
+    """Scale of the initial state (2 joints,) [rad, rad/s]."""
     weights: tuple[Array, ...]
-    """Inverse standard deviation of each sample (samples, joints) [1/rad], 0 for a missing one, period by period."""
+    """Inverse standard deviation of each sample (samples, joints) [1/rad] for each period; 0 for missing samples."""
     steps: int
-    """Integration steps in a sample."""
+    """Integration steps per sample."""
     softness: float
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
@@ -54,17 +56,17 @@ class ChainProblem:
         return len(self.coordinates.names)
 
     def parameters(self, x: Array) -> dict[str, float]:
-        """By name [SI]."""
+        """Return the parameters by name [SI]."""
         return dict(zip(self.coordinates.names, self.coordinates.values(x[: self.count]).tolist(), strict=True))
 
     def start(self, x: Array, period: int) -> Array:
-        """The state at the first sample of a period (2, joints)."""
+        """Return the state at the first sample of a period (2, joints) [rad, rad/s]."""
         size = self.state_scale.size
         first = self.count + period * size
         return (x[first : first + size] * self.state_scale).reshape(2, -1)
 
     def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
-        """The simulation's input, with this delay and lag."""
+        """Return the simulation's input for a period, with the delay and lag of these parameters."""
         delay, lag = parameters.get("delay", 0.0), parameters.get("lag", 0.0)
         torque, slopes = torque_and_slopes(
             period.torque, period.rate, period.command_to_sample, self.steps, delay=delay, lag=lag
@@ -78,13 +80,13 @@ class ChainProblem:
         )
 
     def gain(self, period: SettledPeriod) -> Array:
-        """Of the observer, critically damped (2, joints) [1, 1/s] per sample."""
+        """Return the gains of the critically damped observer (2, joints) [1, 1/s] per sample."""
         turn = 2.0 * np.pi * self.softness
         gains = np.array([2.0 * turn, turn * turn]) / period.rate
         return np.repeat(gains[:, None], period.joints, axis=1)
 
     def evaluate(self, x: Array) -> Quadratic:
-        """The sum of squares at `x` with its normal equations."""
+        """Return the sum of squares at `x` with its normal equations."""
         parameters = self.parameters(x)
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         if not all(map(np.isfinite, parameters.values())):
@@ -125,7 +127,7 @@ class ChainProblem:
         return minimise(self.evaluate, x, ftol, damping, at, limits=limits, options=options)
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
-        """Predicted positions of each period (joints, samples) [rad]; None where a motion diverges."""
+        """Return the predicted positions of each period (joints, samples) [rad]; None if a motion diverges."""
         parameters = self.parameters(x)
         found = []
         for index, period in enumerate(self.periods):
@@ -138,7 +140,7 @@ class ChainProblem:
         return tuple(found)
 
     def scatter(self, x: Array, lags: int) -> Array:
-        """Sum of products of the scores, in coordinates; see `hil.estimator.fit.covariance`."""
+        """Return the sum of products of the scores, in coordinates; see `hil.estimator.fit.covariance`."""
         total = np.zeros((x.size, x.size))
         parameters = self.parameters(x)
         for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):
@@ -169,14 +171,17 @@ class ChainProblem:
             yield residual[:, joint], every
 
     def softer(self, softness: float) -> "ChainProblem":
-        """The same with another observer."""
+        """Return the same problem with another natural frequency of the observer [Hz]."""
         return replace(self, softness=softness)
 
     def _pieces(
         self, x: Array, index: int, period: SettledPeriod, parameters: dict[str, float]
     ) -> Iterator[tuple[slice, Array | None, Array]]:
-        """Piece after piece of a period: which samples, predicted minus measured (samples, joints), 0 where missing,
-        None where the motion diverges, and derivatives by parameters and first state."""
+        """Yield the samples, residuals and derivatives of a period, piece by piece.
+
+        The residuals, predicted minus measured (samples, joints) [rad], are 0 where a sample is missing, and None if
+        the motion diverges. The derivatives are by parameters and initial state.
+        """
         run = self.run_of(period, parameters)
         names = self.coordinates.names
         simulation = Simulation(self.model.base, parameters, self.start(x, index), self.gain(period), names)
@@ -188,14 +193,14 @@ class ChainProblem:
             yield part, np.where(period.valid.T[part], position - run.measured[part], 0.0), derivative
 
     def _where(self, x: Array, index: int) -> tuple[list[int], Array]:
-        """Which coordinates a period's motion depends on, and the slopes of parameters and state by them."""
+        """Return the coordinates on which a period's motion depends, and the slopes of parameters and state by them."""
         size = self.state_scale.size
         first = self.count + index * size
         where = [*range(self.count), *range(first, first + size)]
         return where, np.concatenate((self.coordinates.slopes(x[: self.count]), self.state_scale))
 
     def _add_prior(self, x: Array, normal: Array, gradient: Array) -> float:
-        """Add the prior's part in place; its sum of squares."""
+        """Add the prior's contribution to `normal` and `gradient` in place; return its sum of squares."""
         base, count = self.model.base.count, self.count
         value, slope = self.coordinates.values(x[:count]), self.coordinates.slopes(x[:count])
         at = np.arange(base)

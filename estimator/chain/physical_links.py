@@ -1,9 +1,9 @@
-"""Physically consistent links with the identified base parameters, as close as possible to those of a description.
+"""Physically consistent links that have the identified base parameters and are close to those of a description.
 
-Each link is the exponential map of ten numbers (log-Cholesky; Rucker and Wensing, IEEE Robotics and Automation Letters
-7 (2022) 8250): its pseudo-inertia is U U' with U upper triangular of positive diagonal, so that every one of them has a
-distribution of mass. Base parameters fix sums of these only; what they leave open is regularised weakly towards the
-description.
+Each link is described by ten log-Cholesky coordinates (Rucker and Wensing, IEEE Robotics and Automation Letters 7
+(2022) 8250): its pseudo-inertia is U U' with U upper triangular with positive diagonal, so that every point corresponds
+to a possible mass distribution. Base parameters only determine sums of the links' parameters; what they leave open is
+weakly regularised towards the description.
 """
 
 from dataclasses import dataclass
@@ -15,28 +15,35 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.base_parameters import BaseParameters
 from hil.estimator.chain.dynamics import TERMS
 
-PULL = 0.03  # of one logarithm, against one standard error of a base parameter
+PULL = 0.03  # weight of a unit change of a coordinate, relative to one standard error of a base parameter
 LEAST_MASS = 1e-4  # kg
-LEAST_SPREAD = 1e-3  # m: radius of gyration of a link that the description makes a point
+LEAST_SPREAD = 1e-3  # m: minimum radius of gyration, for links that the description makes a point mass
 LEAST_ROTOR = 1e-7  # kg m^2
 _UPPER = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
 @dataclass(frozen=True)
 class PhysicalLinks:
-    """Physically consistent links."""
+    """Physically consistent parameters of the links and rotors, and how well they match the base parameters."""
 
     links: Array
-    """In the order of LINK_TERMS (joints, 10) [SI]."""
+    """Link parameters in the order of LINK_TERMS (joints, 10) [SI]."""
     armature: Array
-    """(joints,) [kg m^2]."""
+    """Reflected rotor inertias (joints,) [kg m^2]."""
     misfit: float
-    """Largest distance of a base parameter from the identified one, in its standard errors."""
+    """Largest deviation of a base parameter from the identified one, in standard errors."""
 
 
 def nearest_links(base: BaseParameters, value: Array, std: Array, described: Array, armature: Array) -> PhysicalLinks:
-    """Links nearest to `described` (joints, 10) and rotors nearest to `armature` (joints,) [kg m^2] whose base
-    parameters are `value` (base parameters,) within `std`."""
+    """Return the links and rotors nearest to the described ones that agree with the identified base parameters.
+
+    Args:
+        base: base parameters of the chain.
+        value: identified values (base parameters,) [SI].
+        std: their standard errors (base parameters,) [SI].
+        described: link parameters of the description (joints, 10) [SI].
+        armature: described reflected rotor inertias (joints,) [kg m^2].
+    """
     joints = base.chain.joints
     floor = np.maximum(std, 1e-6 * np.abs(value).max())
     start = np.concatenate((*(_coordinates(row) for row in described), np.log(np.maximum(armature, LEAST_ROTOR))))
@@ -60,10 +67,10 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
 
 
 def _link(x: Array) -> Array:
-    """Parameters (10,) of coordinates (10,): logarithms of the diagonal of U, then what is above it."""
+    """Return a link's parameters (10,) for coordinates (10,): log diagonal of U, then the elements above it."""
     U = np.diag(np.exp(x[:4]))
     for k, (row, column) in enumerate(_UPPER):
-        # The first moment is U_34 and the like times the root of the mass: coordinates are then in metres.
+        # The last column is scaled by the root of the mass, so that these coordinates are in metres.
         U[row, column] = x[4 + k] * (U[3, 3] if column == 3 else 1.0)
     pseudo = U @ U.T
     second, moment, mass = pseudo[:3, :3], pseudo[:3, 3], pseudo[3, 3]
@@ -72,7 +79,7 @@ def _link(x: Array) -> Array:
 
 
 def _coordinates(link: Array) -> Array:
-    """The same back, of a link that is physical or made so."""
+    """Return a link's coordinates; a link that is not physical is first made so."""
     mass = max(float(link[0]), LEAST_MASS)
     centre = link[1:4] / mass if link[0] > LEAST_MASS else np.zeros(3)
     inertia = np.zeros((3, 3))
@@ -82,7 +89,7 @@ def _coordinates(link: Array) -> Array:
     second = 0.5 * np.trace(about) * np.eye(3) - about
     size, turned = np.linalg.eigh(second)
     second = turned @ np.diag(np.maximum(size, mass * LEAST_SPREAD**2)) @ turned.T
-    # Upper triangular factor: a Cholesky factor read from the other end.
+    # The upper triangular factor is a Cholesky factor with rows and columns reversed.
     lower = np.linalg.cholesky(second[::-1, ::-1])
     U = lower[::-1, ::-1]
     return np.array(
@@ -91,5 +98,5 @@ def _coordinates(link: Array) -> Array:
 
 
 def _scales() -> Array:
-    """What counts as one step of each coordinate: a factor e of a spread or a root of mass; centimetres of centre."""
+    """Return the typical step of each coordinate: a factor e for spreads and mass, centimetres for the centre."""
     return np.array([1.0, 1.0, 1.0, 1.0, 0.003, 0.003, 0.02, 0.003, 0.02, 0.02])

@@ -1,4 +1,4 @@
-"""Open-loop prediction of a motion from given parameters, without measurements: the arm under its own feedback."""
+"""Open-loop prediction of a motion from given parameters, without measurements but with the arm's own feedback."""
 
 import math
 
@@ -12,23 +12,22 @@ from hil.estimator.errors import PeriodicityError
 from hil.estimator.simulation.arm import steps_per_sample
 from hil.estimator.simulation.closed_loop import Feedback
 
-PERIODS = 3  # simulated; the last is taken
+PERIODS = 3  # number of periods simulated, of which the last is used
 FINER = 4  # steps in place of one near standstill
-NEVER = 1e6  # N m
+NEVER = 1e6  # N m: a limit that is never reached
 
 
 def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeriod) -> Array:
-    """Angles (joints, samples) [rad] of this settled period: starting at rest at its first position and simulated until
-    the
-    transient has decayed, under its commands and its feedback.
+    """Predict the joint angles (joints, samples) [rad] of a settled period under its commands and its feedback.
 
-    Raises PeriodicityError if the motion diverges.
+    The simulation starts at rest at the first measured position and continues until the transient has decayed. Raises
+    PeriodicityError if the motion diverges.
     """
     joints, samples = period.joints, period.samples
     excitation, feedback = _commands(period)
     steps = steps_per_sample(period.rate)
     step = 1.0 / (period.rate * steps)
-    # Commands take effect `command_to_sample` before the sample of the same index, and `delay` later: so much less lag.
+    # Commands take effect `command_to_sample` before the sample of their index, plus `delay`; lumped into a lag.
     lag = max(parameters.get("lag", 0.0) + parameters.get("delay", 0.0) - period.command_to_sample, 1e-5)
     fallen = 1.0 - math.exp(-step / lag)
     share = fallen * lag / step
@@ -54,7 +53,7 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
 
 
 def _commands(period: SettledPeriod) -> tuple[Array, Feedback]:
-    """Commanded torque without the feedback's part (joints, samples) [N m], and the feedback."""
+    """Return the commanded torque without the feedback's contribution (joints, samples) [N m], and the feedback."""
     if period.stabiliser is None:
         feedback = Feedback.none(period.joints)
         return period.torque, Feedback(
@@ -64,7 +63,7 @@ def _commands(period: SettledPeriod) -> tuple[Array, Feedback]:
 
 
 def relative_error(period: SettledPeriod, predicted: Array) -> Array:
-    """RMS of measured minus predicted position over the RMS of the motion (joints,)."""
+    """Return the RMS of measured minus predicted position relative to that of the motion (joints,)."""
     error = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1))
     moved: Array = error / period.filled().std(axis=1)
     return moved

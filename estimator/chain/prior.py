@@ -8,10 +8,10 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.base_parameters import BaseParameters
 from hil.estimator.chain.dynamics import TERMS
 
-SPREAD = 1.0  # of every described parameter: no description is better than its mass, and many are copied
-LEAST_OFFSET = 0.02  # m: a centre of mass may be this far from where the description has it
-LEAST_GYRATION = 0.05  # m
-ARMATURE = 0.02  # kg m^2: standard deviation of a rotor's inertia that nobody knows
+SPREAD = 1.0  # relative standard deviation of every described parameter: descriptions are rarely accurate
+LEAST_OFFSET = 0.02  # m: minimum standard deviation of a centre of mass
+LEAST_GYRATION = 0.05  # m: minimum standard deviation of a radius of gyration
+ARMATURE = 0.02  # kg m^2: standard deviation of an unknown reflected rotor inertia
 
 
 @dataclass(frozen=True)
@@ -19,13 +19,13 @@ class Prior:
     """Prior distribution of the base parameters."""
 
     value: Array
-    """(base parameters,) [SI]."""
+    """Means (base parameters,) [SI]."""
     std: Array
-    """(base parameters,)."""
+    """Standard deviations (base parameters,) [SI]."""
 
     @classmethod
     def of(cls, base: BaseParameters, links: Array, armature: Array | None = None) -> "Prior":
-        """From the links' described parameters (joints, 10) and, where they are known, armatures (joints,)."""
+        """Create the prior from described link parameters (joints, 10) and, if known, armatures (joints,)."""
         joints = base.chain.joints
         rotor = np.full(joints, 0.5 * ARMATURE) if armature is None else armature
         every = np.column_stack((links, rotor)).reshape(-1)

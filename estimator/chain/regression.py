@@ -1,8 +1,9 @@
-"""Filtered inverse dynamics for chains: linear least squares on any recording, the classical method.
+"""Filtered inverse dynamics for chains, the classical method: linear least squares on any recording.
 
-Positions and torques are filtered alike, differentiated, and put into the regressor (Gautier, Janot, Vandanjon, IEEE
-Transactions on Control Systems Technology 21 (2013) 428). It needs no simulation, so it is also the way for a torque
-that was measured and not commanded; where the position is quantised it is biased and much less accurate than stage 2.
+Positions and torques are filtered identically, differentiated, and inserted into the regressor (Gautier, Janot,
+Vandanjon, IEEE Transactions on Control Systems Technology 21 (2013) 428). It needs no simulation, so it also works for
+torques that were measured rather than commanded. With quantised positions it is biased and much less accurate than
+stage 2.
 """
 
 from collections.abc import Sequence
@@ -23,9 +24,10 @@ from hil.estimator.errors import RecordingError
 def fit_filtered(
     recordings: Sequence[Recording], model: ChainModel, prior: Prior, cutoff: float, delay: float = 0.0
 ) -> tuple[Array, Array]:
-    """Values and standard errors, if the residual were white, of `ChainModel.linear_names` [SI].
+    """Return values and standard errors, assuming a white residual, of `ChainModel.linear_names` [SI].
 
-    `cutoff` [Hz] of the filter, `delay` [s] of the torque. Raises RecordingError if the recording cannot be filtered.
+    cutoff: cut-off frequency of the filter [Hz]. delay: delay of the torque [s]. Raises RecordingError if the recording
+    cannot be filtered.
     """
     rows = [_rows(recording, model, cutoff, delay) for recording in recordings]
     Y = np.concatenate([columns for columns, _ in rows], axis=1)

@@ -12,35 +12,36 @@ from hil.estimator.chain.kernels import room
 from hil.estimator.chain.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
-"""What stands for a term that a model lacks; zero for the others."""
+"""Values that disable a term that the model lacks; zero for all other terms."""
 AT_ONCE = 8
 
 
 @dataclass(frozen=True)
 class ChainRun:
-    """A simulation's input from a recording: the samples in order, each with its integration steps."""
+    """Input of a simulation from a recording: consecutive samples, each with its integration steps."""
 
     torque: Array
-    """Mean motor torque over each step after each sample, without the scale (samples, steps, joints) [N m]."""
+    """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
     slopes: Array
-    """Its derivatives by delay and by lag (samples, steps, 2, joints) [N m/s]."""
+    """Derivatives of `torque` by delay and by lag (samples, steps, 2, joints) [N m/s]."""
     measured: Array
-    """Angles (samples, joints) [rad]; NaN where a sample is missing."""
+    """Measured angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
-    """Length of a step [s]."""
+    """Length of an integration step [s]."""
     finer: int = 1
-    """Steps in place of one where a joint may be near standstill."""
+    """Number of smaller integration steps that replace one where a joint may be near standstill."""
 
 
-PIECE = 256  # samples whose derivatives stay in the processor's cache
+PIECE = 256  # samples whose derivatives fit into the processor's cache
 
 
 class Simulation:
-    """A simulation that advances piece by piece, with derivatives by the parameters `names` and then by the angles and
-    velocities at the first sample, unless there are no names.
+    """A simulation that advances piece by piece, optionally with derivatives.
 
-    `parameters` by name [SI]; `start` (2, joints) [rad, rad/s] at the first sample; `gain` (2, joints): of the
-    observer, per sample [1, 1/s].
+    parameters: by name [SI].
+    start: state at the first sample (2, joints) [rad, rad/s].
+    gain: gains of the observer per sample (2, joints) [1, 1/s].
+    names: parameters by which to differentiate, followed by the initial angles and velocities; no derivatives if empty.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class Simulation:
             np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
             np.array(start, dtype=np.float64, order="C"),
         )
-        # What nobody asks for is written behind all columns.
+        # Derivatives that are not wanted are written behind all columns.
         where = np.array([at.get(name, width) for name in base.names] + [width])
         self._columns = (
             where[places(n, base.columns)],
@@ -81,13 +82,16 @@ class Simulation:
 
     @property
     def state(self) -> Array:
-        """Angles and velocities at the next sample (2, joints) [rad, rad/s]; before the observer looks at it."""
+        """Angles and velocities at the next sample (2, joints) [rad, rad/s], before the observer's correction."""
         state: Array = self._arm[3]
         return state
 
     def go_on(self, run_: ChainRun, piece: slice) -> tuple[Array | None, Array]:
-        """Angles (samples, joints) [rad] of the next `piece` of the samples, None if the motion diverges, and their
-        derivatives (samples, joints, causes)."""
+        """Simulate the next `piece` of the samples.
+
+        Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives (samples, joints,
+        causes).
+        """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)
         derivative = np.empty((*measured.shape, self._causes))
@@ -99,5 +103,5 @@ class Simulation:
 
 
 def pieces(samples: int) -> list[slice]:
-    """Consecutive pieces of so many samples."""
+    """Return consecutive slices of at most PIECE samples that cover `samples` samples."""
     return [slice(first, min(first + PIECE, samples)) for first in range(0, samples, PIECE)]

@@ -1,7 +1,7 @@
 """Stage 1 for chains: linear least squares on the Fourier lines of settled periods, with a weak prior.
 
-As `hil.estimator.fit.stage1`, with the chain's regressor. Where the motion does not determine a base parameter, the
-prior does.
+It works like `hil.estimator.fit.stage1`, with the chain's regressor. Base parameters that the motion does not determine
+come from the prior.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from hil.estimator.chain.prior import Prior
 from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 
-COULOMB_WIDTH = 0.05  # rad/s: about the velocity that the dropped lines leave in a sticking joint
+COULOMB_WIDTH = 0.05  # rad/s: about the velocity error of a sticking joint due to the omitted lines
 PASSES = 3
 
 
@@ -24,19 +24,19 @@ class ChainLinear:
     """Result of the regression."""
 
     value: Array
-    """In the order of `ChainModel.linear_names` [SI]."""
+    """Values in the order of `ChainModel.linear_names` [SI]."""
     std: Array
-    """Standard errors if the residual were white."""
+    """Standard errors assuming a white residual."""
     delay: float
-    """Of the motors' torque [s]."""
+    """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]
-    """Each period's motion from its lines."""
+    """Motion of each period from its lines."""
     relative_residual: Array
-    """RMS of the torque residual over that of the torque (joints,)."""
+    """RMS of the torque residual relative to that of the torque (joints,)."""
 
 
 def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainLinear:
-    """Estimate the parameters in which torque is linear from settled periods."""
+    """Estimate the parameters in which the torque is linear from settled periods."""
     lines = [lines_of(period.filled()) for period in periods]
     highest = list(map(cut_off, lines))
     motions = tuple(
@@ -55,7 +55,7 @@ def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior)
 
 
 def columns_of(model: ChainModel, motion: PeriodicMotion) -> Array:
-    """The regressor of `ChainModel.linear_names` (joints, samples, names)."""
+    """Return the regressor of `ChainModel.linear_names` (joints, samples, names)."""
     rigid = model.base.regressor(motion.position, motion.velocity, motion.acceleration)
     return np.concatenate((rigid, columns_of_friction(motion)), axis=2)
 
@@ -72,8 +72,14 @@ def columns_of_friction(motion: PeriodicMotion) -> Array:
 
 
 def solve(columns: Array | Lines, torque: Array | Lines, weight: Array, prior: Prior) -> tuple[Array, Array]:
-    """Weighted least squares of `torque` (joints, rows) on `columns` (joints, rows, unknowns), the first of which are
-    base parameters with a `prior`; `weight` (joints,): inverse standard deviation of a row [1/(N m)]."""
+    """Solve for the parameters by weighted least squares; return values and standard errors.
+
+    Args:
+        columns: regressor (joints, rows, unknowns), whose first unknowns are the base parameters.
+        torque: torques (joints, rows) [N m].
+        weight: inverse standard deviation of a row (joints,) [1/(N m)].
+        prior: prior on the base parameters.
+    """
     weighted = (columns * weight[:, None, None]).reshape(-1, columns.shape[2])
     goal = (torque * weight[:, None]).reshape(-1)
     A = np.concatenate((weighted.real, weighted.imag)) if np.iscomplexobj(weighted) else weighted
@@ -92,7 +98,7 @@ def solve(columns: Array | Lines, torque: Array | Lines, weight: Array, prior: P
 
 
 def _equations(period: SettledPeriod, motion: PeriodicMotion, highest: int, model: ChainModel) -> tuple[Lines, Lines]:
-    """One period's columns (joints, lines, unknowns) and torques (joints, lines), line by line."""
+    """Return one period's columns (joints, lines, unknowns) and torques (joints, lines)."""
     Y = columns_of(model, motion)
     columns = np.stack([np.fft.rfft(rows, axis=0)[: highest + 1] for rows in Y]) / period.samples
     torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : highest + 1]

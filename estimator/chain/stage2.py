@@ -1,7 +1,7 @@
 """Stage 2 for chains: maximum likelihood of one-step-ahead position predictions, starting from stage 1.
 
-The observer starts stiff, so that stage 1's parameters can follow the motion, and is softened as the fit
-improves. Most iterations use coarse integration steps; the last ones use fine steps. The noise level of each
+The observer starts stiff, so that the simulation can follow the motion with stage 1's parameters, and is softened as
+the fit improves. Most iterations use coarse integration steps; the last ones use fine steps. The noise level of each
 joint is itself estimated before the final iterations, in which outliers are downweighted (Huber).
 """
 
@@ -27,6 +27,7 @@ from hil.estimator.fit.covariance import (
     structured_share,
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
+from hil.estimator.fit.noise_weights import noise_weights
 from hil.estimator.options import CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
@@ -35,13 +36,15 @@ START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_s
 
 @dataclass(frozen=True)
 class ChainOptions:
-    """Of the likelihood of chains; names as in `hil.estimator.options`."""
+    """Options of the likelihood of chains; names as in `hil.estimator.options`."""
 
     softness: tuple[float, ...] = (3.0, 1.5, 1.0)
-    """Natural frequency of the observer, one after the other [Hz]. Softer shows more of the arm; much softer never
-    stays with it."""
+    """Natural frequencies of the observer, in order of use [Hz].
+
+    A softer observer reveals more of the arm; one that is much softer loses the motion.
+    """
     lost: float = 1.5
-    """Where a softer observer leaves so many times more than its softness explains, the one before is kept."""
+    """Cost increase, beyond what the softness explains, above which the previous observer is kept (a ratio)."""
     coarse_step: float = 2.6e-3
     """Of integration [s]."""
     fine_step: float = 1.3e-3
@@ -51,7 +54,7 @@ class ChainOptions:
     width_floor: float = 3e-4
     """Least width of every Coulomb step [rad/s]: friction that sticks is hardly told from this."""
     initial_width: float = 0.03
-    """[rad/s]"""
+    """Initial width of the smoothed Coulomb step [rad/s]."""
     min_initial_lag: float = 5e-4
     """[s]"""
     reach: float = 0.3
@@ -61,11 +64,11 @@ class ChainOptions:
     ftol_nearer: float = 1e-3
     ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
-    """Shares of the way from the prior to stage 1 at which to begin, the first at which the arm can be simulated."""
+    """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
     angle_scale: float = 0.1
-    """[rad]"""
+    """Scale of the initial angles [rad]."""
     outlier_threshold: float = 4.0
-    """Standard deviations."""
+    """Residual in standard deviations above which a sample is downweighted."""
 
 
 DEFAULTS = ChainOptions()
@@ -81,21 +84,21 @@ class ChainFit:
     """The most likely parameters under one model."""
 
     value: Array
-    """In the order of `ChainModel.names` [SI]."""
+    """Values in the order of `ChainModel.names` [SI]."""
     covariance: Array
-    """Of `value`, robust against correlated errors."""
+    """Covariance of `value`, robust to correlated errors."""
     white_covariance: Array
-    """Of `value`, if every sample's error were independent."""
+    """Covariance of `value` if the errors of all samples were independent."""
     starts: tuple[Array, ...]
-    """Of each period, angles and velocities at the first sample (2, joints)."""
+    """State at the first sample of each period (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]
-    """Of each period, predicted positions (joints, samples) [rad]."""
+    """Predicted positions of each period (joints, samples) [rad]."""
     outliers: int
-    """Samples that were downweighted."""
+    """Number of samples that were downweighted."""
     correlation_time: float
-    """Samples over which the residual is correlated; 1 is white."""
+    """Number of samples over which the residual is correlated; 1 is white."""
     iterations: int
-    """Simulations with derivatives."""
+    """Number of simulations with derivatives."""
     softness: float
     """Natural frequency of the observer at the end [Hz]."""
 
@@ -107,7 +110,10 @@ def fit_periods(
     prior: Prior,
     options: ChainOptions = DEFAULTS,
 ) -> ChainFit:
-    """The most likely parameters of `model`, from stage 1's `linear`. Raises ConvergenceError."""
+    """Return the maximum-likelihood parameters of `model`, starting from stage 1's result `linear`.
+
+    Raises ConvergenceError.
+    """
     problem, x = _problem(periods, model, linear, prior, options)
     coarse = replace(problem, steps=_steps(periods, options.coarse_step))
     x = _towards_prior(coarse, x, options)
@@ -132,7 +138,8 @@ def fit_periods(
     near = sticking.minimise(found.x, options.ftol_near)
     positions = sticking.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
-    weights, outliers = _weights(periods, positions, options.outlier_threshold)
+    weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
+    weights = tuple((weight * _repeated(each)).T for weight, each in zip(weights, periods, strict=True))
     nearer = replace(sticking, weights=weights, reach=options.reach).minimise(near.x, options.ftol_nearer)
     last = replace(sticking, weights=weights, steps=problem.steps, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
@@ -145,7 +152,7 @@ def fit_periods(
 def _problem(
     periods: Sequence[SettledPeriod], model: ChainModel, linear: ChainLinear, prior: Prior, options: ChainOptions
 ) -> tuple[ChainProblem, Array]:
-    """The problem with every sample weighted by the noise known beforehand, and the point to start from."""
+    """Return the problem, with every sample weighted by the known noise, and the initial guess."""
     velocity = float(np.sqrt(np.mean([np.mean(motion.velocity**2) for motion in linear.motions])))
     scales = np.concatenate((np.maximum(prior.std, 1e-9), np.ones(len(model.names) - prior.std.size)))
     coordinates = ChainCoordinates(model.names, scales, options.width_floor)
@@ -167,9 +174,9 @@ def _problem(
 
 
 def _towards_prior(problem: ChainProblem, x: Array, options: ChainOptions) -> Array:
-    """Stage 1's point, moved towards the prior until the arm there can be simulated.
+    """Return stage 1's point, moved towards the prior until the arm can be simulated.
 
-    Where the data hardly determine some inertias, the estimates may be unphysical, with an indefinite mass matrix.
+    If the data hardly determine some inertias, the estimates may be unphysical, with an indefinite mass matrix.
     """
     count = problem.model.base.count
     likely = problem.prior.value / problem.coordinates.scales[:count]
@@ -183,25 +190,6 @@ def _towards_prior(problem: ChainProblem, x: Array, options: ChainOptions) -> Ar
 
 def _steps(periods: Sequence[SettledPeriod], longest: float) -> int:
     return max(steps_per_sample(period.rate, longest) for period in periods)
-
-
-def _weights(
-    periods: Sequence[SettledPeriod], positions: Sequence[Array], outlier: float
-) -> tuple[tuple[Array, ...], int]:
-    """Weights by how large each joint's errors turned out, and the number of outliers."""
-    weights = []
-    outliers = 0
-    for period, position in zip(periods, positions, strict=True):
-        error = np.where(period.valid, np.abs(period.position - position), 0.0)
-        # 1.35 medians are a standard deviation between those of rounding (1.15) and of normal errors (1.48).
-        typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
-        spread = np.maximum(typical, period.noise)[:, None]
-        far = error > outlier * spread
-        weight = np.where(far, np.sqrt(outlier * spread / np.where(far, error, 1.0)), 1.0) * _repeated(period)
-        rms = np.sqrt(np.nanmean(np.where(far | ~period.valid, np.nan, error) ** 2, axis=1))[:, None]
-        weights.append(np.where(period.valid, weight / np.maximum(rms, period.noise[:, None]), 0.0).T)
-        outliers += int(far.sum())
-    return tuple(weights), outliers
 
 
 def _repeated(period: SettledPeriod) -> Array:

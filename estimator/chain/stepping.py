@@ -1,19 +1,20 @@
-"""The chain's motion under given motor torques and its derivatives by parameters and starting state, compiled.
+"""The compiled motion of a chain under given motor torques, and its derivatives by parameters and initial state.
 
-Friction and drive are those of `hil.estimator.simulation.arm`. Each step is its Rosenbrock method ROS2 with the
-second stage written so that both need the regressor at one acceleration only: with f the torques left after friction,
-S friction's slopes, ID inverse dynamics, M the mass matrix and primes at the end that stage 1 foresees,
+Friction and drive are those of `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method ROS2,
+with the second stage written so that both stages need the regressor at one acceleration only. With f the torques minus
+friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for quantities at the end
+predicted by stage 1,
 
     ID(q, v, k) + gamma h S k = f        ID(q', v', l + 2 k) + gamma h S' l = f'
     v += h (3 k + l) / 2                 q += h v + h^2 k / 2
 
-which differs from ROS2 in the Jacobian of its second stage and keeps second order. Differentiating both gives
+This differs from ROS2 in the Jacobian of its second stage and is still second-order. Differentiating both yields
 
     W dk = -(ID_q dq + ID_v dv + Y dp + ...)        W = M + gamma h S
 
-so that one more parameter costs one more column. Once a sample the state is drawn to the measured angles by an
-observer, q += g (measured - q), v += g' (measured - q), with its derivatives: what is left at each sample before that
-is what the model could not foresee.
+so that one more parameter costs one more column. At each sample an observer moves the state towards the measured
+angles, q += g (measured - q), v += g' (measured - q), and the derivatives with it; the residual before this correction
+is the prediction error.
 """
 
 import math
@@ -38,7 +39,7 @@ WORST = 1e4  # rad or rad/s: a simulation that comes here has run away
 
 
 def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
-    """Torque that drive j leaves its joint, and friction's slope."""
+    """Compute the torque of drive j minus friction and offset, and the slope of friction, into `out`."""
     motor = p[SCALE, j] * t
     ratio = v / p[FADING, j]
     past = ratio * ratio
@@ -53,10 +54,11 @@ def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
 def _direct(
     p: Any, at: Any, j: int, v: float, t: float, late: float, lagged: float, times: Any, ghk: float, by: Any, row: Any
 ) -> None:
-    """What the step's equation of joint j changes with directly, by the drive's parameters; by v into `by`.
+    """Compute the direct derivatives of joint j's step equation by the drive's parameters, and by v into `by`.
 
-    ghk: gamma h times the stage's acceleration, late and lagged: the torque's derivatives by delay and by lag, times:
-    their columns."""
+    ghk: gamma h times the stage's acceleration. late, lagged: derivatives of the torque by delay and by lag. times:
+    their columns.
+    """
     scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
     motor = scale * t
     sign = 1.0 if motor > 0.0 else -1.0
@@ -69,7 +71,7 @@ def _direct(
     bent = (1.0 - bend * bend) / width
     level_v = -2.0 * coulomb * rise * bump * v / (fading * fading)
     bent_v = -2.0 * bend * bent / width
-    # The equation is ID - left + ghk slope = 0: of each, how `left` falls and how the slope rises.
+    # The equation is ID - left + ghk slope = 0; each entry: the decrease of `left` plus ghk times the slope's increase.
     by[j] = p[VISCOUS, j] + level_v * bend + level * bent + ghk * (level_v * bent + level * bent_v)
     shape = bend + ghk * bent
     row[at[VISCOUS, j]] = v + ghk
@@ -98,7 +100,7 @@ def _mix_four(out: Any, a: float, x: Any, b: float, y: Any, c: float, z: Any, d:
 
 
 def _combine(A: Any, X: Any, B: Any, Y: Any, n: int, width: int, out: Any) -> None:
-    """out += A X + B Y, (n, n) by (n, width)."""
+    """Add A X + B Y to out, where A and B are (n, n), X and Y (n, width)."""
     for i in range(n):
         j = 0
         while j + 1 < n:
@@ -109,7 +111,7 @@ def _combine(A: Any, X: Any, B: Any, Y: Any, n: int, width: int, out: Any) -> No
 
 
 def _solved(inverse: Any, R: Any, n: int, width: int, out: Any) -> None:
-    """out = -inverse R."""
+    """Set out = -inverse R."""
     for i in range(n):
         for c in range(width):
             out[i, c] = 0.0
@@ -125,7 +127,7 @@ def _solved(inverse: Any, R: Any, n: int, width: int, out: Any) -> None:
 def _stage(
     chain: Any, links: Any, p: Any, q: Any, v: Any, t: Any, before: Any, gh: float, found: Any, work: Any, solve: Any
 ) -> bool:
-    """Solve ID(q, v, found + before) + gh S found = left for `found`; leaves the accelerations at that."""
+    """Solve ID(q, v, found + before) + gh S found = left for `found`; `solve` then holds the total acceleration."""
     rotation, translation, axis, gravity = chain
     link, armature = links
     left, matrix, inverse, factor, angle, total, rhs = solve
@@ -167,7 +169,7 @@ def _follow(
     by: Any,
     direct: Any,
 ) -> None:
-    """Derivatives of a solved stage's equation: by q and v in `work`, of friction by v too, directly in `direct`."""
+    """Compute the derivatives of a solved stage's equation by q and v (in `work`) and parameters (in `direct`)."""
     base, at, times = columns
     total = solve[5]
     accelerate(links[1], chain[3], v, total, work)
@@ -256,7 +258,7 @@ def _run_loop(  # noqa: PLR0912
                     _follow(chain, links, p, v1, t, slopes[sample, s], m, gh, columns, work, solve, by, direct)
                     for i in range(n):
                         for j in range(n):
-                            # By v' = v + h k, and by k through the acceleration.
+                            # Derivatives through v' = v + h k, and through k in the acceleration.
                             twice[0, i, j] = h * work[7][i, j] + 2.0 * work[4][i, j]
                             twice[1, i, j] = work[7][i, j] + h * work[6][i, j]
                         for c in range(width):

@@ -1,4 +1,4 @@
-"""A settled period as its Fourier lines: noise, cut-off, exact derivatives, the held command."""
+"""Fourier lines of a settled period: noise, cut-off, exact derivatives, the held command."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,12 @@ from hil.estimator.arrays import Array
 
 Lines = npt.NDArray[np.complex128]
 
-SIGNAL_OVER_NOISE = 4.0  # in power, for a band of lines to count as signal
-BAND = 8  # lines looked at together
+SIGNAL_OVER_NOISE = 4.0  # power ratio above which a band of lines counts as signal
+BAND = 8  # lines that are evaluated together
+
+
+_AHEAD = np.array((3.0, -3.0, 1.0))
+"""Weights of the three nearest samples, nearest first, for the one beyond them: a parabola."""
 
 
 @dataclass(frozen=True)
@@ -23,16 +27,16 @@ class PeriodicMotion:
 
 
 def lines_of(signal: Array) -> Lines:
-    """Coefficients (..., samples // 2 + 1) of one period (..., samples), the sum of c_k exp(j k w0 t)."""
+    """Return the coefficients c_k (..., samples // 2 + 1) of a period (..., samples): the sum of c_k exp(j k w0 t)."""
     return np.asarray(np.fft.rfft(signal, axis=-1) / signal.shape[-1])
 
 
 def noise_power(lines: Lines) -> Array:
-    """Mean |c|^2 of the noise in one line (joints,), from the upper half of the lines, where nothing was
-    excited.
+    """Return the mean |c|^2 of the noise per line (joints,), from the upper half of the lines, without excitation.
 
-    The median of an exponentially distributed power is log 2 of its mean, and is robust to single lines. Odd and even
-    lines are evaluated separately: rounding of a motion whose second half mirrors its first has no even lines at all.
+    The median of an exponentially distributed power is log 2 times its mean and robust to single lines. Odd and even
+    lines are evaluated separately: the rounding error of a motion whose second half mirrors its first has no even lines
+    at all.
     """
     upper = np.abs(lines[:, lines.shape[1] // 2 :]) ** 2
     medians = [np.median(upper[:, first::2], axis=1) for first in (0, 1)]
@@ -41,21 +45,33 @@ def noise_power(lines: Lines) -> Array:
 
 
 def white_noise(position: Array) -> Array:
-    """Standard deviation of the white noise in one period of angles (joints, samples), in their unit (joints,).
+    """Return the standard deviation of the white noise in one period of angles (joints, samples), per joint.
 
-    From the upper quarter of the lines, far above any motion. A linear trend is removed first: if the period does
-    not close because the arm drifts, the jump spreads over all lines.
+    It is estimated from the upper quarter of the lines, far above any motion. A linear trend is removed first, since
+    the jump of a period that does not close because the arm drifts spreads over all lines.
     """
     samples = position.shape[1]
-    ramp = (position[:, -1:] - position[:, :1]) * (np.arange(samples) / max(1, samples - 1))
-    lines = lines_of(position - ramp)
+    lines = lines_of(position - _jump(position)[:, None] * (np.arange(samples) / samples))
     upper = lines[:, lines.shape[1] // 2 :]
     noise: Array = np.sqrt(noise_power(upper) * samples)
     return noise
 
 
+def _jump(position: Array) -> Array:
+    """Return by how much a period (joints, samples) fails to close (joints,): the motion between two samples taken off.
+
+    At low rates a joint moves by many encoder steps from the last sample to the next first one.
+    """
+    if position.shape[1] < len(_AHEAD):
+        return np.zeros(len(position))
+    after = position[:, : -len(_AHEAD) - 1 : -1] @ _AHEAD - position[:, 0]
+    before = position[:, -1] - position[:, : len(_AHEAD)] @ _AHEAD
+    jump: Array = 0.5 * (after + before)
+    return jump
+
+
 def cut_off(lines: Lines) -> int:
-    """The highest harmonic that is still signal on some joint, by the mean power of bands of lines."""
+    """Return the highest harmonic with signal on any joint, judged by the mean power of bands of lines."""
     count = (lines.shape[1] - 1) // BAND
     power = np.abs(lines[:, 1 : 1 + count * BAND]) ** 2
     bands = power.reshape(lines.shape[0], count, BAND).mean(axis=2)
@@ -64,7 +80,7 @@ def cut_off(lines: Lines) -> int:
 
 
 def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) -> PeriodicMotion:
-    """The motion reconstructed from the lines up to `harmonics`, differentiated exactly by j k w0."""
+    """Return the motion reconstructed from the lines up to `harmonics`, with exact derivatives (j k w0)."""
     kept = np.zeros_like(lines)
     kept[:, : harmonics + 1] = lines[:, : harmonics + 1]
     turn = 1j * fundamental * np.arange(lines.shape[1])
@@ -73,10 +89,9 @@ def motion_of(lines: Lines, harmonics: int, fundamental: float, samples: int) ->
 
 
 def held_lines(command: Array, rate: float, delay: float) -> Lines:
-    """Lines of a command (joints, samples) with zero-order hold between samples and a delay of `delay`
-    [s].
+    """Return the lines of a command (joints, samples) after a zero-order hold and a delay of `delay` [s].
 
-    Holding scales line k by sinc(f_k / rate) and delays it by half a sample. `delay` may be negative.
+    The hold scales line k by sinc(f_k / rate) and delays it by half a sample. `delay` may be negative.
     """
     lines = lines_of(command)
     frequency = np.arange(lines.shape[-1]) * rate / command.shape[-1]

@@ -10,22 +10,22 @@ from hil.estimator.errors import ShapeError
 
 @dataclass(frozen=True)
 class Settling:
-    """RMS difference of each period from the one before."""
+    """RMS difference of each period from the previous one."""
 
     difference: Array
-    """(periods - 1, joints) [rad]."""
+    """RMS difference (periods - 1, joints) [rad]."""
     relative: Array
-    """The same over the RMS of the later period's motion about its mean (periods - 1, joints)."""
+    """RMS difference relative to the RMS of the later period's motion about its mean (periods - 1, joints)."""
 
 
 def period_difference(position: Array) -> Settling:
-    """Compare each period of `position` (periods, joints, samples) [rad] with the one before.
+    """Compare each period of `position` (periods, joints, samples) [rad] with the previous one.
 
-    Missing samples are NaN and left out of both; for a joint with no samples to compare the difference is infinite.
-    Raises ShapeError for fewer than two periods.
+    Samples missing (NaN) in either period are ignored; for a joint with no samples to compare, the difference is
+    infinite. Raises ShapeError for fewer than two periods.
     """
     if position.ndim != 3 or position.shape[0] < 2:
-        raise ShapeError(f"position is {position.shape}: must be (periods, joints, samples) with at least two periods")
+        raise ShapeError(f"position has shape {position.shape}; it must be (at least 2 periods, joints, samples)")
     difference = _rms(np.diff(position, axis=0))
     later = position[1:]
     seen = np.isfinite(later)
@@ -37,17 +37,18 @@ def period_difference(position: Array) -> Settling:
 
 
 def settling_difference(former: Array, latest: Array) -> float:
-    """How far a period, (joints, samples) [rad], is from the one before: RMS over the motion's RMS, the worst joint.
+    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion.
 
-    Only the later halves are compared. If they agree, the previous period ended settled, so the whole latest one is
-    settled even though the previous one began with the ramp's transient: this saves a whole period of arm time.
+    The worst joint counts. Only the second halves are compared: if they agree, the previous period ended settled, so
+    the whole latest one is settled even if the previous one began with the transient of the ramp. This saves a whole
+    period of arm time.
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
 
 
 def _rms(values: Array) -> Array:
-    """Over the last axis, NaN left out; infinite where nothing is left."""
+    """Return the RMS over the last axis, ignoring NaN; infinite if nothing is left."""
     seen = np.isfinite(values)
     count = seen.sum(axis=-1)
     total = np.sum(np.where(seen, values, 0.0) ** 2, axis=-1)

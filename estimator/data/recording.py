@@ -1,6 +1,7 @@
 """A recording of any motion: torque and position at the actual sampling times."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,9 @@ FEWEST_SAMPLES = 32
 LEAST_VALID = 0.5  # of a joint's samples
 LEAST_MOTION = 4.0  # encoder steps from end to end
 MOST_GAP = 0.2  # s between samples: what moves in between is not seen
+MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # from which on samples are missing: usual intervals, s
+LONGEST_GAP = 10.0  # s within one recording
+LEAST_NOISE = 1e-5  # rad: no encoder of an arm has less
 MOST_ANGLE = 200.0  # rad: more is degrees or encoder steps
 MOST_SPEED = 500.0  # rad/s between samples, likewise
 MOST_TORQUE = 1e4  # N m
@@ -21,15 +25,15 @@ MOST_TORQUE = 1e4  # N m
 
 @dataclass(frozen=True)
 class Recording:
-    """Torque and position of an arm in any motion: ramps, swing-ups, recordings of other tools.
+    """Torque and position of an arm in any motion: ramps, swing-ups, recordings by other tools.
 
-    Positions that are missing are NaN. Raises ShapeError for arrays that do not fit together, RecordingError
-    for times that do not increase, values that are not finite, gaps and values that are implausible in SI units,
-    StandstillError for a joint that moved by hardly more than its encoder step.
+    Missing positions are NaN. Raises ShapeError for incompatible arrays; RecordingError for times that do not increase,
+    non-finite values, gaps, and values that are implausible in SI units; StandstillError for a joint that moved by
+    hardly more than its encoder step.
     """
 
     time: Array
-    """When the positions were taken (samples,) [s]; the intervals need not be equal."""
+    """Sampling times of the positions (samples,) [s]; the intervals need not be equal."""
     torque: Array
     """Motor torque (joints, samples) [N m]."""
     position: Array
@@ -39,7 +43,7 @@ class Recording:
     between: Between = "linear"
     """Torque between its samples: `held` for a command, `linear` for a measurement."""
     command_to_sample: float = 0.0
-    """Value k of the torque holds from this long before position k [s]."""
+    """Time from the instant of torque value k to that of position k [s]."""
 
     def __post_init__(self) -> None:
         _check_shapes(self)
@@ -58,13 +62,19 @@ class Recording:
         return float(np.median(np.diff(self.time)))
 
     @property
+    def longest_interval(self) -> float:
+        """Samples further apart have a gap between them [s]."""
+        return max(MOST_INTERVALS * self.interval, SHORTEST_GAP)
+
+    @cached_property
     def noise(self) -> Array:
-        """Standard deviation of one position as its rounding leaves it (joints,) [rad]."""
-        noise: Array = self.position_step / np.sqrt(12.0)
-        return noise
+        """Standard deviation of one position (joints,) [rad]: what is measured to be white, and rounding at least."""
+        rounding = self.position_step / np.sqrt(12.0)
+        white = np.array([_white_noise(self.time, row) for row in self.position])
+        return np.asarray(np.maximum(rounding, white))
 
     def filled(self) -> Array:
-        """Positions (joints, samples) with the missing ones interpolated between their neighbours [rad]."""
+        """Return the positions (joints, samples) [rad], with missing ones interpolated between their neighbours."""
         position = self.position.copy()
         for row in position:
             valid = np.isfinite(row)
@@ -73,7 +83,10 @@ class Recording:
         return position
 
     def mean_torque(self, edges: Array, delay: float) -> Array:
-        """Mean torque between neighbouring `edges` (n,) [s], `delay` [s] late (joints, n - 1) [N m]."""
+        """Return the mean torque between neighbouring `edges` (n,) [s], with a delay of `delay` [s].
+
+        The result has the shape (joints, n - 1) [N m].
+        """
         at = self.time - self.command_to_sample
         wanted = edges - delay
         rise = np.diff(at)
@@ -88,7 +101,7 @@ class Recording:
                 k = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, at.size - 2)
                 late = wanted - at[k]
                 slope = (torque[k + 1] - torque[k]) / rise[k] * ((wanted >= at[0]) & (wanted <= at[-1]))
-                # Past either end the last value stands.
+                # Beyond either end the end value is held.
                 start = np.where(wanted > at[-1], total[-1] - torque[-1] * rise[-1], total[k])
                 level = np.where(wanted > at[-1], torque[-1], torque[k])
                 integral = start + late * (level + 0.5 * slope * late)
@@ -96,17 +109,39 @@ class Recording:
         return means
 
 
+def _white_noise(time: Array, row: Array) -> float:
+    """Standard deviation of what neighbouring samples do not share [rad]: from the cubic through four of five.
+
+    The median over the recording: quick motion, which no cubic follows, is the smaller part of it.
+    """
+    valid = np.isfinite(row)
+    time, row = time[valid], row[valid]
+    count = time.size - 4
+    if count < FEWEST_SAMPLES:
+        return LEAST_NOISE
+    near = np.arange(count)[:, None] + np.arange(5)
+    t, y = time[near] - time[near[:, 2:3]], row[near]
+    weight = np.ones((count, 5))
+    for i in range(5):
+        for j in range(5):
+            if i != j:
+                weight[:, i] /= t[:, i] - t[:, j]
+    # Divided differences of fourth order: a cubic has none.
+    left = np.sum(weight * y, axis=1) / np.sqrt(np.sum(weight**2, axis=1))
+    return max(LEAST_NOISE, float(np.median(np.abs(left))) / 0.6745)
+
+
 def _check_shapes(recording: Recording) -> None:
     position, torque, time = recording.position, recording.torque, recording.time
     if position.ndim != 2 or torque.shape != position.shape or time.shape != position.shape[1:]:
         raise ShapeError(
-            f"time {time.shape}, torque {torque.shape} and position {position.shape} must be (samples,) and twice "
-            "(joints, samples)"
+            f"time has shape {time.shape}, torque {torque.shape} and position {position.shape}; they must be "
+            "(samples,), (joints, samples) and (joints, samples)"
         )
     if recording.position_step.shape != position.shape[:1]:
-        raise ShapeError(f"position_step is {recording.position_step.shape}, it must be {position.shape[:1]}")
+        raise ShapeError(f"position_step has shape {recording.position_step.shape}; it must be {position.shape[:1]}")
     if time.size < FEWEST_SAMPLES:
-        raise RecordingError(f"the recording has {time.size} samples, at least {FEWEST_SAMPLES} are needed")
+        raise RecordingError(f"the recording has {time.size} samples; at least {FEWEST_SAMPLES} are needed")
 
 
 def _check_times(recording: Recording) -> None:
@@ -123,9 +158,9 @@ def _check_times(recording: Recording) -> None:
         )
     if float(np.median(step)) > MOST_GAP:
         raise RecordingError(
-            f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is usable: is time in seconds?"
+            f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is allowed. Is time in seconds?"
         )
-    if step.max() > 5.0 * MOST_GAP:
+    if step.max() > LONGEST_GAP:
         k = int(np.argmax(step))
         raise RecordingError(
             f"{step[k]:.3g} s are missing after sample {k + 1} at {time[k]:g} s: split the recording there"
@@ -136,7 +171,7 @@ def _check_values(recording: Recording) -> None:
     if not (np.all(recording.position_step > 0.0) and np.isfinite(recording.command_to_sample)):
         raise RecordingError(f"position_step {recording.position_step} rad must be positive, command_to_sample finite")
     if not recording.torque.any():
-        raise RecordingError("all torques are 0: without torque nothing fixes the scale of the parameters")
+        raise RecordingError("all torques are 0: without torque the scale of the parameters cannot be determined")
     for joint in range(recording.joints):
         torque, position = recording.torque[joint], recording.position[joint]
         bad = np.nonzero(~np.isfinite(torque))[0]
@@ -148,7 +183,7 @@ def _check_values(recording: Recording) -> None:
         valid = np.isfinite(position)
         if float(np.mean(valid)) < LEAST_VALID:
             raise RecordingError(
-                f"joint {joint + 1}: {100 * float(np.mean(valid)):.0f} % of {position.size} positions are numbers, at "
+                f"joint {joint + 1}: {100 * float(np.mean(valid)):.0f} % of {position.size} positions are numbers; at "
                 f"least {100 * LEAST_VALID:.0f} % are needed"
             )
         most = float(np.abs(torque).max())
@@ -165,7 +200,7 @@ def _check_motion(recording: Recording) -> None:
         least = LEAST_MOTION * float(recording.position_step[joint])
         if swing <= least:
             raise StandstillError(
-                f"joint {joint + 1} moved by {swing:.2g} rad, at least {least:.2g} rad are needed: check the column "
+                f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: check the column "
                 "and its unit, or drive it harder"
             )
         speed = float(np.abs(np.diff(row) / np.diff(recording.time)).max())

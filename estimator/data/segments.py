@@ -1,4 +1,4 @@
-"""A recording cut into segments on the grid of its simulation, each with its own initial state and motor torque."""
+"""A recording cut into segments on its simulation grid, each with its own initial state and motor torque."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 
@@ -14,31 +14,33 @@ Indices = npt.NDArray[np.int64]
 
 LONGEST_STEP = 1e-3  # s
 FEWEST = 8  # samples in a segment
-START_WINDOW = 0.03  # s on either side, for the state that a segment starts from
+START_WINDOW = 0.03  # s before and after a segment's start, used to estimate its initial state
 DIFFERENCE = 1e-7  # s
 
 
 @dataclass(frozen=True)
 class RecordingSegment:
-    """A piece of a recording on the grid of its simulation."""
+    """A piece of a recording on its simulation grid."""
 
     recording: int
-    """Which recording it is from."""
+    """Index of its recording."""
     first: int
-    """Grid point of its start."""
+    """Grid point at its start."""
     steps: int
-    """Grid steps that it takes."""
+    """Number of grid steps."""
     index: Indices
     """Grid points around each of its samples (samples, 4), counted from `first`."""
     weight: Array
-    """Of each of them: cubic interpolation (samples, 4)."""
+    """Weights of the grid points in `index` for cubic interpolation (samples, 4)."""
     position: Array
-    """Measured (joints, samples) [rad]."""
+    """Measured positions (joints, samples) [rad]."""
     state: Array
     """Angles and velocities at its start by a local fit (2, joints) [rad, rad/s]."""
+    samples: slice
+    """Which of the recording's samples are its own."""
 
     def at_samples(self, grid: Array) -> Array:
-        """Values (joints, grid points, ...) interpolated at the times of the samples (joints, samples, ...)."""
+        """Interpolate values on the grid (joints, grid points, ...) at the sampling times (joints, samples, ...)."""
         weight = self.weight.reshape(*self.weight.shape, *(1,) * (grid.ndim - 2))
         values = np.zeros((grid.shape[0], len(self.index), *grid.shape[2:]))
         for n in range(4):
@@ -48,42 +50,48 @@ class RecordingSegment:
 
 @dataclass(frozen=True)
 class Grid:
-    """A recording's times as equal simulation steps."""
+    """The duration of a recording divided into equal simulation steps."""
 
     start: float
-    """[s]."""
+    """Time of the first grid point [s]."""
     step: float
-    """[s]."""
+    """Length of a step [s]."""
     edges: Array
-    """(steps + 1,) [s]."""
+    """Times of all grid points (steps + 1,) [s]."""
 
     @classmethod
-    def of(cls, recording: Recording) -> "Grid":
-        """From the first sample to the last, in steps of at most LONGEST_STEP."""
+    def of(cls, recording: Recording, longest: float = LONGEST_STEP) -> "Grid":
+        """From the first sample to the last, in steps of at most `longest` [s]."""
         span = float(recording.time[-1] - recording.time[0])
-        count = int(np.ceil(span / LONGEST_STEP))
+        count = int(np.ceil(span / longest - 1e-9))
         step = span / count
         return cls(float(recording.time[0]), step, recording.time[0] + step * np.arange(count + 1))
 
 
 def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[RecordingSegment]:
-    """Cut a recording into equal pieces of about `length` [s]; `number` says which recording it is.
+    """Cut a recording into equal pieces of about `length` [s]; `number` is the recording's index.
 
-    Raises RecordingError when no piece holds FEWEST samples.
+    A piece in which the recording has a gap is left out. Raises RecordingError when no piece holds FEWEST samples.
     """
     steps = len(grid.edges) - 1
     pieces = max(1, round(steps * grid.step / length))
     edges = np.round(np.linspace(0, steps, pieces + 1)).astype(np.int64)
     place = (recording.time - grid.start) / grid.step
+    gaps = np.diff(recording.time) > recording.longest_interval
+    before, after = place[:-1][gaps], place[1:][gaps]
     segments = []
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         inside = (place >= first - 1e-6) & (place < last) if last < steps else (place >= first - 1e-6)
+        if np.any((before < last) & (after > first)):
+            continue
         if inside.sum() < FEWEST or not np.isfinite(recording.position[:, inside]).any(axis=1).all():
             continue
         index, weight = _cubic(place[inside] - first, last - first)
         state = _state_at(recording, grid.start + grid.step * first)
         segments.append(
-            RecordingSegment(number, first, last - first, index, weight, recording.position[:, inside], state)
+            RecordingSegment(
+                number, first, last - first, index, weight, recording.position[:, inside], state, _slice(inside)
+            )
         )
     if not segments:
         raise RecordingError(
@@ -92,12 +100,17 @@ def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Re
     return segments
 
 
+def _slice(inside: Mask) -> slice:
+    at = np.flatnonzero(inside)
+    return slice(int(at[0]), int(at[-1]) + 1)
+
+
 def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
-    """Mean motor torque over each grid step (joints, steps) [N m], `delay` [s] late and lagging by `lag` [s]."""
+    """Return the mean motor torque over each grid step (joints, steps) [N m], with `delay` [s] and `lag` [s]."""
     torque = recording.mean_torque(grid.edges, delay)
     if lag <= 0.0:
         return torque
-    # lag y' = u - y over a step of constant u: exact, and so is the step's mean of y.
+    # lag y' = u - y with constant u during a step: the end value and the mean of y are exact.
     a = np.exp(-grid.step / lag)
     start = torque[:, :1]
     end, _ = lfilter([1.0 - a], [1.0, -a], torque, axis=1, zi=a * start)
@@ -107,7 +120,7 @@ def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> A
 
 
 def grid_torque_slopes(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
-    """Derivatives of `grid_torque` by delay and by lag (2, joints, steps) [N m/s], by central differences."""
+    """Return the derivatives of `grid_torque` by delay and lag (2, joints, steps) [N m/s], by central differences."""
 
     def at(delay: float, lag: float) -> Array:
         return grid_torque(recording, grid, delay, lag)
@@ -120,7 +133,7 @@ def grid_torque_slopes(recording: Recording, grid: Grid, delay: float, lag: floa
 
 
 def _cubic(place: Array, steps: int) -> tuple[Indices, Array]:
-    """Grid points around each place (samples, 4) and the weights of the cubic through them."""
+    """Return the grid points around each place (samples, 4) and the weights of the cubic through them."""
     first = np.clip(np.floor(place).astype(np.int64) - 1, 0, steps - 3)
     index = first[:, None] + np.arange(4)
     u = place - first
@@ -133,7 +146,7 @@ def _cubic(place: Array, steps: int) -> tuple[Indices, Array]:
 
 
 def _state_at(recording: Recording, time: float) -> Array:
-    """Angles and velocities (2, joints) at `time` by a cubic through the samples around it."""
+    """Return angles and velocities (2, joints) at `time` from a cubic fitted to the samples around it."""
     window = max(START_WINDOW, 5.0 * recording.interval)
     near = np.abs(recording.time - time) <= window
     filled = recording.filled()[:, near]

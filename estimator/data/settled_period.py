@@ -1,4 +1,4 @@
-"""One settled period: what the estimator works on."""
+"""One settled period of an experiment, the estimator's input."""
 
 from dataclasses import dataclass, field, replace
 
@@ -11,45 +11,48 @@ from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 from hil.estimator.simulation.closed_loop import Stabilised
 
 FEWEST_SAMPLES = 32
-SPIKE = 8.0
-LEAST_VALID = 0.5  # of a joint's samples
-LEAST_MOTION = 4.0  # encoder steps from end to end
-MOST_GAP = 4.0  # from the last sample to the first, in largest moves between neighbours
-MOST_DRIFT = 0.1  # likewise, of the whole swing
+SPIKE = 8.0  # deviation from the local median, in typical deviations, above which a reading is a spike
+LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
+LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
+MOST_GAP = 4.0  # allowed gap from the last sample to the first, relative to the largest change between neighbours
+MOST_DRIFT = 0.1  # allowed gap relative to the range of motion
 
 
 @dataclass(frozen=True)
 class SettledPeriod:
     """One period of a settled periodic experiment, or the mean of several, sampled without gaps in time.
 
-    Command k takes effect at the motors and holds until command k + 1; sample k is taken `command_to_sample`
-    later. Before the first command stands the last, as in every period before. Missing samples are NaN.
+    Command k takes effect at the motors and holds until command k + 1; sample k is taken `command_to_sample` later. The
+    first command is preceded by the last one, as in a periodic signal. Missing samples are NaN.
 
-    Raises ShapeError for arrays that do not fit together, RecordingError for values that are not finite,
-    for a rate or position step that is not positive and for a period with too few samples, StandstillError
-    for a joint that moved by hardly more than its encoder step.
+    Raises ShapeError for incompatible arrays; RecordingError for non-finite values, for a rate or position step that is
+    not positive and for a period with too few samples; StandstillError for a joint that moved by hardly more than its
+    encoder step.
     """
 
     rate: float
-    """Samples per second."""
+    """Sampling rate [1/s]."""
     torque: Array
-    """Commanded motor torque (joints, samples), each held until the next [N m]."""
+    """Commanded motor torque (joints, samples) [N m], each value held until the next."""
     position: Array
     """Joint angles (joints, samples) [rad]."""
     command_to_sample: float
-    """From a command's effect at the motor to the sample of the same index [s]."""
+    """Time from a command's effect at the motor to the sample of the same index [s]."""
     position_step: Array
     """Quantisation of each joint's angle (joints,) [rad]."""
     periods: int = 1
-    """Settled periods averaged."""
+    """Number of settled periods that were averaged."""
     position_std: Array | None = None
-    """Standard deviation of the mean angles by the scatter between periods (joints,) [rad], if known."""
+    """Standard deviation of the mean angles from the scatter between periods (joints,) [rad], if known."""
     stabiliser: Stabilised | None = None
-    """Where a software stabiliser gave part of `torque`: without it a simulated arm may not stay with the real one."""
+    """The software stabiliser, if one produced part of `torque`.
+
+    A simulated arm may diverge from the real one without it.
+    """
     valid: Mask = field(init=False)
-    """Where a sample was received (joints, samples)."""
+    """Whether each sample was received (joints, samples)."""
     noise: Array = field(init=False)
-    """Standard deviation of one sample's error (joints,) [rad]: what is measured to be white, and rounding at least."""
+    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "valid", np.isfinite(self.position))
@@ -66,7 +69,7 @@ class SettledPeriod:
 
     @property
     def samples(self) -> int:
-        """Samples in the period."""
+        """Number of samples in the period."""
         return int(self.position.shape[1])
 
     @property
@@ -75,7 +78,7 @@ class SettledPeriod:
         return 2.0 * np.pi * self.rate / self.samples
 
     def filled(self) -> Array:
-        """Positions (joints, samples) with the missing ones interpolated between their neighbours [rad]."""
+        """Return the positions (joints, samples) [rad], with missing ones interpolated between their neighbours."""
         position = self.position.copy()
         index = np.arange(self.samples)
         for row, valid in zip(position, self.valid, strict=True):
@@ -85,10 +88,10 @@ class SettledPeriod:
 
 
 def without_spikes(period: SettledPeriod) -> SettledPeriod:
-    """The same period with single wild readings (such as a bit error on the bus) marked as missing.
+    """Return the period with single outliers (such as a bit error on the bus) marked as missing.
 
-    A reading is wild when it is further than SPIKE encoder steps, and than SPIKE times what is usual, from the
-    median of itself and its two neighbours on either side.
+    A reading is an outlier if its distance from the median of itself and two neighbours on either side exceeds SPIKE
+    encoder steps and SPIKE times the typical distance.
     """
     position = period.filled()
     away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))
@@ -104,9 +107,9 @@ def _check_shapes(period: SettledPeriod) -> None:
         raise ShapeError(f"torque {period.torque.shape} and position {period.position.shape} must be (joints, samples)")
     per_joint = (period.position.shape[0],)
     if period.position_step.shape != per_joint:
-        raise ShapeError(f"position_step is {period.position_step.shape}, it must be {per_joint}: one per joint")
+        raise ShapeError(f"position_step has shape {period.position_step.shape}; it must be {per_joint}: one per joint")
     if period.position_std is not None and period.position_std.shape != per_joint:
-        raise ShapeError(f"position_std is {period.position_std.shape}, it must be {per_joint}: one per joint")
+        raise ShapeError(f"position_std has shape {period.position_std.shape}; it must be {per_joint}: one per joint")
 
 
 def _check_values(period: SettledPeriod) -> None:
@@ -116,7 +119,7 @@ def _check_values(period: SettledPeriod) -> None:
             f"command_to_sample {period.command_to_sample:g} s finite"
         )
     if period.samples < FEWEST_SAMPLES:
-        raise RecordingError(f"the period has {period.samples} samples, at least {FEWEST_SAMPLES} are needed")
+        raise RecordingError(f"the period has {period.samples} samples; at least {FEWEST_SAMPLES} are needed")
     for joint in range(period.joints):
         bad = int(np.sum(~np.isfinite(period.torque[joint])))
         if bad:
@@ -124,7 +127,7 @@ def _check_values(period: SettledPeriod) -> None:
         received = float(np.mean(period.valid[joint]))
         if received < LEAST_VALID:
             raise RecordingError(
-                f"joint {joint + 1}: {100 * received:.0f} % of {period.samples} samples were received, at "
+                f"joint {joint + 1}: {100 * received:.0f} % of {period.samples} samples were received; at "
                 f"least {100 * LEAST_VALID:.0f} % are needed: check the bus before you record again"
             )
 
@@ -135,13 +138,13 @@ def _check_motion(period: SettledPeriod) -> None:
         least = LEAST_MOTION * float(period.position_step[joint])
         if swing <= least:
             raise StandstillError(
-                f"joint {joint + 1} moved by {swing:.2g} rad, at least {least:.2g} rad are needed: "
+                f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: "
                 "friction held it; raise its peak torque"
             )
     filled = period.filled()
     for joint, row in enumerate(filled):
         gap = abs(float(row[0] - row[-1]))
-        # Friction that warms up leaves a gap; the likelihood has the first state free and does not mind.
+        # Friction that changes as the arm warms up leaves a gap; it does no harm, as the initial state is estimated.
         most = max(MOST_GAP * float(np.abs(np.diff(row)).max()), MOST_DRIFT * float(np.ptp(row)))
         if gap > most:
             raise RecordingError(

@@ -1,1 +1,1 @@
-"""Multisines, and multisines designed for the worst relative standard error."""
+"""Multisine excitation, and its optimisation for the largest relative standard error."""

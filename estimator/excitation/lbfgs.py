@@ -1,8 +1,8 @@
 """Smooth minimisation by limited-memory BFGS (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 7.5).
 
-Implemented here for one reason: a seed must give the same wave on every machine. A library's own takes its products
-from a BLAS that adds them up in another order on another processor, and after a few hundred evaluations the torque
-differs by up to 4e-4 of its peak (docs/dependencies.md).
+It is implemented here for one reason: a seed must give the same wave on every machine. Library implementations use a
+BLAS whose order of summation depends on the processor, and after a few hundred evaluations the torque differs by up to
+4e-4 of its peak (docs/dependencies.md).
 """
 
 from collections import deque
@@ -16,12 +16,12 @@ Function = Callable[[Array], tuple[float, Array]]
 
 MEMORY = 20  # steps remembered
 HALVINGS = 20
-ENOUGH = 1e-4  # of the decrease that the slope foresees
+ENOUGH = 1e-4  # minimum decrease as a fraction of that predicted by the slope
 Pairs = deque[tuple[Array, Array, float]]
 
 
 def descend(function: Function, x: Array, steps: int) -> Array:
-    """Lower `function`, which gives its value and gradient, by `steps` steps at most, from `x` (unknowns,)."""
+    """Minimise `function`, which returns value and gradient, in at most `steps` steps from `x`; return the last `x`."""
     value, gradient = function(x)
     pairs: Pairs = deque(maxlen=MEMORY)
     for _ in range(steps):
@@ -44,7 +44,7 @@ def descend(function: Function, x: Array, steps: int) -> Array:
 
 
 def _direction(gradient: Array, pairs: Pairs) -> Array:
-    """Minus the gradient times the inverse Hessian that the remembered steps suggest."""
+    """Return minus the gradient times the approximate inverse Hessian from the remembered steps."""
     left = gradient.copy()
     shares = []
     for moved, turned, inverse in reversed(pairs):

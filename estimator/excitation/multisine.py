@@ -1,9 +1,9 @@
 """Multisines: sums of cosines on chosen harmonics of one period, with phases that keep the peaks low.
 
-Low crest factor by minimising the L2p norm with p growing: Guillaume, Schoukens, Pintelon, Kollar,
-"Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40 (1991) 982. They
-take Gauss-Newton steps, which cost lines^2 x samples; here wave and gradient are one FFT each and the steps are
-L-BFGS, which reaches lower peaks too (1.40 against 1.44 for 25 lines) and takes a third of a second for 250.
+The crest factor is lowered by minimising the L2p norm with increasing p: Guillaume, Schoukens, Pintelon, Kollar,
+"Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40 (1991) 982. They use
+Gauss-Newton steps, whose cost is lines^2 x samples. Here wave and gradient take one FFT each and the steps are L-BFGS,
+which also reaches lower peaks (1.40 instead of 1.44 for 25 lines) and takes a third of a second for 250 lines.
 """
 
 import math
@@ -21,13 +21,13 @@ from hil.estimator.excitation.lbfgs import descend
 
 Harmonics = npt.NDArray[np.int64]
 
-DETECTION = 4  # odd lines of which one is not driven
-NORMS = (4, 16, 64)  # p of the L2p norms, one after the other
-FINAL_NORMS = (64, 256)  # for the best start
-STARTS = 4  # random phases besides Schroeder's
+DETECTION = 4  # one of this many odd lines is left unexcited
+NORMS = (4, 16, 64)  # p of the L2p norms, in order of use
+FINAL_NORMS = (64, 256)  # the same for the best candidate
+STARTS = 4  # random initial phases in addition to Schroeder's
 ITERATIONS = 40  # per norm
-OVERSAMPLING = 8  # samples per cycle of the highest line while phases are sought
-FINAL_OVERSAMPLING = 24  # or the peaks grow between the samples
+OVERSAMPLING = 8  # samples per cycle of the highest line while phases are optimised
+FINAL_OVERSAMPLING = 24  # the same for the best candidate, so that no peaks remain between samples
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ class Multisine:
     """One period of torque for each joint: the sum of amplitude * cos(2 pi line t / period + phase)."""
 
     rate: float
-    """Samples per second."""
+    """Sampling rate [1/s]."""
     period: float
-    """Length [s]; a whole number of samples."""
+    """Length of the period [s]; a whole number of samples."""
     lines: tuple[tuple[int, ...], ...]
     """Excited harmonics of each joint."""
     amplitudes: tuple[tuple[float, ...], ...]
-    """Of each line [N m]."""
+    """Amplitude of each line [N m]."""
     phases: tuple[tuple[float, ...], ...]
-    """Of each line [rad]."""
+    """Phase of each line [rad]."""
     torque: Array
-    """One period (joints, samples) [N m], to be held from each sample to the next."""
+    """One period (joints, samples) [N m], each value held until the next sample."""
 
     @property
     def joints(self) -> int:
@@ -54,12 +54,12 @@ class Multisine:
 
     @property
     def samples(self) -> int:
-        """Samples in the period."""
+        """Number of samples in the period."""
         return int(self.torque.shape[1])
 
     @property
     def crest_factor(self) -> Array:
-        """Peak over RMS of each joint's samples (joints,)."""
+        """Peak value relative to RMS of each joint's samples (joints,)."""
         peak: Array = np.abs(self.torque).max(axis=1) / np.sqrt(np.mean(self.torque**2, axis=1))
         return peak
 
@@ -67,34 +67,34 @@ class Multisine:
 def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tuple[tuple[int, ...], ...]:
     """Assign the harmonics of 1/`period` [s] within `band` [Hz] to the joints in turn.
 
-    Raises ExcitationError when the band has fewer lines than joints.
+    Raises ExcitationError if the band has fewer lines than joints.
     """
     first = max(1, math.ceil(band[0] * period - 1e-9))
     last = math.floor(band[1] * period + 1e-9)
     if last - first + 1 < joints:
         raise ExcitationError(
-            f"the band {band[0]:g} to {band[1]:g} Hz holds {max(0, last - first + 1)} harmonics of a period "
-            f"of {period:g} s and {joints} joints need one each: widen the band or lengthen the period"
+            f"the band {band[0]:g} to {band[1]:g} Hz contains {max(0, last - first + 1)} harmonics of a "
+            f"period of {period:g} s, but {joints} joints need one each: widen the band or lengthen the period"
         )
     return tuple(tuple(range(first + joint, last + 1, joints)) for joint in range(joints))
 
 
 def detecting_lines(period: float, band: tuple[float, float], joints: int, seed: int) -> tuple[tuple[int, ...], ...]:
-    """The odd harmonics of `zippered_lines` without one of every DETECTION, drawn by `seed`, shared out in turn.
+    """Assign odd harmonics to the joints in turn, leaving one of every DETECTION unexcited, drawn by `seed`.
 
-    Where nothing was driven the arm's distortion shows, odd or even: see `hil.estimator.selection.distortion`. Raises
-    ExcitationError when fewer lines than joints are left.
+    On the unexcited lines, odd or even, the arm's nonlinear distortion becomes visible: see
+    `hil.estimator.selection.distortion`. Raises ExcitationError if fewer lines than joints are left.
     """
     every = sorted(line for lines in zippered_lines(period, band, 1) for line in lines if line % 2 == 1)
     random = np.random.default_rng(seed)
     groups = [every[first : first + DETECTION] for first in range(0, len(every), DETECTION)]
-    # The highest group may be incomplete; then it keeps its lines.
+    # If the highest group is incomplete, it keeps its lines.
     silent = {int(random.choice(group)) for group in groups if len(group) == DETECTION}
     kept = [line for line in every if line not in silent]
     if len(kept) < joints:
         raise ExcitationError(
-            f"the band {band[0]:g} to {band[1]:g} Hz holds {len(kept)} odd harmonics of a period of {period:g} s to "
-            f"drive and {joints} joints need one each: widen the band or lengthen the period"
+            f"the band {band[0]:g} to {band[1]:g} Hz contains {len(kept)} usable odd harmonics of a "
+            f"period of {period:g} s, but {joints} joints need one each: widen the band or lengthen the period"
         )
     return tuple(tuple(kept[joint::joints]) for joint in range(joints))
 
@@ -106,12 +106,18 @@ def design_multisine(
     peak_torque: Sequence[float],
     seed: int,
 ) -> Multisine:
-    """A multisine of equal amplitudes with a low crest factor.
+    """Return a multisine of equal amplitudes with a low crest factor.
 
-    `rate` [1/s], `period` [s], `lines`: harmonics of each joint, `peak_torque`: largest sample of each
-    joint [N m]. The same seed gives the same phases to the last bit, another seed others. Raises
-    ExcitationError for a period that is not a whole number of samples, lines outside (0, samples / 2) or
-    given twice, a peak that is not positive.
+    Args:
+        rate: sampling rate [1/s].
+        period: length of the period [s].
+        lines: harmonics of each joint.
+        peak_torque: largest sample of each joint [N m].
+        seed: random seed; the same seed gives the same phases to the last bit.
+
+    Raises:
+        ExcitationError: for a period that is not a whole number of samples, lines outside (0, samples / 2) or assigned
+            twice, or a peak that is not positive.
     """
     samples = _whole_samples(rate, period)
     _check_lines(lines, samples)
@@ -168,17 +174,17 @@ def _check_peaks(peak_torque: Sequence[float], joints: int) -> None:
 
 
 def _wave(order: Harmonics, phase: Array, samples: int) -> Array:
-    """Sum of cosines of amplitude 1 over one period (samples,)."""
+    """Return the sum of cosines of amplitude 1 over one period (samples,)."""
     spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
     spectrum[order] = 0.5 * samples * np.exp(1j * phase)
     return np.fft.irfft(spectrum, samples)
 
 
 def _low_crest_phases(order: Harmonics, random: np.random.Generator) -> Array:
-    """The best of several optimised starts: Schroeder's phases, turned at random, and random ones [rad]."""
+    """Return the best phases [rad] of several optimisations, from randomised Schroeder phases and from random ones."""
     count = order.size
     schroeder = -np.pi * np.arange(count) * np.arange(1, count + 1) / count
-    # Schroeder's phases alone would give every seed the same wave: they are shifted in time and loosened.
+    # Plain Schroeder phases would give every seed the same wave, so they are shifted in time and perturbed.
     starts = [schroeder + order * random.uniform(0.0, 2.0 * np.pi) + random.uniform(-1.0, 1.0, count)]
     starts += [random.uniform(0.0, 2.0 * np.pi, count) for _ in range(STARTS)]
     coarse = next_fast_len(OVERSAMPLING * int(order.max()), real=True)
@@ -193,19 +199,19 @@ def _low_crest_phases(order: Harmonics, random: np.random.Generator) -> Array:
 
 
 def _flattened(order: Harmonics, phase: Array, samples: int, norms: tuple[int, ...]) -> Array:
-    """Phases that lower the wave's peak, by one L2p norm after the other, each start the last one's end."""
+    """Return phases that lower the wave's peak, by minimising one L2p norm after the other."""
     for p in norms:
         phase = descend(partial(_norm, order=order, samples=samples, p=p), phase, ITERATIONS)
     return phase
 
 
 def _norm(phase: Array, order: Harmonics, samples: int, p: int) -> tuple[float, Array]:
-    """Logarithm of the wave's L2p norm, and its gradient by the phases (lines,)."""
+    """Return the logarithm of the wave's L2p norm, and its gradient by the phases (lines,)."""
     wave = _wave(order, phase, samples)
     peak = float(np.abs(wave).max())
     steep = (wave / peak) ** (2 * p - 1)
     total = float(np.sum(steep * wave)) / peak
-    # The derivative of the wave by a phase is -sin; the sum over time with `steep` is a Fourier line of it.
+    # The derivative of the wave by a phase is -sin; its sum over time with `steep` is a Fourier line of `steep`.
     lines = np.fft.rfft(steep)[order]
     gradient = np.imag(np.exp(-1j * phase) * lines) / (peak * total)
     return math.log(total) / (2 * p) + math.log(peak), gradient

@@ -1,11 +1,11 @@
-"""Excitation by design: amplitudes and phases that make the worst relative standard error small, within limits.
+"""Optimal excitation: amplitudes and phases that minimise the largest relative standard error, within limits.
 
-The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period: inverse information
-of the positions, the state at the first sample unknown too. They are worked out on a model of the arm, a pilot's. The
-search is a (1+1) evolution strategy with step-size control by Rechenberg's success rule: first the shape
-of the amplitude spectra and how far each joint goes, then the phases too. Every candidate is scaled to the limits.
-Source of the criterion: Pronzato and Pazman, "Design of experiments in nonlinear models", 2013, chapter 5 (E and
-minimax criteria).
+The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period: the inverse
+information of the positions, with unknown initial state. They are computed for a preliminary model of the arm, such as
+that of a pilot experiment. The search is a (1+1) evolution strategy with step-size control by Rechenberg's success
+rule: first over the shape of the amplitude spectra and the extent of each joint's motion, then over the phases as well.
+Every candidate is scaled to the limits. Source of the criterion: Pronzato and Pazman, "Design of experiments in
+nonlinear models", 2013, chapter 5 (E and minimax criteria).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -21,10 +21,10 @@ from hil.estimator.models.terms import extra_names
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
 from hil.estimator.threads import thread_count
 
-KNOTS = 4  # of each joint's amplitude spectrum, over the logarithm of the line
+KNOTS = 4  # of each joint's amplitude spectrum, over the logarithm of the line number
 SHAPE_TRIALS = 60
 PHASE_TRIALS = 60
-DIFFERENCE = 1e-3  # relative, of a parameter; for the state [rad, rad/s]
+DIFFERENCE = 1e-3  # finite difference: relative for a parameter, absolute for the state [rad, rad/s]
 SCALING_ROUNDS = 12
 LEAST_SHARE = 1e-3
 THREADS = 2
@@ -33,7 +33,7 @@ LEAST_WIDTH = 0.02  # rad/s
 
 @dataclass(frozen=True)
 class Limits:
-    """What the motion must stay within (joints,): angles [rad], velocity [rad/s], torque [N m]."""
+    """Limits of the motion, per joint (joints,): angles [rad], velocity [rad/s], torque [N m]."""
 
     low: Array
     high: Array
@@ -43,7 +43,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Design:
-    """A designed multisine and the worst relative standard errors, of it and of the plain one scaled to the limits."""
+    """A designed multisine and the plain one scaled to the limits, each with its largest relative standard error."""
 
     multisine: Multisine
     plain: Multisine
@@ -52,7 +52,7 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """The same arm with friction's step no narrower than LEAST_WIDTH: faster to simulate, same optimum nearly."""
+    """Return the same arm with friction steps at least LEAST_WIDTH wide: simulates faster, nearly the same optimum."""
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")
@@ -61,26 +61,29 @@ def smoothed(physics: Physics) -> Physics:
 
 
 @dataclass(frozen=True)
-class Problem:
+class DesignProblem:
     """Objective and constraints of the design."""
 
     physics: Physics
     names: tuple[str, ...]
-    """Parameters whose standard errors count."""
+    """Names of the parameters whose standard errors count."""
     limits: Limits
     pose: Array
-    """At rest (joints,) [rad]."""
+    """Pose at rest (joints,) [rad]."""
     position_step: Array
-    """Of the encoders (joints,) [rad]."""
+    """Encoder resolution (joints,) [rad]."""
     feedback: Feedback
 
     def worst(self, wave: Multisine) -> float:
-        """The largest relative standard error of `names` from a settled period of `wave`; infinite if undetermined."""
+        """Return the largest relative standard error of `names` from a settled period of `wave`.
+
+        It is infinite if the period does not determine all of them.
+        """
         deviations = self.standard_errors(wave)
         return float((deviations / self.scale()).max())
 
     def standard_errors(self, wave: Multisine) -> Array:
-        """Of `names` (parameters,) [SI]."""
+        """Return the standard errors of `names` (parameters,) [SI]."""
         start = self._settled(wave)
         nominal = self._positions(self.physics, start, wave)
         columns = self._columns(wave, start, nominal)
@@ -95,13 +98,13 @@ class Problem:
         return deviations
 
     def scale(self) -> Array:
-        """What a standard error is compared with: the parameter itself, and for an offset the joint's dry friction."""
+        """Return the scale of each standard error: the parameter; for an offset, the joint's Coulomb friction."""
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
         against = [name.replace("offset", "coulomb") if name.startswith("offset") else name for name in self.names]
         return np.maximum(np.abs([known[name] for name in against]), 1e-9)
 
     def shares(self, wave: Multisine) -> Array:
-        """How much of the limits each joint uses (joints,), over transient and settled period."""
+        """Return the fraction of the limits that each joint uses (joints,), over transient and settled period."""
         response = self._two_periods(wave)
         limits, pose = self.limits, self.pose
         up = (response.position.max(axis=1) - pose) / (limits.high - pose)
@@ -112,7 +115,7 @@ class Problem:
         return np.nan_to_num(share, nan=1e3, posinf=1e3)
 
     def scaled(self, wave: Multisine, target: Array) -> Multisine:
-        """`wave` with each joint's torque such that it uses `target` (joints,) of its limits, and never more."""
+        """Return `wave` with each joint's torque scaled to use at most `target` (joints,) of its limits."""
         most = 0.999 * self.limits.torque / np.abs(wave.torque).max(axis=1)
         factor = 0.3 * most
         best, reached = _times(wave, 0.05 * most), 0.0
@@ -129,7 +132,7 @@ class Problem:
         return best
 
     def positions(self, wave: Multisine) -> Array:
-        """Transient and settled period (joints, samples) [rad]."""
+        """Return transient and settled period (joints, samples) [rad]."""
         return self._two_periods(wave).position
 
     def _two_periods(self, wave: Multisine) -> Response:
@@ -143,7 +146,7 @@ class Problem:
         return respond(physics, start, wave.torque, wave.rate, self.feedback).position
 
     def _columns(self, wave: Multisine, start: Array, nominal: Array) -> Array:
-        """Derivatives of all positions, in units of their rounding, by the parameters, nuisances and first state."""
+        """Return the derivatives of all positions, in units of rounding, by parameters, nuisances and initial state."""
         noise = (self.position_step / np.sqrt(12.0))[:, None]
 
         def by_parameter(name: str) -> Array:
@@ -173,8 +176,8 @@ class Problem:
 
 
 @one_blas_thread
-def design_optimal(plain: Multisine, problem: Problem, seed: int) -> Design:
-    """Improve `plain`, whose lines and period are kept, by the standard errors that `problem` names.
+def design_optimal(plain: Multisine, problem: DesignProblem, seed: int) -> Design:
+    """Improve `plain`, keeping its lines and period, with respect to the standard errors that `problem` defines.
 
     The same seed gives the same wave.
     """
@@ -202,7 +205,12 @@ def design_optimal(plain: Multisine, problem: Problem, seed: int) -> Design:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Log amplitudes at the knots (joints, KNOTS), phases of each joint's lines, share of the limits (joints,)."""
+    """A candidate of the search.
+
+    shape: log amplitudes at the knots (joints, KNOTS).
+    phases: phases of each joint's lines [rad].
+    share: fraction of the limits to use (joints,).
+    """
 
     shape: Array
     phases: tuple[Array, ...]
@@ -215,7 +223,7 @@ class _Candidate:
         return _Candidate(np.clip(shape, -4.0, 4.0), phases, share)
 
     def wave(self, plain: Multisine) -> Multisine:
-        """The multisine that this describes, with the plain one's peaks."""
+        """Return the multisine of this candidate, with the peaks of the plain one."""
         amplitudes, phases, torque = [], [], np.empty_like(plain.torque)
         for joint, lines in enumerate(plain.lines):
             order = np.log(np.asarray(lines, dtype=np.float64))
@@ -238,7 +246,7 @@ def _times(wave: Multisine, factor: Array) -> Multisine:
 
 
 def _moved(physics: Physics, name: str) -> tuple[Physics, float]:
-    """The physics with one constant a little larger, and by how much."""
+    """Return the physics with one constant slightly increased, and the increase."""
     if name == "lag":
         change = 1e-5
         return Physics(physics.vector, physics.delay, physics.lag + change), change

@@ -1,14 +1,14 @@
-"""Standard errors that remain valid when the residual is not white: the sandwich N^-1 S N^-1.
+"""Standard errors that remain valid if the residual is not white: the sandwich N^-1 S N^-1.
 
-N = J'WJ is the information, S the scatter of the score J'Wr. Independent errors have S = N; rounding of a slow
-joint, and model error, are correlated over samples, which S sees when the score's products are summed
-over lags (Newey and West, Econometrica 55 (1987) 703). Bartlett's kernel of L lags is the sum over all windows
-of L samples of the window's own score times itself, over L: one pass, whatever L.
+N = J'WJ is the information, S the scatter of the score J'Wr. For independent errors S = N. Rounding errors of a slow
+joint, and model errors, are correlated between samples, which S takes into account if the products of the score are
+summed over lags (Newey and West, Econometrica 55 (1987) 703). Bartlett's kernel with L lags equals the sum, over all
+windows of L samples, of the window's score times itself, divided by L: one pass for any L.
 
-Model error is more than correlated: it repeats at every reversal, so that averaging does not remove it,
-and the part that resembles a parameter leaves no residual at all. So the part of the residual that is not
-white widens the errors further: 1.4 standard deviations reach as far as the parameters can move before the motion
-changes, RMS, by as much as that part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
+A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
+resembles a parameter leaves no residual at all. Therefore the non-white part of the residual widens the errors further:
+1.4 standard deviations reach as far as the parameters can move before the motion changes (RMS) by as much as that part
+(a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.options import CovarianceOptions
 
 DEFAULTS = CovarianceOptions()
-FAINT_PRIOR = 1e-4  # of a prior's precision, which keeps what is not measured at all finite
-VANISHED = 1e-3  # of a parameter's value: its slope when it has run into its floor
+FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
+VANISHED = 1e-3  # slope relative to its value below which a parameter has run into its floor
 
 
 class Scatter:
-    """Adds up a score (samples, causes), given piece by piece, over windows of `lags` samples."""
+    """Sums a score (samples, causes), given piece by piece, over windows of `lags` samples."""
 
     def __init__(self, causes: int, lags: int) -> None:
         self._lags = lags
@@ -34,13 +34,13 @@ class Scatter:
         self._total = np.zeros((causes, causes))
 
     def add(self, score: Array) -> None:
-        """The next samples."""
+        """Add the next samples."""
         extended = np.concatenate((self._before, score))
         self._before = extended[extended.shape[0] - (self._lags - 1) :]
         self._add_windows(extended)
 
     def sum(self) -> Array:
-        """S (causes, causes), with the last samples' windows closed."""
+        """Return S (causes, causes), including the last, incomplete windows."""
         self._add_windows(np.concatenate((self._before, np.zeros_like(self._before))))
         return self._total
 
@@ -52,9 +52,9 @@ class Scatter:
 
 
 def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DEFAULTS) -> int:
-    """Lags (samples) beyond which no residual (joints, samples) of any run is correlated, times two.
+    """Return twice the lag [samples] beyond which no residual (joints, samples) of any run is correlated.
 
-    Where the autocorrelation first falls into the band that white noise would leave it in.
+    That is where the autocorrelation first falls into the range expected of white noise.
     """
     longest = options.min_lag
     for residual in residuals:
@@ -68,11 +68,10 @@ def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DE
 
 
 def structured_share(residual: Array) -> Array:
-    """Fraction (joints,) of the power of each residual (joints, samples) that is not white; 0 if not significantly
-    different from white.
+    """Return the fraction (joints,) of the power of each residual (joints, samples) that is not white.
 
-    White noise has the same power in every Fourier line; the upper half of the lines, far above the motion, tells
-    how much.
+    White noise has the same power in every Fourier line; its level is estimated from the upper half of the lines, far
+    above the motion. The fraction is 0 if the residual does not differ significantly from white noise.
     """
     samples = residual.shape[1]
     power = np.abs(np.fft.rfft(residual, axis=1)) ** 2 / samples**2
@@ -84,7 +83,7 @@ def structured_share(residual: Array) -> Array:
 
 
 def autocorrelation(residual: Array, lags: int) -> Array:
-    """Autocorrelation of one residual (samples,) at 0 to `lags` samples (lags + 1,)."""
+    """Return the autocorrelation of one residual (samples,) at 0 to `lags` samples (lags + 1,)."""
     centred = residual - residual.mean()
     spectrum = np.abs(np.fft.rfft(centred, 2 * centred.size)) ** 2
     product = np.fft.irfft(spectrum)[: lags + 1]
@@ -98,35 +97,42 @@ def robust_covariance(
     samples: int,
     count: int,
     structured: float = 0.0,
-    precision: Array | None = None,
+    expected: Array | None = None,
 ) -> Array:
-    """Covariance of the first `count` coordinates (count, count), the others unknown with them.
+    """Return the covariance of the first `count` coordinates (count, count), the others being unknown as well.
 
-    The larger of the sandwich and of what independent errors would give, direction by direction: a short
-    recording cannot prove that its errors cancel. Without `scatter` that of independent errors of variance 1.
-    `structured` is the part of the sum of squares that is a model's error. `precision` (coordinates,) is what a prior
-    has put into the normal equations: it stays as it is where the errors of measurement are larger than independent
-    ones. Infinite for a coordinate without influence on the residual.
+    It is the larger of the sandwich and the covariance for independent errors, direction by direction, since a short
+    recording cannot prove that its errors cancel. It is infinite for a coordinate without influence on the residual.
+
+    Args:
+        at: the sum of squares at the minimum.
+        scatter: scatter of the score; without it, the errors are taken as independent with variance 1.
+        samples: number of samples.
+        count: number of coordinates to return.
+        structured: part of the sum of squares that is due to model errors.
+        expected: what a prior has added to the normal equations (coordinates, coordinates); it is not inflated when the
+            measurement errors are larger than independent ones.
     """
-    prior = np.zeros(len(at.normal)) if precision is None else (1.0 - FAINT_PRIOR) * precision
+    prior = np.zeros_like(at.normal) if expected is None else (1.0 - FAINT_PRIOR) * expected
     norm = np.sqrt(np.diag(at.normal))
     seen = norm > 1e-12 * norm.max()
     lengths = np.outer(norm[seen], norm[seen])
-    measured = (at.normal - np.diag(prior))[np.ix_(seen, seen)] / lengths
+    measured = (at.normal - prior)[np.ix_(seen, seen)] / lengths
     inverse = np.asarray(np.linalg.pinv(measured, hermitian=True), dtype=np.float64)
     freedom = max(1, samples - int(seen.sum()))
     covariance = np.zeros_like(at.normal)
     found = inverse
     if scatter is not None:
-        scores = (scatter - np.diag(prior))[np.ix_(seen, seen)] / lengths
+        scores = (scatter - prior)[np.ix_(seen, seen)] / lengths
         robust = inverse @ scores @ inverse * (samples / freedom)
         found = larger_covariance(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
         found = found + 0.5 * structured * inverse
     if prior.any():
-        expected = np.diag(np.sqrt(prior[seen]) / norm[seen])
-        # (found^-1 + prior)^-1 without an inverse of what may be hardly seen.
-        inner = np.eye(len(found)) + expected @ found @ expected
-        found = found - found @ expected @ np.linalg.solve(inner, expected @ found)
+        size, directions = np.linalg.eigh(prior[np.ix_(seen, seen)] / lengths)
+        root = directions * np.sqrt(np.maximum(size, 0.0))
+        # (found^-1 + prior)^-1 without inverting what may be nearly singular.
+        inner = np.eye(len(found)) + root.T @ found @ root
+        found = found - found @ root @ np.linalg.solve(inner, root.T @ found)
     covariance[np.ix_(seen, seen)] = found / lengths
     hidden = np.flatnonzero(~seen)
     covariance[hidden, hidden] = np.inf
@@ -144,10 +150,10 @@ def larger_covariance(robust: Array, white: Array) -> Array:
 
 
 def by_parameters(covariance: Array, slopes: Array, value: Array) -> Array:
-    """Covariance of the parameters (parameters, parameters) from that of their coordinates.
+    """Return the covariance of the parameters (parameters, parameters) from that of their coordinates.
 
-    A positive parameter that leaves no trace is as good as zero: it is known to its own size. Its coordinate is
-    the logarithm of what is above its floor, so that the slope is that size.
+    A positive parameter without effect on the motion is practically zero: its standard error is its own value. Its
+    coordinate is the logarithm of its distance from the floor, so the slope is that distance.
     """
     hidden = np.isinf(np.diag(covariance))
     finite: Array = slopes @ np.where(np.isfinite(covariance), covariance, 0.0) @ slopes.T

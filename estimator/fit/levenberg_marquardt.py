@@ -14,10 +14,10 @@ DEFAULTS = MinimiserOptions()
 
 @dataclass(frozen=True)
 class Quadratic:
-    """A sum of squares |r|^2 at one point and how it changes there."""
+    """A sum of squares |r|^2 at one point, with its normal equations."""
 
     cost: float
-    """The sum."""
+    """The sum of squares."""
     normal: Array
     """J'J of the Jacobian J of r (coordinates, coordinates)."""
     gradient: Array
@@ -31,9 +31,9 @@ class Minimum:
     x: Array
     """Coordinates (coordinates,)."""
     at: Quadratic
-    """The sum of squares there."""
+    """The sum of squares at the minimum."""
     iterations: int
-    """Points at which it was evaluated."""
+    """Number of points at which it was evaluated."""
 
 
 Evaluate = Callable[[Array], Quadratic]
@@ -52,32 +52,31 @@ def minimise(
     limits: Limits | None = None,
     options: MinimiserOptions = DEFAULTS,
 ) -> Minimum:
-    """Minimise a sum of squares from `start`, coordinates of the size of 1.
+    """Minimise a sum of squares from `start`, in coordinates of order 1.
 
-    Damped steps are short along weakly determined directions and terminate too early there: near the end, `damping`
-    should start at `options.min_damping`.
+    Damped steps are short along weakly determined directions and would end the iteration too early there: near the
+    minimum, `damping` should start at `options.min_damping`.
 
     Args:
-        evaluate: the sum at a point; a non-finite sum counts as too large.
-        start: coordinates (coordinates,).
+        evaluate: returns the sum of squares at a point; a non-finite sum counts as too large.
+        start: initial coordinates (coordinates,).
         ftol: stop when the actual or predicted relative decrease of a step is below this.
         damping: initial damping; by default `options.initial_damping`.
-        at: the sum at `start`, if it is known.
+        at: the sum of squares at `start`, if known.
         move: applies a step to coordinates.
-        limits: gives the least and the most that each coordinate may change in a step from a point; by default
-            `options.max_step` either way.
+        limits: returns the minimum and maximum change of each coordinate in a step; by default +-`options.max_step`.
         options: limits of the iteration.
 
     Returns:
-        The minimum, and how many points were evaluated.
+        The minimum and the number of points evaluated.
 
     Raises:
-        ConvergenceError: when `start` gives no finite sum, or when the sum still falls by more than
-            `options.unfinished` of it after `options.max_iterations`.
+        ConvergenceError: if the sum at `start` is not finite, or if its relative decrease still exceeds
+            `options.unfinished` after `options.max_iterations`.
     """
     x, here = start, evaluate(start) if at is None else at
     if not np.isfinite(here.cost):
-        raise ConvergenceError("the initial guess gives no finite motion: check the torque and the period's units")
+        raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
     damping = options.initial_damping if damping is None else damping
     evaluations = int(at is None)
     gained = np.inf
@@ -100,7 +99,7 @@ def minimise(
 
 
 def step_limits(x: Array, options: MinimiserOptions) -> tuple[Array, Array]:
-    """The least and the most that each coordinate of `x` may change in one step if nothing else limits it."""
+    """Return the minimum and maximum change of each coordinate of `x` in one step, if nothing else limits it."""
     return np.full(x.size, -options.max_step), np.full(x.size, options.max_step)
 
 
@@ -114,7 +113,7 @@ def _improve(
     limits: tuple[Array, Array],
     options: MinimiserOptions,
 ) -> tuple[tuple[Array, Quadratic] | None, float, int]:
-    """A better point, or None if there is none; the next step's damping; and the points tried."""
+    """Return a better point or None, the damping for the next step, and the number of points tried."""
     tried = 0
     while damping < options.max_damping:
         step = _step(at.normal, at.gradient, damping, *limits)
@@ -133,10 +132,10 @@ def _improve(
 
 
 def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
-    """The damped step, every coordinate moving by no less than `least` and no more than `most`.
+    """Return the damped step, with every coordinate's change between `least` and `most`.
 
-    A coordinate that would is held there and the others solved again: scaling the whole step would let one
-    that is all but flat, such as the logarithm of something that is zero, stop the rest.
+    A coordinate that would exceed its limit is fixed there and the others are solved for again: scaling the whole step
+    would let an almost flat coordinate, such as the logarithm of a value near zero, stop all others.
     """
     scale = np.sqrt(np.diag(normal))
     scale = np.maximum(scale, 1e-12 * scale.max())

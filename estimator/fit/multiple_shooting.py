@@ -1,19 +1,20 @@
 """Multiple shooting: maximum likelihood on any recording, cut into segments with unknown initial states.
 
-Open-loop simulation accumulates errors: on a long recording, model error or the chaos of a tumbling arm
-swamps the parameters' influence. On a segment of a second it does not. Bock, "Recent advances in parameter
-identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems
-(1983). The segments are not joined: noise that a rigid arm does not have, such as play and flexing, may
-move the state between them.
+Open-loop simulation accumulates errors: on a long recording, model errors or the chaos of a tumbling arm mask the
+parameters' influence. On a segment of a second they do not. Bock, "Recent advances in parameter identification
+techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems (1983). The segments are
+not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the state between
+them.
 
-Short segments come first, since they converge from a poor initial guess; longer ones then refine the result. A segment
-whose residual is then larger than usual, because a joint stuck in it, say, as no smooth friction sticks, is
-downweighted
-accordingly: with equal weights the segments that the model explains worst would dominate.
+Short segments come first, since they converge from a poor initial guess, and only some of them, since a neighbourhood
+is all that is wanted; longer ones then refine the result, first with long steps of integration. A segment whose
+residual is larger than usual, because a joint stuck in it, say, as no smooth friction sticks, is downweighted
+accordingly: with equal weights the segments that the model explains worst would dominate. What is usual of small terms
+(`Term.spread`) is a prior, in units of what the model leaves.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -24,8 +25,8 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.data.segments import Grid, RecordingSegment, cut, grid_torque, grid_torque_slopes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import by_parameters
-from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
-from hil.estimator.fit.segmented_least_squares import Segmented, minimise_segmented
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Sizes, scales_of
+from hil.estimator.fit.segmented_least_squares import Expected, Segmented, minimise_segmented
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
@@ -35,6 +36,7 @@ from hil.estimator.simulation.presliding_sensitivity import sensitive
 
 DEFAULTS = ShootingOptions()
 ALL = slice(None)
+MOST_WEIGHT = 1e9
 
 
 @dataclass(frozen=True)
@@ -46,19 +48,25 @@ class ShootingEstimate:
     """`model.names`."""
     units: tuple[str, ...]
     value: Array
-    """(parameters,) [SI]."""
+    """Values (parameters,) [SI]."""
     covariance: Array
-    """(parameters, parameters), robust against model error: see `Segmented.covariance`."""
+    """Covariance (parameters, parameters), robust to model errors: see `Segmented.covariance`."""
     zeros: Array
-    """True minus measured angle of each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
+    """True minus measured angle for each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
     zeros_std: Array
-    """Their standard errors, shaped alike."""
+    """Standard errors of `zeros`, with the same shape."""
     residual_rms: Array
-    """Measured minus simulated position (joints,) [rad]."""
+    """RMS of measured minus simulated position (joints,) [rad]."""
     segments: int
     segment_length: float
-    """[s]."""
+    """Nominal length of a segment [s]."""
     iterations: int
+    residual_over_noise: Array
+    """RMS in units of the noise (joints,)."""
+    own: Array
+    """Each segment's state at its start (segments, 2 joints), in units of `Shooting.state_scale`."""
+    fitted: slice = field(default_factory=lambda: ALL)
+    """Which segments of each recording were fitted."""
 
     @property
     def std(self) -> Array:
@@ -73,7 +81,7 @@ class ShootingEstimate:
 
 
 class Shooting:
-    """The residuals of all segments by coordinates."""
+    """The residuals of all segments as a function of coordinates."""
 
     def __init__(
         self,
@@ -83,17 +91,21 @@ class Shooting:
         *,
         zeros: bool = False,
         of: slice = ALL,
+        most: int | None = None,
+        step: float | None = None,
         options: ShootingOptions = DEFAULTS,
     ) -> None:
+        """`most`: of the segments, evenly chosen; `step`: the longest of the integration [s]."""
         self._options = options
         self._recordings = recordings
         self.zeros = len(recordings) * model.joints if zeros else 0
-        self._grids = [Grid.of(recording) for recording in recordings]
-        self.segments = [
+        self._grids = [Grid.of(recording, step or options.max_step) for recording in recordings]
+        every = [
             segment
             for number, (recording, grid) in enumerate(zip(recordings, self._grids, strict=True))
             for segment in cut(recording, number, grid, length)[of]
         ]
+        self.segments = every[:: max(1, -(-len(every) // most))] if most else every
         self.noise = np.max([recording.noise for recording in recordings], axis=0)[:, None]
         velocity = float(np.sqrt(np.mean([np.mean(segment.state[1] ** 2) for segment in self.segments]))) + 0.1
         torque = float(np.sqrt(np.mean([np.mean(recording.torque**2) for recording in recordings])))
@@ -104,19 +116,26 @@ class Shooting:
         self._driven: dict[tuple[float, float], list[tuple[Array, Array]]] = {}
 
     def coordinates(self, inertia: float) -> Coordinates:
-        """The parameters' coordinates; `inertia` [kg m^2] of the arm as a scale."""
+        """Return the parameters' coordinates; `inertia` [kg m^2]: typical inertia of the arm."""
         scales = scales_of(self._model.names, Sizes(*self._scales, inertia))
         return Coordinates(self._model.names, scales, self._options.coordinates)
 
     def position(self, segment: RecordingSegment, physics: Physics, state: Array) -> Array:
-        """Simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
+        """Return the simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
         torque = self._torque(segment, physics)[0]
         step = self._grids[segment.recording].step
         grid, end = simulate(physics, state, np.ascontiguousarray(torque[:, :, None]), step)
         return segment.at_samples(np.concatenate((grid, end[:1].T), axis=1))
 
+    def position_by_values(
+        self, segment: RecordingSegment, values: Mapping[str, float], offsets: Array, own: Array
+    ) -> Array:
+        """The same by parameters [SI], the `offsets` of the zeros and the segment's own coordinates."""
+        state = own.reshape(2, -1) * self.state_scale
+        return self.position(segment, self._with_zeros(values, segment, offsets), state)
+
     def residual(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> Array:
-        """Simulated minus measured positions of one segment in units of their noise (rows,)."""
+        """Return simulated minus measured positions of one segment, in units of their noise (rows,)."""
         segment = self.segments[number]
         position = self.position(
             segment, self._physics(coordinates, segment, shared), own.reshape(2, -1) * self.state_scale
@@ -125,65 +144,106 @@ class Shooting:
 
     def derivative(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> tuple[Array, Array]:
         """The same, and its derivatives by the shared coordinates, then by the segment's own (rows, all)."""
+        count = len(coordinates.names)
+        values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
+        rows, columns = self.derivative_by_values(number, values, shared[count:], own, coordinates.names)
+        # A motion that diverges has no finite derivatives; the minimiser says so.
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns[:, :count] = columns[:, :count] @ coordinates.slopes(shared[:count])
+        return rows, columns
+
+    def derivative_by_values(
+        self, number: int, values: Mapping[str, float], offsets: Array, own: Array, names: Sequence[str]
+    ) -> tuple[Array, Array]:
+        """The same with the parameters `values` [SI], by those of `names`, by `offsets` of the zeros, by its own."""
         segment = self.segments[number]
-        physics = self._physics(coordinates, segment, shared)
+        physics = self._with_zeros(values, segment, offsets)
         joints = self._model.joints
         zeros = tuple(f"zero_{joint + 1}" for joint in range(joints) if self.zeros)
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
         motion = sensitive(physics)(
             physics,
             own.reshape(2, -1) * self.state_scale,
-            (*coordinates.names, *zeros, *state),
+            (*names, *zeros, *state),
             self._grids[segment.recording].step,
         )
-        # The state after the last step is the sample before one more, of whatever torque.
+        # One step is appended so that the state after the last step is returned; its torque is irrelevant.
         torque, slopes = (
             np.pad(each, ((0, 0),) * (each.ndim - 1) + ((0, 1),)) for each in self._torque(segment, physics)
         )
         grid, change = motion.advance(torque[:, :, None], slopes[:, :, :, None])
         by_value = segment.at_samples(change)
-        count = len(coordinates.names)
-        columns = np.zeros((*by_value.shape[:2], shared.size + own.size))
-        columns[:, :, :count] = by_value[:, :, :count] @ coordinates.slopes(shared[:count])
-        columns[:, :, self._zeros_of(segment)] = by_value[:, :, count : count + len(zeros)] * self._options.angle_scale
-        columns[:, :, shared.size :] = by_value[:, :, count + len(zeros) :] * self.state_scale.reshape(-1)
+        count = len(names)
+        shared = count + self.zeros
+        columns = np.zeros((*by_value.shape[:2], shared + own.size))
+        columns[:, :, :count] = by_value[:, :, :count]
+        its_zeros = columns[:, :, count:shared][:, :, self._zeros_of(segment)]
+        its_zeros[:] = by_value[:, :, count : count + len(zeros)] * self._options.angle_scale
+        columns[:, :, shared:] = by_value[:, :, count + len(zeros) :] * self.state_scale.reshape(-1)
         known = np.isfinite(segment.position)[:, :, None]
-        columns = np.where(known, columns / self._noise(number)[:, :, None], 0.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns = np.where(known, columns / self._noise(number)[:, :, None], 0.0)
         return self._rows(number, segment.at_samples(grid)), columns.reshape(-1, columns.shape[2])
 
     def errors(self, coordinates: Coordinates, found: Segmented) -> Array:
-        """RMS of simulated minus measured position, segment by segment (segments, joints) [rad]."""
+        """Return the RMS of simulated minus measured position of each segment (segments, joints) [rad]."""
         rms = np.empty_like(self._trust)
         for number, (segment, own) in enumerate(zip(self.segments, found.own, strict=True)):
             rows = self.residual(coordinates, number, found.shared, own).reshape(self._model.joints, -1)
             rms[number] = np.sqrt(np.sum((rows * self._noise(number)) ** 2, axis=1) / _samples(segment))
         return rms
 
+    def over_noise(self, coordinates: Coordinates, found: Segmented) -> Array:
+        """RMS residual in units of the noise (joints,)."""
+        errors, samples = self.errors(coordinates, found), np.stack([_samples(each) for each in self.segments])
+        mean = np.sum(errors**2 * samples, axis=0) / samples.sum(axis=0)
+        return np.asarray(np.sqrt(mean) / self.noise[:, 0])
+
     def downweight(self, errors: Array) -> None:
-        """Downweight the segments whose `errors`, as the method of this name gives them, are larger than usual."""
+        """Downweight the segments whose `errors` (segments, joints) [rad] are larger than usual."""
         usual = np.median(errors, axis=0)
         self._trust = np.minimum(1.0, usual / np.maximum(errors, 1e-12))
 
+    def weight_as(self, other: "Shooting") -> None:
+        """Weight the segments as `other`, which has the same, does."""
+        self._trust = other._trust
+
+    def expected(self, coordinates: Coordinates, shared: Array, own: Array) -> Expected:
+        """What is usual of small terms, held against what the model leaves at these coordinates."""
+        count = len(coordinates.names)
+        inertia = float(coordinates.scales[coordinates.names.index("inertia_1")])
+        prior = CoordinatePrior.of(coordinates.names, coordinates.scales, Sizes(*self._scales, inertia))
+        centre, precision = np.zeros(shared.size), np.zeros(shared.size)
+        centre[:count], precision[:count] = prior.centre, prior.precision
+        if not precision.any():
+            return Expected.nothing(shared.size)
+        rows = [self.residual(coordinates, number, shared, each) for number, each in enumerate(own)]
+        with np.errstate(over="ignore"):  # a motion that diverges
+            weight = min(max(1.0, float(np.mean(np.concatenate(rows) ** 2))), MOST_WEIGHT)
+        return Expected(centre, weight * precision, weight)
+
     def start(self) -> Array:
-        """Each segment's own coordinates as its measured positions suggest (segments, 2 joints)."""
+        """Return initial guesses of each segment's own coordinates from its measured positions (segments, 2 joints)."""
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
     def _zeros_of(self, segment: RecordingSegment) -> slice:
-        """Where a segment's encoder zeros stand among the shared coordinates; nowhere if they are known."""
-        count = len(self._model.names)
+        """Where a segment's encoder zeros stand among those of all recordings; nowhere if they are known."""
         if not self.zeros:
-            return slice(count, count)
-        first = count + segment.recording * self._model.joints
+            return slice(0, 0)
+        first = segment.recording * self._model.joints
         return slice(first, first + self._model.joints)
 
     def _physics(self, coordinates: Coordinates, segment: RecordingSegment, shared: Array) -> Physics:
         count = len(coordinates.names)
         values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
-        zeros = self._options.angle_scale * shared[self._zeros_of(segment)]
-        return Physics.of(values | {f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)})
+        return self._with_zeros(values, segment, shared[count:])
+
+    def _with_zeros(self, values: Mapping[str, float], segment: RecordingSegment, offsets: Array) -> Physics:
+        zeros = self._options.angle_scale * offsets[self._zeros_of(segment)]
+        return Physics.of({**values, **{f"zero_{joint + 1}": float(zero) for joint, zero in enumerate(zeros)}})
 
     def _noise(self, number: int) -> Array:
-        """Assumed standard deviation of a segment's samples (joints, 1) [rad]."""
+        """Return the assumed standard deviation of a segment's samples (joints, 1) [rad]."""
         noise: Array = self.noise / self._trust[number][:, None]
         return noise
 
@@ -193,7 +253,7 @@ class Shooting:
         return np.asarray((difference / self._noise(number)).reshape(-1))
 
     def _torque(self, segment: RecordingSegment, physics: Physics) -> tuple[Array, Array]:
-        """Motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
+        """Return the motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
         key = (physics.delay, physics.lag)
         driven = self._driven.get(key)
         if driven is None:
@@ -216,43 +276,77 @@ def estimate_by_shooting(
     length: float = 1.0,
     zeros: bool = False,
     of: slice = ALL,
+    near: ShootingEstimate | None = None,
     options: ShootingOptions = DEFAULTS,
 ) -> ShootingEstimate:
-    """Maximum likelihood over all `recordings`, cut into segments of about `length` [s].
+    """Estimate parameters by maximum likelihood over all `recordings`, cut into segments.
 
     `start`: base parameters (base parameters,) [SI], for instance of `hil.estimator.baselines.idim`. The same
     recordings give the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one
     offset a joint and recording, as of servos whose zero is set at every start; with gravity they are seen, without
-    they are not. `of` takes some of each recording's segments and leaves the others for a check. Raises RecordingError
-    if no segment is long enough, ConvergenceError.
+    they are not. `of` takes some of each recording's segments and leaves the others for a check. `near`: an estimate of
+    the same recordings by another model, or of other segments, whose end is the only initial guess. Raises
+    RecordingError if no segment is long enough, ConvergenceError.
     """
-    short, problem = (
-        Shooting(recordings, model, part * length, zeros=zeros, of=of, options=options) for part in (options.short, 1.0)
-    )
-    coordinates = problem.coordinates(max(float(start[0]), 1e-6))
-    # Friction's rise has local minima: several starts, and the best end is kept.
+
+    def posed(part: float, most: int | None, step: float) -> Shooting:
+        return Shooting(recordings, model, part * length, zeros=zeros, of=of, most=most, step=step, options=options)
+
+    coarse = posed(1.0, None, options.coarse_step)
+    coordinates = coarse.coordinates(max(float(start[0]), 1e-6))
+    if near is None:
+        short = posed(options.short, options.start_segments, options.coarse_step)
+        long = posed(1.0, options.start_segments, options.coarse_step)
+        x = _from_guesses(short, long, coordinates, model, start, options)
+    else:
+        x = _from_estimate(near, coordinates, model, coarse.zeros, options)
+    found = _fit(coarse, coordinates, x, coarse.start(), options.ftol_start, options)
+    for _ in range(options.reweightings):
+        coarse.downweight(coarse.errors(coordinates, found))
+        found = _fit(coarse, coordinates, found.shared, found.own, options.ftol_refine, options)
+    problem = posed(1.0, None, options.max_step)
+    problem.weight_as(coarse)
+    found = _fit(problem, coordinates, found.shared, found.own, options.ftol, options)
+    return replace(_estimate(problem, coordinates, model, found, length, options.angle_scale), fitted=of)
+
+
+def _from_guesses(
+    short: Shooting, long: Shooting, coordinates: Coordinates, model: Model, start: Array, options: ShootingOptions
+) -> Array:
+    """Near the best minimum: friction's rise has local ones, so that there are several guesses."""
     ends: list[Segmented] = []
     lost: list[ConvergenceError] = []
-    for x in _initial_guesses(problem, coordinates, model, start, options):
+    for x in _initial_guesses(short, coordinates, model, start, options):
         try:
             near = _fit(short, coordinates, x, short.start(), options.ftol_start, options)
-            ends.append(_fit(problem, coordinates, near.shared, problem.start(), options.ftol, options))
+            ends.append(_fit(long, coordinates, near.shared, long.start(), options.ftol_start, options))
         except ConvergenceError as error:
             lost.append(error)
     if not ends:
         raise lost[0]
-    found = min(ends, key=lambda end: end.cost)
-    for _ in range(options.reweightings):
-        problem.downweight(problem.errors(coordinates, found))
-        found = _fit(problem, coordinates, found.shared, found.own, options.ftol, options)
-    return _estimate(problem, coordinates, model, found, length, options.angle_scale)
+    return min(ends, key=lambda end: end.cost).shared
+
+
+def _from_estimate(
+    near: ShootingEstimate, coordinates: Coordinates, model: Model, zeros: int, options: ShootingOptions
+) -> Array:
+    """Shared coordinates where `near` ended, what it lacks at its initial value."""
+    known = near.parameters
+    for joint in range(1, model.joints + 1):
+        known.setdefault(f"coulomb_width_{joint}", options.initial_width)
+        known.setdefault(f"presliding_stiffness_{joint}", abs(known[f"coulomb_{joint}"]) / options.initial_bend)
+        known.setdefault(f"presliding_damping_{joint}", abs(known[f"viscous_{joint}"]))
+    value = np.array([known.get(name, term_of(name).initial) for name in model.names])
+    offsets = near.zeros.reshape(-1) if near.zeros.size == zeros else np.zeros(zeros)
+    return np.concatenate((coordinates.coordinates(value), offsets / options.angle_scale))
 
 
 def _fit(
     problem: Shooting, coordinates: Coordinates, shared: Array, own: Array, ftol: float, options: ShootingOptions
 ) -> Segmented:
     residual, derivative = partial(problem.residual, coordinates), partial(problem.derivative, coordinates)
-    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser)
+    expected = problem.expected(coordinates, shared, own)
+    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser, expected)
 
 
 def _estimate(
@@ -279,18 +373,20 @@ def _estimate(
         len(problem.segments),
         length,
         found.iterations,
+        problem.over_noise(coordinates, found),
+        found.own,
     )
 
 
 def _samples(segment: RecordingSegment) -> Array:
-    """Samples that hold a position (joints,)."""
+    """Return the number of valid samples (joints,)."""
     return np.asarray(np.isfinite(segment.position).sum(axis=1), dtype=np.float64)
 
 
 def _initial_guesses(
     problem: Shooting, coordinates: Coordinates, model: Model, base: Array, options: ShootingOptions
 ) -> Iterator[Array]:
-    """Initial shared coordinates: `base`, completed by guesses for friction."""
+    """Yield initial shared coordinates: `base`, completed by guesses for friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), options.initial_width)
     for joint in range(1, model.joints + 1):

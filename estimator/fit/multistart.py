@@ -1,8 +1,8 @@
 """Minimisation of the likelihood from several initial guesses, with coarse integration steps first.
 
-Most iterations use coarse integration steps; fine steps decide between minima that the coarse ones cannot separate.
-The noise level of each joint is itself estimated before the final iterations, in which outliers are
-downweighted (Huber), so that a few wild readings do no harm.
+Most iterations use coarse integration steps; fine steps decide between minima that the coarse ones cannot separate. The
+noise level of each joint is itself estimated before the final iterations, in which outliers are downweighted (Huber),
+so that a few corrupted readings do no harm.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,12 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
-
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.levenberg_marquardt import Minimum
+from hil.estimator.fit.noise_weights import noise_weights
 from hil.estimator.fit.objective import Objective
 from hil.estimator.models.terms import TERMS, kind_of
 from hil.estimator.options import LikelihoodOptions
@@ -30,45 +29,45 @@ class Start:
     """Result from one initial guess with coarse integration steps."""
 
     tracking: Array
-    """Coordinates of what fits the motion of the arm that springs hold to the measured one."""
+    """Coordinates of the tracking fit, in which springs hold the simulated arm close to the measured motion."""
     free: Minimum
-    """What fits the free motion, counting all simulations on the way there."""
+    """Fit of the free motion; its iterations include those of all preceding fits."""
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Results with fine integration steps, weighted by the residual of the best."""
+    """Results with fine integration steps, weighted by the residual of the best one."""
 
     weighted: Objective
     outliers: int
     best: Minimum
     cost: float
-    """Sum of squares of the best in units of the noise."""
+    """Sum of squares of the best result in units of the noise."""
     iterations: int
 
 
 @dataclass(frozen=True)
 class Search:
-    """The search on one set of periods."""
+    """The search for one set of periods."""
 
     periods: Sequence[SettledPeriod]
     fine: Objective
-    """With the integration steps of the result."""
+    """The objective with the integration steps of the result."""
     rough: Objective
-    """With coarse integration steps."""
+    """The objective with coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
-    """Whether a model is only tried: what leaves much more than the noise is given up before its last digits."""
+    """Whether to stop before full convergence if the residual is well above the noise, for comparing models."""
 
     @property
     def samples(self) -> int:
-        """Valid samples of all joints and periods."""
+        """Number of valid samples over all joints and periods."""
         return int(sum(period.valid.sum() for period in self.periods))
 
     def minimum(self, guesses: Sequence[Array], springs: Array) -> tuple[Refined, Minimum]:
-        """The best minimum from `guesses` (each: coordinates), the last of which has wide friction near standstill.
+        """Return the best minimum from `guesses` (coordinates), the last of which has wide friction near standstill.
 
-        `springs`: tracking stiffness (joints,) [N m/rad]. Raises ConvergenceError.
+        springs: tracking stiffness (joints,) [N m/rad]. Raises ConvergenceError.
         """
         options = self.options
         starts = self._multistart(guesses, springs)
@@ -85,9 +84,12 @@ class Search:
         return refined, replace(minimum, iterations=spent)
 
     def nearest(self, x: Array) -> tuple[Refined, Minimum]:
-        """The minimum to which the coordinates `x` lead, and no other. Raises ConvergenceError."""
+        """Return the minimum reached from the coordinates `x` alone. Raises ConvergenceError."""
         options = self.options
-        found = self.rough.minimise(x, options.ftol_start)
+        found = Minimum(x, self.fine.evaluate(x), 1)
+        # Coarse steps lead away from a minimum where they do not see the same motion: near a narrow friction step.
+        if abs(self.rough.evaluate(x).cost / found.at.cost - 1.0) < options.same_motion:
+            found = self.rough.minimise(x, options.ftol_start)
         refined = self._compare([found], options.ftol_refine)
         unexplained = refined.cost > options.explained_cost * self.samples
         ftol = options.ftol_refine if self.coarse and unexplained else options.ftol
@@ -112,14 +114,14 @@ class Search:
         return starts
 
     def _from_guess(self, x: Array, springs: Array) -> Start:
-        """From a guess to the open-loop motion, by way of motion that springs keep close to the measured one."""
+        """Fit the open-loop motion from a guess, after fitting motion that springs keep close to the measured one."""
         options, rough = self.options, self.rough
         ftol = options.ftol_coarse if self.coarse else options.ftol_start
         tracking = replace(rough, tracking_stiffness=springs).minimise(x, options.ftol_coarse)
         spent = tracking.iterations
         ends: list[Minimum] = []
         try:
-            # Springs leave little trace of the state at the first sample.
+            # With springs, the motion hardly depends on the initial state.
             start = replace(rough, fixed_parameters=True).minimise(tracking.x, options.ftol_state)
             ends.append(rough.minimise(start.x, ftol, at=start.at))
             spent += start.iterations + ends[0].iterations
@@ -136,10 +138,11 @@ class Search:
         return Start(tracking.x, replace(_best(ends), iterations=spent))
 
     def _refine(self, starts: Sequence[Start], wide: Array) -> Refined:
-        """From where the best of `starts` led, with other friction near standstill too, to minima in fine steps.
+        """Refine the best of `starts`, and variants with other friction near standstill, with fine steps.
 
-        What explains the motion may still have that friction wrong, by a little of the sum: the tracking fit shows it
-        well, and from a narrow step there is no path to a wide one, as which `wide` (coordinates) has it.
+        A fit that explains the motion may still have this friction wrong, at the cost of a slightly larger sum. The
+        tracking fit determines it well, and no path leads from a narrow step to a wide one, so both variants are tried:
+        that of the tracking fit and that of `wide` (coordinates).
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start
@@ -148,11 +151,11 @@ class Search:
         likely = options.refine_ratio * start.free.at.cost
         changed = [self._with_friction_of(start.free.x, start.tracking)]
         if any(name.startswith("presliding") for name in self.fine.coordinates.names):
-            # How far friction bends before it slides is seen better than how it rises then.
+            # The presliding deflection is better determined than the Stribeck rise.
             changed.append(self._with_friction_of(start.free.x, wide, STRIBECK_TERMS))
         alike = [each.free for each in starts if each.free.at.cost < likely]
         with ThreadPoolExecutor(1) as aside:
-            # From a wide step it is far: the others converge meanwhile.
+            # The fit from a wide step takes long, so the others run meanwhile.
             coming = aside.submit(self._polish, self._with_friction_of(start.free.x, wide), ftol, likely)
             tries = self._at_once(
                 [partial(self.rough.minimise, each.x, options.ftol_refine, at=each.at) for each in alike]
@@ -171,7 +174,7 @@ class Search:
         return replace(refined, iterations=spent)
 
     def _polish(self, x: Array, ftol: float, likely: float) -> Minimum:
-        """From `x` until little is left to gain, and on if the sum of squares is below `likely`."""
+        """Fit from `x` until little is left to gain, and further if the sum of squares is below `likely`."""
         found = self.rough.minimise(x, ftol)
         if found.at.cost >= likely:
             return found
@@ -179,9 +182,9 @@ class Search:
         return replace(near, iterations=found.iterations + near.iterations)
 
     def _compare(self, tries: Sequence[Minimum], ftol: float) -> Refined:
-        """The best of `tries` in fine steps, samples weighted by what the best of them leaves."""
+        """Fit `tries` with fine steps, with samples weighted by the residual of the best; return the best."""
         positions = self.fine.positions(_best(tries).x)
-        weights, outliers = _weights(self.periods, positions, self.options.outlier_threshold)
+        weights, outliers = noise_weights(self.periods, positions, self.options.outlier_threshold)
         weighted = replace(self.fine, weights=weights)
         ends = self._at_once([partial(weighted.minimise, each.x, ftol) for each in self._distinct(tries)])
         best = _best(ends)
@@ -189,7 +192,7 @@ class Search:
         return Refined(weighted, outliers, best, cost, sum(found.iterations for found in ends))
 
     def _distinct(self, tries: Sequence[Minimum]) -> list[Minimum]:
-        """The best, and those that only finer steps can distinguish from it."""
+        """Return the best minimum and those that only finer steps can distinguish from it."""
         distinct: list[Minimum] = []
         for each in sorted(tries, key=lambda found: found.at.cost):
             cost = each.at.cost
@@ -199,19 +202,19 @@ class Search:
         return distinct
 
     def _with_friction_of(self, x: Array, other: Array, kinds: tuple[str, ...] = STANDSTILL_TERMS) -> Array:
-        """The coordinates `x` with these kinds of parameters as the coordinates `other` have them."""
+        """Return the coordinates `x`, with these kinds of parameters taken from the coordinates `other`."""
         chosen = [kind_of(name) in kinds for name in self.fine.coordinates.names]
         changed = x.copy()
         changed[: len(chosen)][chosen] = other[: len(chosen)][chosen]
         return changed
 
     def _at_once(self, fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
-        """Fits that do not need each other, in threads: what is compiled leaves the interpreter to the others.
+        """Run independent fits in threads; compiled code releases the GIL.
 
-        One that does not converge is no loss where there is another. Raises ConvergenceError when none does.
+        Fits that do not converge are ignored if any other does; otherwise raises ConvergenceError.
         """
         found: list[Minimum] = []
-        lost = ConvergenceError("there was nothing to fit")
+        lost = ConvergenceError("no fit was started")
         with ThreadPoolExecutor(min(len(fits), thread_count(self.options.threads))) as threads:
             for running in [threads.submit(fit) for fit in fits]:
                 try:
@@ -225,23 +228,3 @@ class Search:
 
 def _best(tries: Sequence[Minimum]) -> Minimum:
     return min(tries, key=lambda found: found.at.cost)
-
-
-def _weights(
-    periods: Sequence[SettledPeriod], positions: Sequence[Array], threshold: float
-) -> tuple[tuple[Array, ...], int]:
-    """Weights by how large each joint's errors turned out, and the number of outliers."""
-    weights = []
-    outliers = 0
-    for period, position in zip(periods, positions, strict=True):
-        error = np.where(period.valid, np.abs(period.position - position), 0.0)
-        # 1.35 medians are a standard deviation between those of rounding (1.15) and of normal errors (1.48).
-        typical = np.array([1.35 * np.median(row[valid]) for row, valid in zip(error, period.valid, strict=True)])
-        spread = np.maximum(typical, period.noise)[:, None]
-        far = error > threshold * spread
-        weight = np.where(far, np.sqrt(threshold * spread / np.where(far, error, 1.0)), 1.0)
-        inside = np.where(far | ~period.valid, np.nan, error)
-        rms = np.sqrt(np.nanmean(inside**2, axis=1))[:, None]
-        weights.append(np.where(period.valid, weight / np.maximum(rms, period.noise[:, None]), 0.0))
-        outliers += int(far.sum())
-    return tuple(weights), outliers

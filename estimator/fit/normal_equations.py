@@ -1,7 +1,7 @@
-"""The products of least squares, compiled: without BLAS or a weighted copy of the Jacobian.
+"""Compiled products for least squares, without BLAS or a weighted copy of the Jacobian.
 
-As fast as a BLAS held to one thread; its own threads make products of this size ten times slower on a busy machine, and
-the last digits of a fit would depend on their number (docs/dependencies.md).
+They are as fast as BLAS with one thread. With several threads, BLAS is ten times slower for products of this size on a
+busy machine, and the last digits of a fit would depend on the number of threads (docs/dependencies.md).
 """
 
 from collections.abc import Callable
@@ -14,7 +14,10 @@ from hil.estimator.arrays import Array
 
 
 def normal_equations(jacobian: Array, residual: Array, weight: Array | None = None) -> tuple[Array, Array]:
-    """J'WJ (columns, columns) and J'Wr (columns,) of J (rows, columns), r (rows,) and the diagonal of W (rows,)."""
+    """Return J'WJ (columns, columns) and J'Wr (columns,).
+
+    jacobian: J (rows, columns). residual: r (rows,). weight: diagonal of W (rows,), by default 1.
+    """
     columns = jacobian.shape[1]
     product = np.zeros((columns, columns + 1))
     both = np.ascontiguousarray(jacobian)
@@ -24,7 +27,7 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array | None = No
 
 def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:
     rows, columns = J.shape
-    # Four rows at once: a quarter of the sums to fetch and put back.
+    # Four rows at a time: a quarter of the memory accesses to the sums.
     for first in range(0, rows, 4):
         i, j, k, m = first, min(first + 1, rows - 1), min(first + 2, rows - 1), min(first + 3, rows - 1)
         w = weight[i]

@@ -9,7 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise, step_limits
 from hil.estimator.fit.normal_equations import normal_equations
-from hil.estimator.fit.reparametrisation import Coordinates, Prior
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.models.parameters import Physics
@@ -20,25 +20,30 @@ Run = SimulatedRun | StabilisedRun
 
 @dataclass(frozen=True)
 class Objective:
-    """Residuals of several runs under one model, by coordinates: the parameters', then each run's first state."""
+    """Residuals of several runs under one model.
+
+    The coordinates are those of the parameters, followed by each run's initial state.
+    """
 
     runs: tuple[Run, ...]
     coordinates: Coordinates
     state_scale: Array
-    """Of the state at the first sample (2 joints,) [rad, rad/s]."""
+    """Scale of the initial state (2 joints,) [rad, rad/s]."""
     weights: tuple[Array, ...]
-    """Inverse standard deviation of each sample (joints, samples) [1/rad], 0 for a missing one, run by run."""
-    prior: Prior
+    """Inverse standard deviation of each sample (joints, samples) [1/rad] for each run; 0 for missing samples."""
+    prior: CoordinatePrior
     """Prior of the parameters."""
     minimiser: MinimiserOptions
     max_relative_decrease: float
-    """Of the width of friction's step, in one iteration."""
+    """Maximum relative decrease of the width of a smoothed Coulomb step per iteration."""
     horizon: float = 1.0
     """Fraction of each run, from its beginning, that is used."""
     tracking_stiffness: Array | None = None
-    """Of springs that draw the simulated arm to the measured angles (joints,) [N m/rad]."""
+    """Stiffness of springs that pull the simulated arm to the measured angles (joints,) [N m/rad]."""
     fixed_parameters: bool = False
-    """Whether only the first states are fitted."""
+    """Whether only the initial states are fitted."""
+    lever: Lever | None = None
+    """Prior on coupling and gravity_2 together."""
 
     @property
     def count(self) -> int:
@@ -46,18 +51,18 @@ class Objective:
         return len(self.coordinates.names)
 
     def physics(self, x: Array) -> Physics:
-        """The physics at the coordinates `x`."""
+        """Return the physical constants at the coordinates `x`."""
         values = self.coordinates.values(x[: self.count]).tolist()
         return Physics.of(dict(zip(self.coordinates.names, values, strict=True)))
 
     def start(self, x: Array, run: int) -> Array:
-        """The state at the first sample of a run (2, joints) at the coordinates `x`."""
+        """Return the state at the first sample of a run (2, joints) [rad, rad/s] at the coordinates `x`."""
         size = self.state_scale.size
         first = self.count + run * size
         return (x[first : first + size] * self.state_scale).reshape(2, -1)
 
     def evaluate(self, x: Array) -> Quadratic:
-        """The weighted sum of squares at `x` with its normal equations."""
+        """Return the weighted sum of squares at `x` with its normal equations."""
         physics = self.physics(x)
         total = self._expected(x)
         if not np.all(np.isfinite(physics.vector)):
@@ -83,11 +88,22 @@ class Objective:
         return total
 
     def _expected(self, x: Array) -> Quadratic:
-        """What the prior alone adds."""
+        """Return the contribution of the prior."""
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         normal[: self.count, : self.count] = np.diag(self.prior.precision)
         gradient[: self.count] = self.prior.precision * (x[: self.count] - self.prior.centre)
-        return Quadratic(self.prior.cost(x[: self.count]), normal, gradient)
+        cost = self.prior.cost(x[: self.count])
+        if self.lever is not None:
+            away, slope = self.lever.residual(self.coordinates.values(x[: self.count]))
+            by_coordinate = slope @ self.coordinates.slopes(x[: self.count])
+            normal[: self.count, : self.count] += np.outer(by_coordinate, by_coordinate)
+            gradient[: self.count] += away * by_coordinate
+            cost += away**2
+        return Quadratic(cost, normal, gradient)
+
+    def expected_normal(self, x: Array) -> Array:
+        """What is expected beforehand, as its share of the normal equations (parameters, parameters)."""
+        return self._expected(x).normal[: self.count, : self.count]
 
     def minimise(self, x: Array, ftol: float, damping: float | None = None, at: Quadratic | None = None) -> Minimum:
         """Minimise the sum of squares from `x`; see `hil.estimator.fit.levenberg_marquardt.minimise`."""
@@ -99,7 +115,7 @@ class Objective:
         )
 
     def _limits(self, x: Array) -> tuple[Array, Array]:
-        """The least and the most that each coordinate may change in a step."""
+        """Return the minimum and maximum change of each coordinate in a step."""
         least, most = step_limits(x, self.minimiser)
         self.coordinates.limit(x[: self.count], least, most, self.max_relative_decrease)
         if self.fixed_parameters:
@@ -107,7 +123,7 @@ class Objective:
         return least, most
 
     def cost(self, positions: Sequence[Array]) -> float:
-        """The weighted sum of squares of simulated positions, run by run (joints, samples) [rad]."""
+        """Return the weighted sum of squares for simulated positions of each run (joints, samples) [rad]."""
         squares = [
             np.square(weight * (position - run.measured))
             for run, weight, position in zip(self.runs, self.weights, positions, strict=True)
@@ -115,12 +131,12 @@ class Objective:
         return float(sum(square.sum() for square in squares))
 
     def positions(self, x: Array) -> tuple[Array, ...]:
-        """Simulated positions of each run (joints, samples) [rad]."""
+        """Return the simulated positions of each run (joints, samples) [rad]."""
         physics = self.physics(x)
         return tuple(run.position(physics, self.start(x, index)) for index, run in enumerate(self.runs))
 
     def scatter(self, x: Array, lags: int) -> Array:
-        """Sum of products of the scores, in coordinates (coordinates, coordinates); see `covariance`."""
+        """Return the sum of products of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
         physics = self.physics(x)
         total = self._expected(x).normal
         for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):
@@ -133,7 +149,7 @@ class Objective:
         return total
 
     def _transform(self, x: Array, run: int) -> Array:
-        """Derivatives of a run's parameters and first state by all coordinates (those, coordinates)."""
+        """Return the derivatives of a run's parameters and initial state by all coordinates (those, coordinates)."""
         size = self.state_scale.size
         transform = np.zeros((self.count + size, x.size))
         transform[: self.count, : self.count] = self.coordinates.slopes(x[: self.count])

@@ -1,9 +1,9 @@
 """Unconstrained coordinates for the likelihood: no step can leave the physical range.
 
-What range a parameter has, its scale and its longest step is declared in `hil.estimator.models.terms`. Positive
-parameters are exponentials. Coupling is a share of its bound, sqrt(inertia_1 inertia_2) tanh(z), which every arm of
-positive masses obeys and which keeps the mass matrix positive definite; so is the asymmetry of viscous friction,
-viscous tanh(z), which keeps friction positive both ways. The width of the Coulomb step stays above a floor.
+The range, scale and longest step of each parameter are declared in `hil.estimator.models.terms`. Positive parameters
+are exponentials. Coupling is a fraction of its bound, sqrt(inertia_1 inertia_2) tanh(z), which holds for every arm with
+positive masses and keeps the mass matrix positive definite; likewise the asymmetry of viscous friction, viscous
+tanh(z), which keeps friction positive in both directions. The width of the smoothed Coulomb step stays above a floor.
 """
 
 from dataclasses import dataclass
@@ -12,25 +12,28 @@ from functools import cached_property
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.models.model import LEVER_STD, Model
 from hil.estimator.models.terms import Scale, joint_of, term_of
 from hil.estimator.options import CoordinateOptions
 
-TYPICAL_SATURATION = 0.02  # of the RMS torque: much to lose; only a scale
-TYPICAL_BEND = 0.01  # rad: much, for friction that yields before it slides; only a scale
+TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a scale
+LEAST_WEIGHT = 0.02  # least gravity_2 that gives a scale, as a fraction of the RMS torque
+TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS torque per radian
+TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The map between parameters and coordinates of about the size of 1."""
+    """The map between parameters and coordinates of order 1."""
 
     names: tuple[str, ...]
-    """Parameters, as in `Model.names`."""
+    """Names of the parameters, as in `Model.names`."""
     scales: Array
-    """Scale of each parameter (parameters,) [its unit], by `scales_of`."""
+    """Scale of each parameter (parameters,) [its unit], from `scales_of`."""
     options: CoordinateOptions
 
     def values(self, x: Array) -> Array:
-        """Parameters (parameters,) at the coordinates `x` (parameters,)."""
+        """Return the parameters (parameters,) at the coordinates `x` (parameters,)."""
         value = np.where(self._either_sign, x * self.scales, np.exp(np.where(self._either_sign, 0.0, x)))
         value += self._floors
         for share, first, second in self._shares:
@@ -38,7 +41,7 @@ class Coordinates:
         return value
 
     def coordinates(self, value: Array) -> Array:
-        """Coordinates of the parameters `value` (parameters,), moved into the physical range."""
+        """Return the coordinates of the parameters `value` (parameters,), moved into the physical range."""
         above = np.maximum(value - self._floors, self.options.min_initial * self.scales)
         x = np.where(self._either_sign, value / self.scales, np.log(above))
         for share, first, second in self._shares:
@@ -48,10 +51,10 @@ class Coordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Where `step` (coordinates,) leads from `x`; both may have coordinates of something else at their end.
+        """Return the point reached by `step` (coordinates,) from `x`; both may be followed by unrelated coordinates.
 
-        The motion follows a width and not its logarithm: the width changes as a linear model foresees. By the
-        exponential of the step it would never arrive at its floor, and all that makes up for it would go too far.
+        A step changes a width linearly rather than its logarithm, since the motion depends linearly on it. With
+        exponential steps it would never reach its floor, and the parameters that compensate for it would overshoot.
         """
         y = x + step
         widths = np.flatnonzero(self._floors)
@@ -60,20 +63,20 @@ class Coordinates:
         return y
 
     def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
-        """Lower in place what coordinates may change by in one step from `x` (coordinates,), where less is declared of
-        them: a width relative to itself, others by their `Term.max_step`.
+        """Tighten, in place, the bounds on the change of each coordinate in one step from `x` (coordinates,).
 
-        One that shrinks to nothing in a single step leaves no trace in the motion that would bring it back.
+        A width is limited relative to itself, other parameters by their `Term.max_step`. If a width shrank to its floor
+        in a single step, the motion would no longer depend on it, and nothing would bring it back.
         """
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)
         widths = np.flatnonzero(self._floors)
-        share = 1.0 + self.options.width_floor * np.exp(-x[widths])  # of the width in what is above its floor
+        share = 1.0 + self.options.width_floor * np.exp(-x[widths])  # width relative to its distance from the floor
         least[widths] = np.maximum(-1.0, -max_relative_decrease * share)
         most[widths] = self.options.max_relative_increase * share
 
     def slopes(self, x: Array) -> Array:
-        """Derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
+        """Return the derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
         value = self.values(x)
         slope = np.diag(np.where(self._either_sign, self.scales, value - self._floors))
         for share, first, second in self._shares:
@@ -96,7 +99,7 @@ class Coordinates:
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
-        """Indices of what is bounded by the geometric mean of two others, and of the two."""
+        """Indices of parameters bounded by the geometric mean of two others, each with those two."""
         shares = []
         for share, name in enumerate(self.names):
             bounds, joint = term_of(name).share_of, joint_of(name)
@@ -107,22 +110,22 @@ class Coordinates:
 
 
 @dataclass(frozen=True)
-class Prior:
-    """What is expected of the parameters before any measurement: normal distributions of independent coordinates."""
+class CoordinatePrior:
+    """Prior knowledge of the parameters: independent normal distributions of their coordinates."""
 
     centre: Array
-    """(parameters,) [coordinates]."""
+    """Means (parameters,) [coordinates]."""
     precision: Array
-    """Inverse variances (parameters,), 0 where nothing is expected."""
+    """Inverse variances (parameters,), 0 without prior knowledge."""
 
     @classmethod
-    def of(cls, names: tuple[str, ...], scales: Array, sizes: "Sizes") -> "Prior":
-        """As `Term.spread` declares it, of coordinates with these scales."""
+    def of(cls, names: tuple[str, ...], scales: Array, sizes: "Sizes") -> "CoordinatePrior":
+        """Return the prior declared by `Term.spread`, for coordinates with these scales."""
         terms = [term_of(name) for name in names]
         spread = np.array([np.inf if term.spread is None else sizes.of(term.spread) for term in terms])
         signed = np.array([term.range == "any" for term in terms])
         absent = np.array([term.absent for term in terms])
-        # Around its absent value the logarithm of a factor changes as the factor itself does.
+        # For small deviations from its absent value, the logarithm of a factor changes like the factor itself.
         centre = np.where(signed, absent / scales, np.log(np.where(signed | (absent <= 0.0), 1.0, absent)))
         precision = (np.where(signed, scales, absent) / spread) ** 2
         for index, term in enumerate(terms):
@@ -131,8 +134,35 @@ class Prior:
         return cls(centre, precision)
 
     def cost(self, x: Array) -> float:
-        """What the coordinates `x` (parameters,) add to the sum of squares."""
+        """Return the prior's contribution to the sum of squares at the coordinates `x` (parameters,)."""
         return float(np.sum(self.precision * (x - self.centre) ** 2))
+
+
+@dataclass(frozen=True)
+class Lever:
+    """What is expected of two parameters together: coupling is `ratio` times gravity_2, whatever they are."""
+
+    coupling: int
+    gravity: int
+    """Their places among the parameters."""
+    ratio: float
+    """`Model.lever` [s^2]."""
+    std: float
+    """Of coupling less that [kg m^2]."""
+
+    @classmethod
+    def of(cls, model: Model, gravity_2: float, sizes: "Sizes") -> "Lever | None":
+        """For a model that knows it; gravity_2: about what it is [N m], as a scale."""
+        if model.lever is None or model.joints != 2:
+            return None
+        std = LEVER_STD * model.lever * max(abs(gravity_2), LEAST_WEIGHT * sizes.torque)
+        return cls(model.names.index("coupling"), model.names.index("gravity_2"), model.lever, std)
+
+    def residual(self, value: Array) -> tuple[float, Array]:
+        """How far the parameters `value` (parameters,) are from it, in standard deviations, and the slopes of that."""
+        slope = np.zeros(value.size)
+        slope[self.coupling], slope[self.gravity] = 1.0 / self.std, -self.ratio / self.std
+        return float(slope @ value), slope
 
 
 @dataclass(frozen=True)
@@ -140,14 +170,14 @@ class Sizes:
     """Scales of an arm and its motion."""
 
     torque: float
-    """RMS [N m]."""
+    """RMS torque [N m]."""
     velocity: float
-    """RMS [rad/s]."""
+    """RMS velocity [rad/s]."""
     inertia: float
-    """[kg m^2]."""
+    """Typical inertia [kg m^2]."""
 
     def of(self, scale: Scale | float) -> float:
-        """The value of a declared scale for this arm."""
+        """Return the value of a declared scale for this arm."""
         if not isinstance(scale, str):
             return scale
         return {
@@ -156,10 +186,11 @@ class Sizes:
             "velocity": self.velocity,
             "damping": self.torque / self.velocity,
             "stiffness": self.torque / TYPICAL_BEND,
+            "cable": TYPICAL_CABLE * self.torque,
             "saturation": TYPICAL_SATURATION / self.torque**2,
         }[scale]
 
 
 def scales_of(names: tuple[str, ...], sizes: Sizes) -> Array:
-    """Scale of each parameter (parameters,)."""
+    """Return the scale of each parameter (parameters,)."""
     return np.array([sizes.of(term_of(name).scale) for name in names])

@@ -1,7 +1,8 @@
-"""Where torque ripple over the joint angle repeats: a scan that needs no initial guess.
+"""Period of the torque ripple over the joint angle: a scan that needs no initial guess.
 
-For each number of cycles a turn, torque times its sine and cosine are two more columns of the regression on
-Fourier lines; the one that explains most of what friction and dynamics leave is where the likelihood starts.
+For each number of cycles per turn, torque times the sine and cosine of the angle are two additional columns of the
+regression on Fourier lines. The number that explains most of the residual of dynamics and friction is the likelihood's
+initial guess.
 """
 
 from collections.abc import Sequence
@@ -15,13 +16,13 @@ from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.regressor import regressor
 from hil.estimator.options import LinearOptions
 
-CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint: what is slower is gravity, cables, encoders
+CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint; slower variations come from gravity, cables, encoders
 COULOMB_WIDTH = LinearOptions().coulomb_width
-STRIBECK_VELOCITY = 0.15  # rad/s: about right is enough to keep the rise of friction out of the ripple
+STRIBECK_VELOCITY = 0.15  # rad/s: a rough value suffices to separate the Stribeck rise from the ripple
 
 
 def find_ripple(periods: Sequence[SettledPeriod], linear: LinearEstimate) -> dict[str, float]:
-    """Cycles per turn of each joint's torque ripple and its sine and cosine parts, by parameter name."""
+    """Return cycles per turn, sine and cosine part of each joint's torque ripple, by parameter name."""
     found: dict[str, float] = {}
     for joint in range(periods[0].joints):
         each = [
@@ -37,7 +38,7 @@ def find_ripple(periods: Sequence[SettledPeriod], linear: LinearEstimate) -> dic
             share = np.asarray(np.linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
             explained = float(goal @ goal - np.sum((goal - extra @ share) ** 2))
             best = max(best, (explained, cycles, share), key=lambda trial: trial[0])
-        # Torque appears as measured = applied (1 + ripple), so what the columns explain is its opposite.
+        # Torque appears as measured = applied (1 + ripple), so the columns explain the negative ripple.
         found |= {f"ripple_cycles_{joint + 1}": best[1]}
         found |= {f"ripple_sin_{joint + 1}": -float(best[2][0]), f"ripple_cos_{joint + 1}": -float(best[2][1])}
     return found
@@ -50,7 +51,7 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Columns and torque of one joint's lines as real numbers, and its torque and angle over time (samples,)."""
+    """Return columns and torque of one joint's lines as real numbers, and its torque and angle over time (samples,)."""
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]
     sign = np.tanh(velocity / COULOMB_WIDTH)
@@ -59,7 +60,7 @@ def _prepared(
     kept[harmonics + 1 :] = 0.0
     torque = np.fft.irfft(kept * period.samples, period.samples)
     friction = (sign * np.exp(-((velocity / STRIBECK_VELOCITY) ** 2)), sign * np.abs(torque), np.abs(velocity))
-    # What zeros that are off, cables and torque that saturates leave looks like slow ripple.
+    # Zero errors, cables and saturation have effects that resemble slow ripple.
     angles = np.cumsum(motion.position, axis=0)
     slow = (*np.sin(angles), motion.position[joint], torque**3, *np.sin(2.0 * motion.position))
     columns = np.column_stack((Y, *friction, *slow))
@@ -78,6 +79,6 @@ def _real(lines: np.ndarray) -> Array:
 
 
 def _without(Q: Array, b: Array) -> Array:
-    """What is left of `b` outside the columns of `Q`."""
+    """Return the component of `b` orthogonal to the columns of `Q`."""
     left: Array = b - Q @ (Q.T @ b)
     return left

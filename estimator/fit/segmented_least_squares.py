@@ -1,8 +1,8 @@
-"""Nonlinear least squares with unknowns shared by all segments and unknowns of each segment alone.
+"""Nonlinear least squares with unknowns shared by all segments and unknowns of each segment.
 
-A segment's own unknowns touch only its own residuals, so the normal equations have an arrow's shape: each
-segment's block is eliminated by itself (Schur complement), and its columns of the Jacobian are taken for all
-segments at once. Hundreds of initial states cost as much as four.
+A segment's own unknowns only affect its own residuals, so the normal equations have an arrowhead structure: each
+segment's block is eliminated by itself (Schur complement), and the corresponding columns of the Jacobian are computed
+for all segments at once. Hundreds of initial states cost as much as four.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,15 +18,37 @@ from hil.estimator.options import SegmentedMinimiserOptions
 from hil.estimator.threads import thread_count
 
 Residual = Callable[[int, Array, Array], Array]
-"""Residuals (rows,) of one segment at shared coordinates (shared,) and its own (own,)."""
+"""Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
-"""The same residuals and their derivatives by shared coordinates, then by its own (rows, shared + own)."""
+"""Returns the same residuals, and their derivatives by shared, then own coordinates (rows, shared + own)."""
 
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3
-MIN_EIGENVALUE = 1e-12  # of the largest: below, a direction leaves no trace
-MIN_PART = 1e-4  # of a coordinate in such a direction, squared: less is rounding
+MIN_EIGENVALUE = 1e-12  # relative to the largest; directions below have no effect on the residual
+MIN_PART = 1e-4  # squared component of a coordinate in such a direction; anything smaller is rounding error
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What is expected of the shared coordinates before any measurement: independent normal distributions."""
+
+    centre: Array
+    """(shared,)."""
+    precision: Array
+    """Inverse variances times `weight` (shared,), 0 where nothing is expected."""
+    weight: float = 1.0
+    """Mean square of the residual in units of the noise, as far as it is correlated: what the model leaves tells as
+    much less as it is larger, and so must the prior be held against it."""
+
+    @classmethod
+    def nothing(cls, size: int) -> "Expected":
+        """No prior on any of `size` coordinates."""
+        return cls(np.zeros(size), np.zeros(size))
+
+    def cost(self, x: Array) -> float:
+        """What the coordinates `x` (shared,) add to the sum of squares."""
+        return float(np.sum(self.precision * (x - self.centre) ** 2))
 
 
 @dataclass(frozen=True)
@@ -34,29 +56,30 @@ class Segmented:
     """Minimum of the sum of squares."""
 
     shared: Array
-    """(shared,)."""
+    """Shared coordinates (shared,)."""
     own: Array
-    """(segments, own)."""
+    """Own coordinates (segments, own)."""
     cost: float
     """Sum of squares."""
     information: Array
-    """Of the shared coordinates, the segments' own eliminated (shared, shared)."""
+    """Information about the shared coordinates, with the segments' own eliminated (shared, shared)."""
     scores: Array
-    """Each segment's gradient by the shared coordinates, its own eliminated (segments, shared)."""
+    """Gradient of each segment by the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
+    expected: Expected | None = None
+    """What of `information` was expected, not measured."""
 
     def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
-        """Sandwich covariance of the shared coordinates (shared, shared), segments taken as independent.
+        """Return the sandwich covariance of the shared coordinates (shared, shared), taking segments as independent.
 
-        If `groups` (segments,) says which recording each is from, all is as much more uncertain as the recordings
-        disagree more than their segments would make them: a repeated motion repeats the model's error. The last `own`
-        coordinates belong to one recording each.
+        It is valid if residuals within a segment are correlated, as model errors are: Liang and Zeger, "Longitudinal
+        data analysis using generalized linear models", Biometrika 73 (1986) 13. With fewer than MIN_SEGMENTS times as
+        many segments as coordinates, correlations cannot be estimated; then a single factor scales the covariance for
+        white noise. Infinite for coordinates that can change, alone or together, without affecting the residual.
 
-        It holds when the residuals of a segment hang together, as model error makes them: Liang and Zeger,
-        "Longitudinal data analysis using generalized linear models", Biometrika 73 (1986) 13. Fewer than
-        MIN_SEGMENTS times as many segments as coordinates cannot tell what correlates with what: they tell
-        one factor by which all is more uncertain than white noise would make it. Infinite for a coordinate that can
-        change, alone or with others, and leave no trace.
+        groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
+        because a repeated motion repeats the model error, the whole covariance is increased accordingly.
+        own: number of coordinates, at the end, that belong to one recording each.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
@@ -66,7 +89,10 @@ class Segmented:
         if segments < MIN_SEGMENTS * size:
             covariance = few * _size(self.scores, bread) / size * bread
         else:
-            covariance = few * bread @ (self.scores.T @ self.scores) @ bread
+            meat = few * self.scores.T @ self.scores
+            if self.expected is not None:
+                meat += self.expected.weight * np.diag(self.expected.precision)
+            covariance = bread @ meat @ bread
         if groups is not None and np.unique(groups).size > 1:
             together = np.stack([self.scores[groups == group].sum(axis=0) for group in np.unique(groups)])
             fewer = len(together) / (len(together) - 1)
@@ -77,13 +103,15 @@ class Segmented:
 
 
 def _size(scores: Array, bread: Array) -> float:
-    """Sum of the squares of scores (scores, shared) in units of what white noise would make of them."""
+    """Return the sum of squares of scores (scores, shared) relative to that expected for white noise."""
     return float(np.einsum("si,ij,sj->", scores, bread, scores))
 
 
 def _inverse(matrix: Array) -> tuple[Array, Array]:
-    """Of a matrix that is positive semidefinite but for rounding, without the directions that are not seen at all;
-    and which coordinates have part in those."""
+    """Return the pseudo-inverse of a positive semidefinite matrix, and which coordinates it leaves undetermined.
+
+    Directions without effect on the residual are left out; a coordinate with a component in one is undetermined.
+    """
     size, direction = np.linalg.eigh(matrix)
     seen = size > MIN_EIGENVALUE * size[-1]
     inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
@@ -93,21 +121,21 @@ def _inverse(matrix: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Normal equations, a block for each segment."""
+    """Normal equations, one block per segment."""
 
     shared: Array
-    """(segments, shared, shared)."""
+    """J'J of the shared coordinates (segments, shared, shared)."""
     mixed: Array
-    """(segments, shared, own)."""
+    """J'J between shared and own coordinates (segments, shared, own)."""
     own: Array
-    """(segments, own, own)."""
+    """J'J of the own coordinates (segments, own, own)."""
     shared_gradient: Array
-    """(segments, shared)."""
+    """J'r of the shared coordinates (segments, shared)."""
     own_gradient: Array
-    """(segments, own)."""
+    """J'r of the own coordinates (segments, own)."""
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array, Array]:
-        """Information and scores with the segments' own eliminated, and what recovers their own steps."""
+        """Return information and scores with own coordinates eliminated, and the terms that recover those."""
         eye = np.eye(self.own.shape[1])
         scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14
         damped = self.own + damping * self.own * eye + scale * eye
@@ -125,27 +153,30 @@ def minimise_segmented(
     own: Array,
     ftol: float,
     options: SegmentedMinimiserOptions = DEFAULTS,
+    expected: Expected | None = None,
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1. Ends when the relative decrease
+    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1; `expected` adds what is known of
+    the shared ones beforehand. Ends when the relative decrease
     of a step is below `ftol`, or after `options.max_iterations` when it gained less than `options.unfinished`.
     `residual` and `derivative` are called from several threads; the result does not depend on their number. Raises
     ConvergenceError.
     """
+    prior = expected or Expected.nothing(shared.size)
     with ThreadPoolExecutor(thread_count()) as threads:
         rows = _residuals(residual, shared, own, threads)
-        cost = _cost(rows)
+        cost = _cost(rows) + prior.cost(shared)
         if not np.isfinite(cost):
-            raise ConvergenceError("the initial guess gives no finite motion: check the units of torque and time")
+            raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):
             blocks = _blocks(derivative, shared, own, threads)
             gained = 0.0
             while damping < options.max_damping:
-                there = _stepped(blocks, shared, own, damping, options.max_step)
+                there = _stepped(blocks, prior, shared, own, damping, options.max_step)
                 rows_there = _residuals(residual, *there, threads)
-                gained = cost - _cost(rows_there)
+                gained = cost - _cost(rows_there) - prior.cost(there[0])
                 if gained > 0.0:
                     (shared, own), rows, cost = there, rows_there, cost - gained
                     damping = max(0.2 * damping, options.min_damping)
@@ -155,7 +186,8 @@ def minimise_segmented(
             if gained < ftol * cost or (last and gained < options.unfinished * cost):
                 blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
-                return Segmented(shared, own, cost, information, scores, iteration)
+                information = information + np.diag(prior.precision)
+                return Segmented(shared, own, cost, information, scores, iteration, prior)
     raise ConvergenceError(
         f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} per "
         "iteration: try a simpler friction model or shorter segments"
@@ -163,7 +195,8 @@ def minimise_segmented(
 
 
 def _cost(rows: Sequence[Array]) -> float:
-    return float(sum(np.sum(np.square(row)) for row in rows))
+    with np.errstate(over="ignore"):  # a motion that diverges costs infinitely much
+        return float(sum(np.sum(np.square(row)) for row in rows))
 
 
 def _residuals(residual: Residual, shared: Array, own: Array, threads: ThreadPoolExecutor) -> list[Array]:
@@ -185,12 +218,16 @@ def _blocks(derivative: Derivative, shared: Array, own: Array, threads: ThreadPo
     return _Blocks(normal[:, :n, :n], normal[:, :n, n:], normal[:, n:, n:], gradient[:, :n], gradient[:, n:])
 
 
-def _stepped(blocks: _Blocks, shared: Array, own: Array, damping: float, max_step: float) -> tuple[Array, Array]:
+def _stepped(
+    blocks: _Blocks, prior: Expected, shared: Array, own: Array, damping: float, max_step: float
+) -> tuple[Array, Array]:
     information, scores, solve, known = blocks.reduced(damping)
-    full = np.diag(blocks.shared.sum(axis=0))
+    information = information + np.diag(prior.precision)
+    gradient = scores.sum(axis=0) + prior.precision * (shared - prior.centre)
+    full = np.diag(blocks.shared.sum(axis=0)) + prior.precision
     scale = np.sqrt(np.maximum(full, 1e-12 * full.max()))
     matrix = information / np.outer(scale, scale) + damping * np.eye(shared.size)
-    step = -np.linalg.lstsq(matrix, scores.sum(axis=0) / scale, rcond=1e-13)[0] / scale
+    step = -np.linalg.lstsq(matrix, gradient / scale, rcond=1e-13)[0] / scale
     step = np.clip(step, -max_step, max_step)
     own_step = -known - np.einsum("sij,j->si", solve, step)
     return shared + step, own + np.clip(own_step, -max_step, max_step)

@@ -1,4 +1,4 @@
-"""One recorded run as the likelihood simulates it: piece by piece, so that memory does not grow with derivatives."""
+"""Simulation of one recorded run for the likelihood, piece by piece, so that memory use is bounded."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.models.parameters import Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
+from hil.estimator.simulation.back_emf import by_names, causes_of
 from hil.estimator.simulation.drive import motor_torque, torque_and_slopes
 from hil.estimator.simulation.encoder import by_motion, measured, measured_and_slopes
 from hil.estimator.simulation.presliding_sensitivity import sensitive
@@ -19,36 +20,35 @@ PIECE = 8192  # samples; the derivatives of one piece are a few MiB
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """What a run's simulation takes from its recording."""
+    """The input of a run's simulation, from its recording."""
 
     command: Array
     """Commanded torque (joints, samples) [N m], periodic."""
     measured: Array
-    """Angles (joints, samples) [rad], the missing ones interpolated."""
+    """Measured angles (joints, samples) [rad], with missing ones interpolated."""
     rate: float
     command_to_sample: float
     steps: int
-    """Integration steps in a sample."""
+    """Integration steps per sample."""
     max_substeps: int
-    """Into which a step may be cut near standstill."""
+    """Maximum number of substeps into which a step is divided near standstill."""
     pulled_to: Array | None = None
-    """Where springs end that draw the arm, held from sample to sample (joints, samples) [rad]; `measured` unless given.
-    """
+    """Angles to which springs pull the arm, held between samples (joints, samples) [rad]; by default `measured`."""
 
     @classmethod
     def of(cls, period: SettledPeriod, integration: IntegrationOptions) -> "SimulatedRun":
-        """Of this period."""
+        """Create a run from a settled period."""
         steps = steps_per_sample(period.rate, integration.max_step)
         samples = (period.torque, period.filled(), period.rate, period.command_to_sample)
         return cls(*samples, steps, integration.max_substeps)
 
     def integrated(self, integration: IntegrationOptions) -> "SimulatedRun":
-        """The same in other steps."""
+        """Return the same run with other integration steps."""
         steps = steps_per_sample(self.rate, integration.max_step)
         return replace(self, steps=steps, max_substeps=integration.max_substeps)
 
     def position(self, physics: Physics, start: Array) -> Array:
-        """Measured angles (joints, samples) [rad] from the state `start` (2, joints) at the first sample."""
+        """Return the simulated encoder angles (joints, samples) [rad] from the initial state `start` (2, joints)."""
         of = self.command, self.rate, self.command_to_sample, self.steps
         torque = motor_torque(*of, delay=physics.delay, lag=physics.lags)
         return measured(physics, simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0])
@@ -61,21 +61,30 @@ class SimulatedRun:
         tracking_stiffness: Array | None = None,
         horizon: float = 1.0,
     ) -> Iterator[tuple[slice, Array, Array]]:
-        """Piece after piece: which samples, their angles (joints, samples) [rad], and the derivatives of these
-        (joints, samples, causes) by the parameters `names` and then by the state at the first sample. Springs of
-        stiffness `tracking_stiffness` (joints,) [N m/rad] draw the simulated arm to the measured angles. Ends after the
-        share `horizon` of the samples."""
+        """Simulate the run piece by piece, with derivatives.
+
+        Yields the samples of each piece, their angles (joints, samples) [rad], and the derivatives of these (joints,
+        samples, causes).
+
+        Args:
+            physics: physical constants.
+            start: state at the first sample (2, joints) [rad, rad/s].
+            names: parameters by which to differentiate, followed by the initial state.
+            tracking_stiffness: stiffness of springs that pull the simulated arm to the measured angles (joints,) [N
+                m/rad].
+            horizon: fraction of the samples to simulate.
+        """
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
-        motion = sensitive(physics)(
-            *(physics, start, (*by_motion(names), *state), 1.0 / (self.rate * self.steps), self.max_substeps),
-            tracking_stiffness,
-        )
+        moving = by_motion(names)
+        causes = (*causes_of(physics, moving), *state)
+        step = 1.0 / (self.rate * self.steps)
+        motion = sensitive(physics)(physics, start, causes, step, self.max_substeps, tracking_stiffness)
         of = self.command, self.rate, self.command_to_sample, self.steps
         torque, slopes = torque_and_slopes(*of, delay=physics.delay, lag=physics.lags)
         samples = round(horizon * samples)
         ends = self.measured if self.pulled_to is None else self.pulled_to
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
-            true = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part])
-            yield part, *measured_and_slopes(physics, names, *true)
+            true, slope = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part])
+            yield part, *measured_and_slopes(physics, names, true, by_names(physics, moving, slope))

@@ -1,9 +1,8 @@
-"""Stage 1: linear least squares on the Fourier lines of settled periods. No initial guess, no local
-minima.
+"""Stage 1: linear least squares on the Fourier lines of settled periods, without initial guess or local minima.
 
-The motion's lines up to where signal meets noise are differentiated exactly, the regressor evaluated on
-them, and regressor and torque compared line by line. The command's own derivative is one more column, whose
-coefficient is the delay of the motors: tau(t - delay) = tau(t) - delay tau'(t).
+The motion's lines above the noise are differentiated exactly, the regressor is evaluated on the resulting motion, and
+regressor and torque are compared line by line. The command's derivative is one more column, whose coefficient is the
+delay of the motors: tau(t - delay) = tau(t) - delay tau'(t).
 """
 
 from dataclasses import dataclass
@@ -26,29 +25,29 @@ class LinearEstimate:
     """Result of the regression."""
 
     names: tuple[str, ...]
-    """Base parameters."""
+    """Names of the base parameters."""
     value: Array
-    """(parameters,) [SI]."""
+    """Values (parameters,) [SI]."""
     std: Array
-    """Standard errors if the residual were white (parameters,): optimistic for other friction."""
+    """Standard errors assuming a white residual (parameters,): too optimistic if the friction is not as modelled."""
     delay: float
     """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]
-    """Each period's motion from its lines up to `harmonics`."""
+    """Motion of each period from its lines up to `harmonics`."""
     harmonics: tuple[int, ...]
     """Highest harmonic used of each period."""
 
     @property
     def motion(self) -> PeriodicMotion:
-        """Of the first period."""
+        """Motion of the first period."""
         return self.motions[0]
 
 
 def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> LinearEstimate:
     """Estimate the base parameters from one or more settled periods of one arm.
 
-    Raises UnidentifiableError when the motion does not tell them apart, ShapeError for periods of arms with
-    different numbers of joints.
+    Raises UnidentifiableError if the motion does not separate them, ShapeError for periods of arms with different
+    numbers of joints.
     """
     joints = periods[0].joints
     if any(period.joints != joints for period in periods):
@@ -65,7 +64,7 @@ def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> Lin
     torque = np.concatenate([goal for _, goal in equations], axis=1)
 
     theta, _ = _solve(A, torque, np.ones(joints), options.max_condition)
-    # The second time each joint counts by what the first left unexplained of it.
+    # The second time, each joint is weighted by the residual of the first.
     left = np.sqrt(np.mean(np.abs(torque - A @ theta) ** 2, axis=1))
     weight = 1.0 / np.maximum(left, 1e-12 * np.abs(torque).max())
     theta, std = _solve(A, torque, weight, options.max_condition)
@@ -75,9 +74,9 @@ def fit_lines(*periods: SettledPeriod, options: LinearOptions = DEFAULTS) -> Lin
 def _equations(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, coulomb_width: float
 ) -> tuple[Lines, Lines]:
-    """One period's columns (joints, lines, unknowns) and torques (joints, lines), line by line."""
+    """Return one period's columns (joints, lines, unknowns) and torques (joints, lines)."""
     Y = regressor(motion.position, motion.velocity, motion.acceleration, coulomb_width)
-    # One joint after the other: a long period's spectra of all regressors at once would fill the memory.
+    # One joint at a time: the spectra of all regressors of a long period at once would fill the memory.
     columns = np.stack([np.fft.rfft(rows, axis=0)[: harmonics + 1] for rows in Y]) / period.samples
     torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : harmonics + 1]
     slope = 1j * period.fundamental * np.arange(harmonics + 1) * torque
@@ -85,7 +84,7 @@ def _equations(
 
 
 def _solve(columns: Lines, torque: Lines, weight: Array, max_condition: float) -> tuple[Array, Array]:
-    """Weighted least squares of complex `torque` (joints, lines) on `columns` (joints, lines, unknowns)."""
+    """Solve for complex `torque` (joints, lines) by weighted least squares on `columns` (joints, lines, unknowns)."""
     weighted = (columns * weight[:, None, None]).reshape(-1, columns.shape[2])
     A = np.concatenate((weighted.real, weighted.imag))
     goal = (torque * weight[:, None]).reshape(-1)
@@ -94,7 +93,7 @@ def _solve(columns: Lines, torque: Lines, weight: Array, max_condition: float) -
     U, size, Vt = np.linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
     if size[-1] * max_condition < size[0]:
         raise UnidentifiableError(
-            f"the regression's condition is {size[0] / max(size[-1], 1e-300):.2g}, at most "
+            f"the regression has a condition number of {size[0] / max(size[-1], 1e-300):.2g}; at most "
             f"{max_condition:.0e} can be solved: the motion does not separate the parameters; "
             "excite more lines or raise the torque"
         )

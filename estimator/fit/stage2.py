@@ -1,9 +1,8 @@
 """Stage 2: maximum likelihood, by least squares of measured minus simulated position over settled periods.
 
-If position errors are independent and identically distributed, as rounding errors nearly are,
-the most likely parameters minimise the weighted sum of squares. The state at the first sample of
-each run is unknown too: simulating until the motion is periodic would take two or more periods instead of one.
-`hil.estimator.fit.multistart` finds the minimum.
+If position errors are independent and identically distributed, as rounding errors nearly are, the most likely
+parameters minimise the weighted sum of squares. The initial state of each run is estimated as well: simulating until
+the motion is periodic would take two or more periods instead of one. `hil.estimator.fit.multistart` finds the minimum.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,46 +16,48 @@ from hil.estimator.fit.covariance import by_parameters, correlation_time, robust
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
-from hil.estimator.fit.reparametrisation import Coordinates, Prior, Sizes, scales_of
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever, Sizes, scales_of
 from hil.estimator.fit.ripple import find_ripple
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.model import Model
-from hil.estimator.models.terms import term_of
+from hil.estimator.models.terms import FRICTIONS, term_of
 from hil.estimator.options import LikelihoodOptions
 
 DEFAULTS = LikelihoodOptions()
+HARDLY = 0.05
+"""Of its usual initial guess: what a term begins with near the minimum of a model without it."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The most likely parameters under one model."""
+    """Maximum-likelihood parameters under one model."""
 
     value: Array
-    """In the order of `Model.names` [SI]."""
+    """Values in the order of `Model.names` [SI]."""
     covariance: Array
-    """Of `value`, also valid for correlated errors. Infinite for parameters without influence."""
+    """Covariance of `value`, also valid for correlated errors; infinite for parameters without influence."""
     starts: tuple[Array, ...]
-    """Of each run, angles and velocities at the first sample (2, joints) [rad, rad/s]."""
+    """State at the first sample of each run (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]
-    """Of each run, simulated positions (joints, samples) [rad]."""
+    """Simulated positions of each run (joints, samples) [rad]."""
     outliers: int
-    """Samples that were downweighted."""
+    """Number of samples that were downweighted."""
     correlation_time: float
-    """Samples over which the residual is correlated; 1 is white."""
+    """Number of samples over which the residual is correlated; 1 is white."""
     iterations: int
-    """Simulations with derivatives."""
+    """Number of simulations with derivatives."""
 
 
 @dataclass(frozen=True)
 class Near:
-    """A nearby minimum: the result of a similar model for the same periods."""
+    """A point close to a minimum: the result of a similar model for the same periods."""
 
     parameters: Mapping[str, float]
-    """By name [SI]; others start from their usual initial guess."""
+    """Parameters by name [SI]; others start from their usual initial guess."""
     state: Array
-    """Angles and velocities at the first sample of the first period (2, joints) [rad, rad/s]."""
+    """State at the first sample of the first period (2, joints) [rad, rad/s]."""
 
 
 def fit_runs(
@@ -69,22 +70,22 @@ def fit_runs(
     near: Near | None = None,
     options: LikelihoodOptions = DEFAULTS,
 ) -> Fit:
-    """The most likely parameters of `model`.
+    """Fit the parameters of `model` by maximum likelihood.
 
     Args:
         periods: settled periods of one arm.
-        model: what is fitted.
-        linear: stage 1's estimate of the same periods.
-        coarse: for trying a model: one whose residual is well above the noise is abandoned before full convergence.
-        starts: parameters by name [SI], further initial guesses, tried before all others.
-        near: the only initial guess, where a minimum is known to be close.
+        model: the model to fit.
+        linear: stage 1's estimate for the same periods.
+        coarse: for comparing models: stop early where the residual is well above the noise.
+        starts: parameters by name [SI], additional initial guesses that are tried before all others.
+        near: point known to be close to a minimum, used as the only initial guess.
         options: tolerances and limits.
 
     Returns:
-        Parameters with their covariance, first states and simulated motions.
+        Parameters with their covariance, initial states and simulated motions.
 
     Raises:
-        ConvergenceError: when no initial guess leads to a minimum.
+        ConvergenceError: if no initial guess leads to a minimum.
     """
     fine, states = _objective(periods, model, linear, options)
     rough = replace(
@@ -109,11 +110,19 @@ def _near_values(
 ) -> Array:
     narrow = _standstill_guesses(linear, options)[0]
     unnamed = dict(zip(model.names, _guess(model, linear, {}, narrow, options).tolist(), strict=True))
-    return np.array([{**unnamed, **parameters}[name] for name in model.names])
+    # What a plainer model does without begins as next to nothing, or its minimum is left at once.
+    hardly = {name: HARDLY * value for name, value in unnamed.items() if _is_nothing_when_small(name)}
+    return np.array([{**unnamed, **hardly, **parameters}[name] for name in model.names])
+
+
+def _is_nothing_when_small(name: str) -> bool:
+    """Whether a term vanishes with its value and has one to begin with."""
+    term = term_of(name)
+    return term.range == "positive" and term.part in FRICTIONS and not term.standstill and bool(term.initial)
 
 
 def _springs(linear: LinearEstimate, options: LikelihoodOptions) -> Array:
-    """Stiffness (joints,) [N m/rad] of springs that give each joint the tracking frequency."""
+    """Return the stiffness (joints,) [N m/rad] of springs that give each joint the tracking frequency."""
     inertia = [abs(linear.value[i]) for i, name in enumerate(linear.names) if name.startswith("inertia")]
     stiffness: Array = np.array(inertia) * (2.0 * np.pi * options.tracking_frequency) ** 2
     return stiffness
@@ -122,7 +131,7 @@ def _springs(linear: LinearEstimate, options: LikelihoodOptions) -> Array:
 def _objective(
     periods: Sequence[SettledPeriod], model: Model, linear: LinearEstimate, options: LikelihoodOptions
 ) -> tuple[Objective, Array]:
-    """What is minimised, samples weighted by the noise known beforehand, and guesses of the first states."""
+    """Return the objective, with samples weighted by the known noise, and initial guesses of the initial states."""
     velocity = float(np.sqrt(np.mean([np.mean(motion.velocity**2) for motion in linear.motions])))
     torque = float(np.sqrt(np.mean([np.mean(period.torque**2) for period in periods])))
     sizes = Sizes(torque, velocity, abs(float(linear.value[0])))
@@ -133,8 +142,11 @@ def _objective(
     runs = tuple(_simulated(period, options) for period in periods)
     coordinates = Coordinates(model.names, scales, options.coordinates)
     steps = options.minimiser, options.max_relative_decrease
-    prior = Prior.of(model.names, scales, sizes)
-    return Objective(runs, coordinates, state_scale, weights, prior, *steps), np.concatenate(states)
+    prior = CoordinatePrior.of(model.names, scales, sizes)
+    weight = dict(zip(linear.names, linear.value.tolist(), strict=True)).get("gravity_2", 0.0)
+    lever = Lever.of(model, weight, sizes)
+    objective = Objective(runs, coordinates, state_scale, weights, prior, *steps, lever=lever)
+    return objective, np.concatenate(states)
 
 
 def _simulated(period: SettledPeriod, options: LikelihoodOptions) -> Run:
@@ -151,7 +163,7 @@ def _initial_guesses(
     starts: Sequence[Mapping[str, float]],
     options: LikelihoodOptions,
 ) -> list[Array]:
-    """Coordinates of the parameters (parameters,): the caller's, then stage 1's with narrow and with wide friction."""
+    """Return initial guesses in coordinates: the caller's, then stage 1's with narrow and with wide friction."""
     ripple = find_ripple(periods, linear) if "ripple" in model.options else {}
     own = [_guess(model, linear, ripple, standstill, options) for standstill in _standstill_guesses(linear, options)]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
@@ -160,7 +172,7 @@ def _initial_guesses(
 
 
 def _standstill_guesses(linear: LinearEstimate, options: LikelihoodOptions) -> list[dict[str, float]]:
-    """Friction near standstill to start from, of every joint: narrow and wide."""
+    """Return initial guesses of friction near standstill, for every joint: narrow and wide."""
     viscous, coulomb = (
         float(np.mean([abs(linear.value[i]) for i, name in enumerate(linear.names) if name.startswith(kind)]))
         for kind in ("viscous", "coulomb")
@@ -178,7 +190,7 @@ def _guess(
     standstill: Mapping[str, float],
     options: LikelihoodOptions,
 ) -> Array:
-    """Initial guess [SI] (parameters,): stage 1's values, and defaults for parameters it does not estimate."""
+    """Return an initial guess (parameters,) [SI]: stage 1's values, and defaults for other parameters."""
     known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | dict(ripple)
     known |= {f"{name}_{joint + 1}": value for name, value in standstill.items() for joint in range(model.joints)}
     if model.drive == "delay":
@@ -203,10 +215,10 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
         float(np.sum(_model_error(each, weight, period)))
         for each, weight, period in zip(residuals, objective.weights, periods, strict=True)
     )
-    precision = np.zeros(x.size)
-    precision[:count] = objective.prior.precision
+    expected = np.zeros((x.size, x.size))
+    expected[:count, :count] = objective.expected_normal(x)
     scatter = objective.scatter(x, window)
-    covariance = robust_covariance(minimum.at, scatter, samples, count, structured, precision)
+    covariance = robust_covariance(minimum.at, scatter, samples, count, structured, expected)
     value = objective.coordinates.values(x[:count])
     return Fit(
         value,
@@ -220,9 +232,9 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
 
 
 def _model_error(residual: Array, weight: Array, period: SettledPeriod) -> Array:
-    """Part of each joint's weighted sum of squares that is neither white nor noise (joints,).
+    """Return the part of each joint's weighted sum of squares that is neither white nor noise (joints,).
 
-    Rounding of a slow joint is not white either: what is no more than the noise is not the model's error.
+    Rounding errors of a slow joint are not white either, so a residual no larger than the noise is not a model error.
     """
     squares = np.sum(residual**2, axis=1)
     noise = np.sum((weight * period.noise[:, None]) ** 2, axis=1)

@@ -1,4 +1,4 @@
-"""Which friction and which drive the likelihood fits, and the names of all its parameters."""
+"""Friction and drive model of a planar arm, and the names of all its parameters."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -16,37 +16,56 @@ from hil.estimator.models.terms import (
     units_of,
 )
 
+LEVER_STD = 0.05
+"""Relative standard deviation of a link's length by a ruler, over gravity by the tilt that somebody gave."""
+
 
 @dataclass(frozen=True)
 class Model:
-    """The arm's equations with these terms, which `hil.estimator.models.terms` declares.
+    """The arm's equations with the terms chosen here, which `hil.estimator.models.terms` declares.
 
     Friction: `coulomb` is viscous v + coulomb tanh(v / coulomb_width); `stribeck` multiplies coulomb by 1 +
-    stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level. Drive:
-    `delay` is a pure delay of the torque on top of what `SettledPeriod` knows, `lag` a first-order lag, `delay_lag`
-    both. Options: `presliding` puts bristles that bend before they slip (`hil.estimator.simulation.bristles`) instead
-    of any friction's coulomb_width. `asymmetry` adds viscous_asymmetry |v|: friction that differs with direction
-    (of the Coulomb level, that is the offset). `ripple` multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles
-    q) + ripple_cos cos(ripple_cycles q), ripple_cycles per turn of the joint. `zeros` adds the errors of the
-    encoders' zeros, true angle = measured angle + zero; the first joint's is observable only under gravity.
-    `torque_scale` multiplies the second joint's torque: true over assumed torque constant, relative to the first
-    joint's. One unknown torque constant scales all parameters; of two, the ratio is identifiable, since both joints
-    feel the same masses. `saturation` takes the share saturation torque^2 off the torque, `cable` adds cable_stiffness
-    q to what holds the joint (where it is slack is part of the offset), and `encoder` says that a joint at q is
-    measured to be at q + encoder_sin_once sin q + encoder_cos_once cos q + encoder_sin_twice sin 2q + encoder_cos_twice
-    cos 2q. `lags` lets the second joint's torque lag by lag + lag_difference.
+    stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level.
 
-    Raises ModelError for other names, for other than one or two joints, and for a torque_scale of one joint.
+    Drive: `delay` is a pure delay of the torque in addition to that in `SettledPeriod`, `lag` a first-order lag,
+    `delay_lag` both.
+
+    Options:
+        presliding: replaces coulomb_width by bristles that deflect before they slip
+            (`hil.estimator.simulation.bristles`).
+        asymmetry: adds viscous_asymmetry |v|, friction that depends on direction (for the Coulomb level, the offset
+            does this).
+        ripple: multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q),
+            with ripple_cycles per turn of the joint.
+        zeros: adds zero errors of the encoders, true angle = measured angle + zero; the first joint's is observable
+            only under gravity.
+        torque_scale: multiplies the second joint's torque by the ratio of true to assumed torque constant relative to
+            the first joint's. A single unknown torque constant scales all parameters; the ratio of two is identifiable,
+            since both joints move the same masses.
+        saturation: reduces the torque by the fraction saturation torque^2.
+        cable: adds cable_stiffness q to the load torque (the angle at which the cable is slack is part of the offset).
+        encoder: a joint at q is measured to be at q + encoder_sin_once sin q + encoder_cos_once cos q +
+            encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
+        lags: the second joint's torque has the lag lag + lag_difference.
+
+    Raises ModelError for other names, for other than one or two joints, and for torque_scale with one joint.
     """
 
     joints: int
     friction: Friction = "coulomb"
     drive: Drive = "delay"
     options: Collection[Option] = frozenset()
-    """A frozenset once the model exists."""
+    """Always a frozenset after construction."""
+    by_voltage: Collection[int] = frozenset()
+    """Joints, from 1, that are driven by voltage; a share back_emf of their viscous friction passes the drive's lag
+    (`hil.estimator.simulation.back_emf`). Always a frozenset after construction."""
+    lever: float | None = None
+    """Measured length of link 1 over gravity [s^2]: coupling is expected to be this times gravity_2, within
+    `LEVER_STD`. It decides only where the motion does not."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "options", frozenset(self.options))
+        object.__setattr__(self, "by_voltage", frozenset(self.by_voltage))
         base_names(self.joints)
         if self.friction not in FRICTIONS:
             raise ModelError(f"friction model {self.friction!r}: choose one of {', '.join(FRICTIONS)}")
@@ -59,27 +78,29 @@ class Model:
             raise ModelError("torque_scale compares two joints' torque constants: it needs two joints")
 
     def having(self, *options: Option) -> "Model":
-        """This model with these options besides its own."""
+        """Return this model with these options added."""
         return replace(self, options={*self.options, *options})
 
     def without(self, *options: Option) -> "Model":
-        """This model without these options."""
+        """Return this model without these options."""
         return replace(self, options=set(self.options) - set(options))
 
     @property
     def base_names(self) -> tuple[str, ...]:
-        """The base parameters."""
+        """Names of the base parameters."""
         return base_names(self.joints)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The base parameters, then the other terms joint by joint, in the order in which they are declared."""
+        """Names of the base parameters, then of the other terms joint by joint, in the order of their declaration."""
         laws = FRICTIONS[: FRICTIONS.index(self.friction) + 1]
-        return (*self.base_names, *extra_names(self.joints, frozenset((*laws, *self.options, *DRIVES[self.drive]))))
+        voltage = ("voltage",) if self.by_voltage else ()
+        parts = frozenset((*laws, *self.options, *DRIVES[self.drive], *voltage))
+        return (*self.base_names, *extra_names(self.joints, parts, frozenset(self.by_voltage)))
 
     @property
     def description(self) -> str:
-        """Human-readable description."""
+        """Text naming the friction, options and drive."""
         return " + ".join(
             (self.friction, *(each.replace("_", " ") for each in OPTIONS if each in self.options), self.drive)
         )

@@ -5,16 +5,18 @@ torques:
 
     torque = d/dt momentum(q, v) theta + rest(q, v) theta
 
-Passed through a first-order low-pass both sides become sums over the past (generalised momentum: A. De Luca and
-R. Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li,
-"On the adaptive control of robot manipulators", 1987). The parameters are known as a mean and a covariance, those of an
-ensemble of arms; they are updated from sample to sample (recursive least squares, that is, a Kalman filter on constants
-that drift slowly). The admissible motion is thus wide for a poorly known arm and narrows as it moves.
+After a first-order low-pass filter both sides become sums over the past (generalised momentum: A. De Luca and R.
+Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li, "On
+the adaptive control of robot manipulators", 1987). The parameters are given as a mean and a covariance, those of an
+ensemble of arms, and are updated with each sample (recursive least squares, that is, a Kalman filter on constants that
+drift slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
 
-Alarm: for `HOLD_S` (less where it is much) the torque lacking in a joint is more than `TIMES` standard deviations of
-what parameters and noise leave open, more than friction can hold while the joint stands, and more than a share of the
-largest planned torque. Noise is learnt too: what the model lacks (Stribeck friction, play, flexibility) widens what is
-allowed.
+An alarm is raised if the torque missing at a joint exceeds three thresholds for `HOLD_S` (a shorter time if it exceeds
+them by far): `TIMES` standard deviations of the uncertainty due to parameters and noise, what friction can hold while
+the joint stands still, and a fraction of the largest planned torque. The noise is estimated as well: effects that the
+model lacks (Stribeck friction, backlash, flexibility) widen the admissible range. A deviation that may become an alarm
+enters that estimate only once it has ended without one; otherwise a joint that is held for long would widen the range
+until nothing exceeds it. While a joint stands still its noise is lower, since most of it needs motion.
 """
 
 import math
@@ -30,39 +32,46 @@ NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
     *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2", "tilt_1", "tilt_2"),
 )
-"""Of the parameters; a tilt is gravity across the direction in which the angles' zero expects it."""
+"""Names of the parameters. Tilts are components of gravity perpendicular to the direction assumed for angle zero."""
 
 FILTER_S = 0.02
 HOLD_S = 0.02
 TIMES = 4.0
 FLOOR_SHARE = 0.25
-"""Of the largest planned torque: less is never an alarm."""
+"""Fraction of the largest planned torque below which a missing torque never raises an alarm."""
 
 _COUNT = len(NAMES)
-_STANDING = 0.05  # rad/s below which a joint may be held by its dry friction
-_STATIC = 1.5  # static friction over Coulomb's
-_VELOCITY_STD = 0.0135  # rad/s: a register's step, which is 0.024, and some noise
-_FIRST_NOISE_SHARE = 0.1  # of the largest planned torque
-_NOISE_S = 1.0  # in which the noise is learnt
-_CLIPPED = 9.0  # variances by which one sample may teach it
-_DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # of its value, of its first deviation: a parameter's drift in a second
-_MOST_WEIGHT = 4.0  # of a sample in which so many times as much lacks as may
+_STANDING = 0.05  # rad/s below which dry friction may hold a joint
+_STATIC = 1.5  # ratio of static to Coulomb friction
+_VELOCITY_STD = 0.0135  # rad/s: rounding of the register, with steps of 0.024, and some noise
+_FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
+_NOISE_S = 1.0  # time constant of the noise estimate
+_CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
+_STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
+_DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
+_MOST_WEIGHT = 4.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
+_OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at slow rates
 _WARM_S = 3 * FILTER_S
-_LONGEST_GAP = 3.0  # intervals between two samples behind which the past is forgotten
+_LONGEST_GAP = 3.0  # number of intervals between two samples after which the observer restarts
 
-# Rows of the observer's memory: momentum and rest through the filter, rest at the former sample (two joints each), the
-# parameters, one of single numbers, then their covariance.
+# Rows of the observer's memory: filtered momentum and rest, rest at the previous sample (two joints each), the
+# parameters, a row of scalars, and the parameters' covariance.
 _MOMENTUM, _REST, _FORMER, _THETA, _SINGLE, _COVARIANCE = 0, 2, 4, 6, 7, 8
-# Of the single numbers: per joint filtered torque, noise variance, standing, time of alarm, samples of it, lacking
-# torque; then the time since the last lesson and since the start.
+_PENDING = _COVARIANCE + _COUNT
+# Scalars: per joint filtered torque, noise variance, fraction of time at standstill, duration and sample count of a
+# possible alarm, missing torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
+# Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration.
+_TAUGHT, _TEACHES = 0, 2
 
 
 class MomentumObserver:
-    """For arms of one or two joints.
+    """Momentum observer for arms of one or two joints.
 
-    mean: parameters by their NAMES, 0 where left out. covariance: in the order of NAMES (14, 14). largest: planned
-    torque of each joint (joints,) [N m]. interval: from one sample to the next [s].
+    mean: parameters by name, 0 if left out.
+    covariance: their covariance in the order of NAMES (14, 14).
+    largest: largest planned torque of each joint (joints,) [N m].
+    interval: time between two samples [s].
     """
 
     def __init__(self, mean: Mapping[str, float], covariance: Array, largest: Array, interval: float) -> None:
@@ -70,19 +79,23 @@ class MomentumObserver:
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
             raise ValueError(f"{joints} joints and a covariance of {covariance.shape}: 1 or 2, and 14 x 14, are needed")
         self._joints = joints
-        self._memory = np.zeros((_COVARIANCE + _COUNT, _COUNT))
+        self._memory = np.zeros((_PENDING + 1, _COUNT))
         self._memory[_THETA] = [mean.get(name, 0.0) for name in NAMES]
-        self._memory[_COVARIANCE:] = covariance
+        self._memory[_COVARIANCE:_PENDING] = covariance
         self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * largest) ** 2
         floor = np.zeros(2)
         floor[:joints] = FLOOR_SHARE * largest
         drift = _LEAST_DRIFT**2 * np.diag(covariance)
         self._constants = np.concatenate(([joints, interval, *floor], drift, (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2))
-        self.observe((0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf)  # compiled, and begun anew
+        self.observe(
+            (0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf
+        )  # compiles the loop and initialises the memory
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
-        """One sample: angles [rad], velocities [rad/s], the torques commanded since the previous sample
-        [N m], and the time since then [s]. Returns the joint (from 0) whose motion no arm explains, -1 for none.
+        """Process one sample; return the joint (from 0) whose motion no arm explains, or -1.
+
+        position: angles [rad]. velocity: velocities [rad/s]. torque: torques commanded since the previous sample [N m].
+        seconds: time since the previous sample [s].
         """
         if self._joints == 1:
             return _observe(self._memory, self._constants, position[0], 0.0, velocity[0], 0.0, torque[0], 0.0, seconds)
@@ -90,17 +103,17 @@ class MomentumObserver:
 
     @property
     def lacking(self) -> list[float]:
-        """Latest torque per joint that is missing from the commanded one to explain the motion (joints,) [N m]."""
+        """Torque missing from the commanded one to explain the latest motion (joints,) [N m]."""
         return [float(value) for value in self._memory[_SINGLE, _LACKING : _LACKING + self._joints]]
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What has been learnt so far, by name."""
+        """Current parameter estimates by name."""
         return dict(zip(NAMES, self._memory[_THETA].tolist(), strict=True))
 
 
 def _regressors(momentum: Any, rest: Any, q1: float, q2: float, v1: float, v2: float) -> None:
-    """Rows of both joints, in the order of NAMES."""
+    """Compute the rows of both joints, in the order of NAMES."""
     cos_2, sin_2 = math.cos(q2), math.sin(q2)
     both = v1 + v2
     momentum[0, 0] = v1
@@ -132,11 +145,12 @@ def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
         single[_TORQUE + j] = t1 if j == 0 else t2
         single[_STANDS + j] = 1.0
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
+        m[_PENDING, _TAUGHT + j] = m[_PENDING, _TEACHES + j] = 0.0
     single[_LESSON] = single[_AGE] = 0.0
 
 
 def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: float, slope: float, row: Any) -> None:
-    """One joint's signals through the low-pass; the filtered equation's regressors into `row`."""
+    """Low-pass filter one joint's signals; compute the regressors of the filtered equation into `row`."""
     single = m[_SINGLE]
     for i in range(_COUNT):
         m[_MOMENTUM + j, i] += fallen * (momentum[j, i] - m[_MOMENTUM + j, i])
@@ -148,7 +162,7 @@ def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: flo
 
 
 def _lacks(m: Any, j: int, row: Any, gain: Any) -> tuple[float, float]:
-    """Torque that the commanded one lacks, and the variance of it that the parameters leave open; `gain` times it."""
+    """Return the missing torque, and its variance due to the parameters; set `gain` to covariance times `row`."""
     lacking = m[_SINGLE, _TORQUE + j]
     left_open = 0.0
     for i in range(_COUNT):
@@ -168,26 +182,44 @@ def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
 
 
 def _held_by_friction(m: Any, j: int) -> float:
-    """Torque that dry friction may hold for as much of the past as the joint stood [N m]."""
+    """Return the torque that dry friction may hold, given the fraction of the past at standstill [N m]."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
     return float(_STATIC * max(dry, 0.0) * min(max(m[_SINGLE, _STANDS + j], 0.0), 1.0))
 
 
 def _of_rounding(m: Any, j: int, slope: float) -> float:
-    """Variance of the lacking torque from velocities in whole ticks."""
+    """Return the variance of the missing torque due to the rounding of velocities to ticks."""
     inertia = m[_THETA, 0] + m[_THETA, 2] + 2.0 * abs(m[_THETA, 1]) if j == 0 else m[_THETA, 2] + m[_THETA, 3]
     rounding = slope * _VELOCITY_STD * max(inertia, 0.0)
     return float(rounding * rounding)
 
 
 def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
-    """Whether what lacks, as a share of what may, is more and lasts long enough: the shorter the more it is."""
+    """Return whether the missing torque exceeds its threshold long enough; a larger excess needs less time.
+
+    share: missing torque relative to the threshold. dt: time since the previous sample [s].
+    """
     if share <= 1.0:
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
         return False
     single[_HELD + j] += dt * min(share, _MOST_WEIGHT)
     single[_SAMPLES + j] += 1.0
-    return bool(single[_HELD + j] >= HOLD_S and single[_SAMPLES + j] >= 2.0)
+    # Where samples are far apart, a sudden fault may show in a single one.
+    enough = single[_SAMPLES + j] >= 2.0 or (dt >= HOLD_S and share >= _OBVIOUS)
+    return bool(single[_HELD + j] >= HOLD_S and enough)
+
+
+def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> None:
+    """Update the noise variance; the contribution of a possible alarm waits until the alarm has ended."""
+    for_later = m[_PENDING]
+    if pending:
+        for_later[_TAUGHT + j] += taught * dt
+        for_later[_TEACHES + j] += dt
+        return
+    seconds = dt + for_later[_TEACHES + j]
+    mean = (taught * dt + for_later[_TAUGHT + j]) / seconds
+    m[_SINGLE, _NOISE + j] += min(seconds / _NOISE_S, 1.0) * (mean - m[_SINGLE, _NOISE + j])
+    for_later[_TAUGHT + j] = for_later[_TEACHES + j] = 0.0
 
 
 def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float) -> int:
@@ -198,11 +230,11 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
         return -1
     single = m[_SINGLE]
     fallen = 1.0 - math.exp(-dt / FILTER_S)
-    slope = fallen / ((1.0 - fallen) * dt)  # of what is left of a value behind the filter: its filtered derivative
+    slope = fallen / ((1.0 - fallen) * dt)  # from a value minus its filtered value to its filtered derivative
     single[_LESSON] += dt
     single[_AGE] += dt
     is_warm = single[_AGE] > _WARM_S
-    # What is filtered repeats itself: only after the filter's time there is something new to learn.
+    # Filtered signals are correlated: new information is only available after the filter's time constant.
     lesson = is_warm and single[_LESSON] >= FILTER_S
     if lesson:
         for i in range(_COUNT):
@@ -217,20 +249,21 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
         lacking, left_open = _lacks(m, j, row, gain)
         single[_LACKING + j] = lacking
         holds, rounding = _held_by_friction(m, j), _of_rounding(m, j, slope)
-        spread = left_open + rounding + single[_NOISE + j]
+        quiet = 1.0 - (1.0 - _STANDING_NOISE) * min(max(single[_STANDS + j], 0.0), 1.0)
+        spread = left_open + rounding + quiet * quiet * single[_NOISE + j]
         beyond = max(abs(lacking) - holds, 0.0)
         is_beyond = beyond > TIMES * math.sqrt(spread)
-        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), k[2 + j]), dt):
+        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), quiet * k[2 + j]), dt):
             alarm = j
-        taught = min(beyond * beyond, _CLIPPED * spread) - left_open - rounding
-        single[_NOISE + j] += min(dt / _NOISE_S, 1.0) * (max(taught, k[4 + _COUNT + j]) - single[_NOISE + j])
+        taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
+        _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt, single[_SAMPLES + j] > 0.0)
         if lesson and not is_beyond:
             _learn(m, gain, lacking, spread + holds * holds)
     return alarm
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
-_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms = map(
-    _inner, (_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms)
+_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms, _teach_noise = map(
+    _inner, (_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms, _teach_noise)
 )
 _observe: Callable[..., int] = numba.njit(cache=True, nogil=True, error_model="numpy")(_observe_loop)

@@ -1,4 +1,4 @@
-"""The full set of physical constants one simulation needs, whatever the model leaves out."""
+"""The full set of physical constants that one simulation needs, including those that the model leaves out."""
 
 import math
 from collections.abc import Mapping
@@ -10,40 +10,54 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.terms import TERMS, constants, term_of
 
 CONSTANTS = constants()
-"""The order in which the compiled simulation takes them."""
+"""Names of the constants, in the order in which the compiled simulation takes them."""
 ABSENT = {name: term_of(name).absent for name in CONSTANTS}
-"""What stands for a term that the model lacks; a pendulum's second joint is a wheel that nothing turns."""
+"""Values that disable a term that the model lacks; a one-joint arm gets a second joint that moves freely.
+"""
 ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
-"""Terms of what an encoder gets wrong at every turn."""
+"""Terms of the encoder errors that are periodic over a turn."""
 LEAST_LAG = 1e-6  # s
-SLIDING = 0.05  # rad/s: faster than this a joint slides, and its friction's bristles are bent that way
+SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles deflected in that direction
+
+
+LEAST_INERTIA = 0.2
+"""Of a joint's own: what back-EMF that comes late may leave of it. Less is no arm."""
 
 
 def place_of(term: str) -> int:
-    """Where a term's constant stands in `Physics.vector`, joint 1's if each joint has one; joint 2's comes next."""
+    """Return the index of a term's constant in `Physics.vector`.
+
+    For a term of each joint it is the index for joint 1, which is followed by joint 2.
+    """
     return CONSTANTS.index(term if TERMS[term].scope == "arm" else f"{term}_1")
+
+
+VISCOUS, GENERATED = place_of("viscous"), place_of("back_emf")
+OWN_INERTIA = CONSTANTS.index("inertia_1"), CONSTANTS.index("armature_2")
+"""Where the inertia stands that only the joint itself feels, the rotor's among it."""
 
 
 @dataclass(frozen=True)
 class Physics:
-    """Constants of one simulation."""
+    """Physical constants of one simulation."""
 
     vector: Array
-    """In the order of CONSTANTS (constants,) [SI]."""
+    """Constants in the order of CONSTANTS (constants,) [SI]; back_emf is not the share but the back-EMF itself
+    [N m s/rad]."""
     delay: float
     """Pure delay of the torque [s]."""
     lag: float
     """Time constant of the torque's first-order lag [s]; 0 for none."""
     encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
-    """Errors of the encoders by joint, in the order of ENCODER (2, terms) [rad]."""
+    """Encoder errors by joint, in the order of ENCODER (2, terms) [rad]."""
     lag_difference: float = 0.0
-    """Lag of the second joint's torque beyond the first's [s]."""
+    """Lag of the second joint's torque minus that of the first's [s]."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":
-        """From parameters by name; what is not named is absent from the model.
+        """Return the constants for parameters given by name; terms that are not named are disabled.
 
-        Friction with presliding has no step over the velocity: what asks for its width gets SLIDING.
+        Friction with presliding has no velocity step; code that needs a width uses SLIDING.
         """
         parameters = dict(parameters)
         parameters |= {
@@ -52,16 +66,28 @@ class Physics:
         vector = np.array([parameters.get(name, ABSENT[name]) for name in CONSTANTS])
         encoder = np.array([[parameters.get(f"{name}_{joint}", 0.0) for name in ENCODER] for joint in (1, 2)])
         beyond = parameters.get("lag_difference_2", 0.0)
-        return cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0), encoder, beyond)
+        physics = cls(vector, parameters.get("delay", 0.0), parameters.get("lag", 0.0), encoder, beyond)
+        # Back-EMF is given as a share of viscous friction; see `hil.estimator.simulation.back_emf`.
+        vector[GENERATED : GENERATED + 2] *= vector[VISCOUS : VISCOUS + 2]
+        for joint in np.flatnonzero(vector[GENERATED : GENERATED + 2]):
+            place, lacking = OWN_INERTIA[joint], vector[GENERATED + joint] * physics.late[joint]
+            vector[place] = max(vector[place] - lacking, LEAST_INERTIA * vector[place])
+        return physics
 
     @property
     def lags(self) -> Array:
-        """Time constants of the joints' lags (2,) [s]; the second's stays above 0 where there is one at all."""
+        """Time constants of the joints' lags (2,) [s]; the second joint's stays above 0 if there is any lag."""
         other = max(self.lag + self.lag_difference, LEAST_LAG if self.lag_difference else 0.0)
         return np.array([self.lag, other])
 
+    @property
+    def late(self) -> Array:
+        """By how much the joints' torques come late in all, delay and lag together (2,) [s]."""
+        late: Array = self.lags + max(self.delay, 0.0)
+        return late
+
     def crossing_time(self) -> float:
-        """The shortest time in which friction turned round moves a joint, over its step or on its bristles [s]."""
+        """Return the shortest time in which reversed friction crosses a joint's step or bristle deflection [s]."""
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
         shared = constant["inertia_2"] ** 2 / (constant["inertia_2"] + constant["armature_2"])
         inertia = (
@@ -72,7 +98,7 @@ class Physics:
         for joint in (1, 2):
             stiffness = constant[f"presliding_stiffness_{joint}"]
             if stiffness > 0.0:
-                # Bristles turned round swing like a spring; an eighth of a radian of that is followed well.
+                # Bristles reacting to a reversal oscillate like a spring; an eighth of a radian is resolved well.
                 times.append(0.125 * math.sqrt(inertia[joint - 1] / stiffness))
             else:
                 turned = 2.0 * constant[f"coulomb_{joint}"] * (1.0 + constant[f"stribeck_rise_{joint}"])

@@ -1,8 +1,8 @@
-"""From base parameters to masses, centres and inertias, given what else is known of the arm.
+"""Masses, centres of mass and inertias from base parameters, given other knowledge of the arm.
 
-Torque and position show six combinations of ten quantities (two for a pendulum's four). Each known length, mass or
-rotor inertia takes one unknown away. What is then left open is the null space of the equations: a quantity with no
-part in it is determined, the others come in groups within which nothing can be told apart.
+Torque and position determine six combinations of ten quantities (for one joint, two combinations of four). Each known
+length, mass or rotor inertia reduces the unknowns by one. What remains undetermined is the null space of the equations:
+a quantity without a component in it is determined; the others form groups within which they cannot be separated.
 """
 
 from collections.abc import Mapping
@@ -23,40 +23,44 @@ QUANTITIES = {
         *("mass_elbow", "mass_2", "centre_2", "link_inertia_2", "armature_2"),
     ),
 }
-"""Link i: mass, centre of mass from joint i, inertia about it; length_1 from joint 1 to joint 2; mass_elbow, the
-second servo's; armature_i, rotor inertia times gear ratio squared."""
-OPEN = 1e-6  # part of a quantity in the null space from which on it is not determined
+"""Names of the physical quantities, by number of joints.
+
+Link i has a mass, a centre of mass (distance from joint i) and an inertia about the centre of mass; length_1 is the
+distance from joint 1 to joint 2; mass_elbow is the second servo's mass; armature_i is rotor inertia times gear ratio
+squared.
+"""
+OPEN = 1e-6  # component of a quantity in the null space above which it is not determined
 SINGULAR = 1e-9
 CONTRADICTION = 5.0  # standard errors
 
 
 @dataclass(frozen=True)
 class Known:
-    """A quantity that was measured with a ruler, scales, or found in a data sheet."""
+    """A quantity measured with a ruler or scales, or taken from a data sheet."""
 
     value: float
     std: float = 0.0
-    """Standard error; 0 is taken as exact."""
+    """Standard error; 0 means exact."""
 
 
 @dataclass(frozen=True)
 class Quantities:
-    """What base parameters and known quantities say together."""
+    """Physical quantities determined by base parameters and known quantities together."""
 
     value: dict[str, float]
-    """Determined quantities by name [SI], the known ones among them."""
+    """Determined quantities by name [SI], including the known ones."""
     std: dict[str, float]
-    """Their standard errors."""
+    """Standard errors of `value` by name [SI]."""
     groups: tuple[tuple[str, ...], ...]
-    """Quantities that cannot be told apart; one more of each group must be known, at least."""
+    """Quantities that cannot be separated; at least one more of each group must be known."""
     doubts: tuple[str, ...]
-    """In words: known quantities that contradict the data, quantities that no arm has."""
+    """Warnings as text: known quantities that contradict the data, and physically impossible quantities."""
 
 
 def base_of(quantities: Mapping[str, float], gravity: float, joints: int) -> Array:
-    """Rigid-body base parameters [SI] of these quantities, in the order of `arm_model.RIGID_BODY`.
+    """Return the rigid-body base parameters [SI] of these quantities, in the order of `terms.RIGID_BODY`.
 
-    `gravity` [m/s^2]; the table at the head of docs/model.md.
+    gravity: acceleration of gravity [m/s^2]. See the table at the top of docs/model.md.
     """
     q = quantities
     inertia = q["link_inertia_1"] + q["mass_1"] * q["centre_1"] ** 2 + q["armature_1"]
@@ -80,11 +84,17 @@ def base_of(quantities: Mapping[str, float], gravity: float, joints: int) -> Arr
 def physical_quantities(
     base: Mapping[str, float], covariance: Array, known: Mapping[str, Known], gravity: float, joints: int
 ) -> Quantities:
-    """Masses, centres and inertias with standard errors, or what cannot be told apart.
+    """Return masses, centres of mass and inertias with standard errors, and groups that cannot be separated.
 
-    `base`: the rigid-body base parameters by name [SI], `covariance` theirs in the order of
-    `arm_model.RIGID_BODY[joints]`. Raises ModelError for a known quantity that this arm does not have, that is not
-    positive or whose std is negative.
+    Args:
+        base: rigid-body base parameters by name [SI].
+        covariance: their covariance in the order of `terms.RIGID_BODY[joints]`.
+        known: known quantities by name.
+        gravity: acceleration of gravity [m/s^2].
+        joints: number of joints.
+
+    Raises:
+        ModelError: for a known quantity that this arm does not have, that is not positive or whose std is negative.
     """
     _check(known, joints)
     names = RIGID_BODY[joints]
@@ -130,11 +140,11 @@ def _check(known: Mapping[str, Known], joints: int) -> None:
             raise ModelError(f"known.{name}: an arm of {joints} joints has {', '.join(QUANTITIES[joints])}")
         positive = name.startswith(("length", "mass_1", "mass_2"))
         if not np.isfinite(item.value) or item.std < 0.0 or (positive and item.value <= 0.0):
-            raise ModelError(f"known.{name} = {item.value:g}, std {item.std:g}: must be a positive number of SI units")
+            raise ModelError(f"known.{name} = {item.value:g}, std {item.std:g}: must be a positive number in SI units")
 
 
 def _guess(name: str, base: Mapping[str, float], known: Mapping[str, Known], gravity: float) -> float:
-    """A start of the right size; what is determined does not depend on it."""
+    """Return an initial guess of the right magnitude; the determined quantities do not depend on it."""
     if name in known:
         return known[name].value
     length = 0.2
@@ -150,7 +160,7 @@ def _guess(name: str, base: Mapping[str, float], known: Mapping[str, Known], gra
 
 
 def _slope(function: object, x: Array, size: Array) -> Array:
-    """Derivatives by x / size, central differences."""
+    """Return derivatives by x / size, by central differences."""
     assert callable(function)
     columns = []
     for i in range(x.size):
@@ -161,7 +171,7 @@ def _slope(function: object, x: Array, size: Array) -> Array:
 
 
 def _null_space(slope: Array) -> Array:
-    """Directions in which nothing changes (unknowns, directions)."""
+    """Return the directions in which nothing changes (unknowns, directions)."""
     _, size, Vt = np.linalg.svd(slope)
     rank = int(np.sum(size > SINGULAR * size[0]))
     null: Array = Vt[rank:].T
@@ -177,7 +187,7 @@ def _spread(slope: Array) -> Array:
 
 
 def _groups(names: list[str], null: Array) -> tuple[tuple[str, ...], ...]:
-    """Names that share a direction of the null space, directly or through others."""
+    """Return groups of names that share a direction of the null space, directly or through others."""
     tied = np.abs(null @ null.T) > OPEN
     groups: list[tuple[str, ...]] = []
     left = set(range(len(names)))
@@ -197,8 +207,8 @@ def _doubts(
     value: Mapping[str, float], std: Mapping[str, float], known: Mapping[str, Known], misfit: float
 ) -> tuple[str, ...]:
     doubts = [
-        f"{name} comes out as {number:.4g}, {abs(number) / max(std[name], 1e-300):.1f} standard errors below zero: a "
-        "known quantity or a torque constant is wrong"
+        f"{name} is estimated as {number:.4g}, {abs(number) / max(std[name], 1e-300):.1f} standard errors below "
+        "zero: a known quantity or a torque constant is wrong"
         for name, number in value.items()
         if number < 0.0 and not name.startswith("centre") and -number > 2.0 * std[name]
     ]

@@ -1,7 +1,7 @@
 """The arm as a regressor: torque is linear in the base parameters, tau = Y(q, q', q'') theta.
 
-Two revolute joints in one plane, joint 1 from the horizontal, joint 2 from link 1, with s the sign of
-velocity:
+The arm has two revolute joints in one plane; joint 1 is measured from the horizontal, joint 2 from link 1. With s the
+sign of velocity:
 
     tau1 = (inertia_1 + inertia_2 + 2 coupling cos q2) q1'' + (inertia_2 + coupling cos q2) q2''
            - coupling sin q2 (2 q1' q2' + q2'^2) + gravity_1 cos q1 + gravity_2 cos(q1 + q2)
@@ -9,7 +9,7 @@ velocity:
     tau2 = (inertia_2 + coupling cos q2) q1'' + (inertia_2 + armature_2) q2''
            + coupling sin q2 q1'^2 + gravity_2 cos(q1 + q2) + viscous_2 q2' + coulomb_2 s2 + offset_2
 
-One joint is the same without all that belongs to the second: inertia_1, gravity_1 and friction.
+An arm with one joint only has the terms inertia_1, gravity_1 and friction of joint 1.
 """
 
 import numpy as np
@@ -20,11 +20,18 @@ from hil.estimator.models.terms import base_names
 
 
 def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0) -> Array:
-    """Y of the base parameters (joints, samples, parameters).
+    """Return the regressor Y of the base parameters (joints, samples, parameters).
 
-    `position` [rad], `velocity` [rad/s], `acceleration` [rad/s^2]: (joints, samples). The sign of velocity is
-    tanh(velocity / coulomb_width) for a width [rad/s], one for all or one per joint, and sharp for 0.
-    Raises ShapeError when the three differ in shape, ModelError for an arm of other than one or two joints.
+    Args:
+        position: angles (joints, samples) [rad].
+        velocity: velocities (joints, samples) [rad/s].
+        acceleration: accelerations (joints, samples) [rad/s^2].
+        coulomb_width: width of the smoothed sign of velocity, tanh(velocity / coulomb_width) [rad/s], one value or one
+            per joint; 0 for the sharp sign.
+
+    Raises:
+        ShapeError: if the three arrays differ in shape.
+        ModelError: for an arm with other than one or two joints.
     """
     if not position.shape == velocity.shape == acceleration.shape:
         raise ShapeError(
@@ -47,10 +54,10 @@ def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_wid
 def inverse_dynamics(
     theta: Array, position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0
 ) -> Array:
-    """Joint torques [N m] (joints, samples) of this motion, from the equations at the head of this module.
+    """Return the joint torques (joints, samples) [N m] of a motion, from the equations in this module's docstring.
 
-    `theta`: base parameters in the order of `hil.estimator.models.terms.base_names`; the rest, and what is raised, as
-    in `regressor`.
+    `theta`: base parameters in the order of `hil.estimator.models.terms.base_names`; other arguments and errors as in
+    `regressor`.
     """
     torque: Array = regressor(position, velocity, acceleration, coulomb_width) @ theta
     return torque

@@ -1,8 +1,9 @@
-"""Every parameter that a model may hold, declared once: adding a term is one entry here and its equations.
+"""Declaration of every parameter that a model may have: adding a term takes one entry here and its equations.
 
-Fits, results, reports, exports and the configuration take names, units, words, ranges, initial guesses and scales from
-here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, joints from 1,
-and terms of the whole arm plainly `term`. Standard library only: what reads a result imports nothing heavy.
+Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
+scales from here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, with
+joints counted from 1, and terms of the whole arm just `term`. This module only imports the standard library, so that
+reading a result loads nothing heavy.
 """
 
 import re
@@ -27,12 +28,12 @@ Option = Literal[
 ]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
-Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation"]
+Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation", "cable"]
 
 FRICTIONS: tuple[Friction, ...] = get_args(Friction)
-"""Laws of dry friction; each holds the terms of those before it."""
+"""Laws of dry friction; each includes the terms of the previous ones."""
 DRIVES: dict[Drive, tuple[str, ...]] = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
-"""The drive's terms."""
+"""Terms of each drive model."""
 OPTIONS: dict[Option, str] = {
     "presliding": "presliding friction: elastic displacement before sliding",
     "asymmetry": "direction-dependent viscous friction",
@@ -44,7 +45,7 @@ OPTIONS: dict[Option, str] = {
     "encoder": "encoder errors that repeat once and twice per turn",
     "lags": "different lags of the two joints' current loops",
 }
-"""What a model may have besides its laws of friction and drive, each in words: keys of `[model]` too."""
+"""Optional parts of a model and their descriptions; also keys of `[model]`."""
 
 
 @dataclass(frozen=True)
@@ -52,47 +53,51 @@ class Term:
     """One kind of parameter."""
 
     name: str
-    """Without the joint's number."""
+    """Name without the joint's number."""
     unit: str
-    """SI; "1" for a ratio."""
+    """SI unit; "1" for a ratio."""
     meaning: str
-    """Human-readable description."""
+    """Description for users."""
     _: KW_ONLY
     part: str
-    """What of a model brings it: "base" (the linear regression's, always there), a law of FRICTIONS, one of OPTIONS or
-    a drive's term."""
+    """The part of a model that includes this term.
+
+    "base" (part of the linear regression, always present), a law of FRICTIONS, one of OPTIONS, a drive's term, or
+    "voltage" (joints driven by voltage).
+    """
     scope: Scope = "joint"
     first_joint: int = 1
-    """The first joint that has one: 2 for what is relative to joint 1 or contained in its other terms."""
+    """First joint that has this term: 2 for terms relative to joint 1 or included in its other terms."""
     range: Range = "positive"
-    """"any" sign; "positive"; above the fit's "floor" (a width); or a "share" of the geometric mean of `share_of`,
-    with either sign."""
+    """Range of values.
+
+    "any" for either sign; "positive"; "floor": above the fit's lower bound for widths; "share": a fraction, of either
+    sign, of the geometric mean of the two terms in `share_of`.
+    """
     share_of: tuple[str, str] | None = None
-    """Names of the two; for a term of each joint, terms of the same joint."""
+    """Names of these two; for a term of each joint, terms of the same joint."""
     scale: Scale | float = 1.0
-    """Size of a typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
+    """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
     initial: float = 0.0
-    """Initial guess where neither the regression nor the caller gives one [unit]."""
+    """Initial guess if neither the regression nor the caller provides one [unit]."""
     absent: float = 0.0
-    """What the simulation takes for it in a model without it [unit]: 1 for factors and divisors."""
+    """Value that disables the term in the simulation [unit]: 1 for factors and divisors."""
     max_step: float | None = None
-    """The most that its coordinate, a logarithm if it is positive, changes in one iteration; None: the fit's own."""
+    """Maximum change of its coordinate (for positive terms, of the logarithm) per iteration; None: the fit's limit."""
     standstill: bool = False
-    """Whether it shapes friction near standstill, whose fit has local minima and is started from several guesses."""
+    """Whether it shapes friction near standstill, which has local minima and is fitted from several initial guesses."""
     replaced_by: str | None = None
-    """The option in whose presence the model does without it."""
+    """The option that replaces this term."""
     simulated: bool = True
-    """Whether it is one of the constants of the equations of motion, and not of the torque before them or of the
-    encoders behind them."""
+    """Whether it is a constant of the equations of motion, rather than of the drive or of the encoders."""
     spread: Scale | float | None = None
-    """How far from its `absent` value it lies on a usual arm (standard deviation), as a scale or a number [unit]; None
-    where nothing is expected of it."""
+    """Standard deviation from its `absent` value among typical arms, as a scale or a number [unit]; None if unknown."""
     log_spread: float | None = None
-    """The same of a positive term's logarithm, about that of `initial`."""
+    """Standard deviation of a positive term's logarithm from that of `initial`; None if unknown."""
 
     @property
     def of_torque(self) -> bool:
-        """Whether it doubles when all torques are twice as large as assumed."""
+        """Whether the parameter doubles if all torques are twice as large as assumed."""
         return self.unit.startswith(("N m", "kg m^2"))
 
 
@@ -209,7 +214,7 @@ _DECLARED = (
         part="cable",
         range="any",
         scale="torque",
-        spread="torque",
+        spread="cable",
     ),
     *(
         Term(
@@ -237,6 +242,14 @@ _DECLARED = (
         spread=1.5e-3,
     ),
     Term(
+        "back_emf",
+        "1",
+        "share of viscous friction that the motor generates: it passes the drive's lag as the voltage does",
+        part="voltage",
+        initial=0.92,
+        log_spread=0.08,
+    ),
+    Term(
         "delay",
         "s",
         "torque delay",
@@ -258,24 +271,24 @@ _DECLARED = (
     ),
 )
 TERMS: dict[str, Term] = {term.name: term for term in _DECLARED}
-"""The terms by name, in the order of every vector of parameters."""
+"""All terms by name, in the order of every parameter vector."""
 
 RIGID_BODY: dict[int, tuple[str, ...]] = {
     1: ("inertia_1", "gravity_1"),
     2: ("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
 }
-"""The base parameters of the links, by the number of joints."""
+"""Base parameters of the links, by number of joints."""
 BASE_FRICTION = ("viscous", "coulomb", "offset")
-"""The other base terms, one of each joint."""
+"""The other base terms, one per joint."""
 
 
 def kind_of(name: str) -> str:
-    """The term of a parameter: its name without the joint's number."""
+    """Return the term of a parameter: its name without the joint's number."""
     return _split(name)[0]
 
 
 def term_of(name: str) -> Term:
-    """What is declared of a parameter. Raises ModelError for a name that no model has."""
+    """Return the declaration of a parameter's term; raises ModelError for an unknown name."""
     try:
         return TERMS[kind_of(name)]
     except KeyError:
@@ -283,30 +296,36 @@ def term_of(name: str) -> Term:
 
 
 def joint_of(name: str) -> int | None:
-    """The joint, from 1, of a parameter; None for one of the whole arm."""
+    """Return the joint of a parameter, counted from 1; None for a parameter of the whole arm."""
     return _split(name)[1]
 
 
 def base_names(joints: int) -> tuple[str, ...]:
-    """Names of the base parameters, in the order of every vector of them. Raises ModelError."""
+    """Return the names of the base parameters, in the order of every vector of them; raises ModelError."""
     if joints not in RIGID_BODY:
         raise ModelError(f"an arm of {joints} joints: the arm model has one or two joints")
     friction = (f"{term}_{joint + 1}" for term in BASE_FRICTION for joint in range(joints))
     return (*RIGID_BODY[joints], *friction)
 
 
-def extra_names(joints: int, parts: frozenset[str] | None = None) -> tuple[str, ...]:
-    """Names of what a model of these `parts` has beside the base parameters; by default of all that there is."""
+def extra_names(
+    joints: int, parts: frozenset[str] | None = None, by_voltage: frozenset[int] | None = None
+) -> tuple[str, ...]:
+    """Return the names of the other parameters of a model with these `parts`; by default of all parts.
+
+    by_voltage: joints, from 1, that are driven by voltage; by default all.
+    """
     return tuple(
         name
         for term in _DECLARED
         if term.part != "base" and (parts is None or (term.part in parts and term.replaced_by not in parts))
         for name in _names_of(term, joints)
+        if term.part != "voltage" or by_voltage is None or joint_of(name) in by_voltage
     )
 
 
 def constants() -> tuple[str, ...]:
-    """Names of the constants of the equations of motion of two joints, each term for joint 1 and then for joint 2."""
+    """Return the names of the constants in the equations of motion of two joints, term by term for joints 1 and 2."""
     joints = (1, 2)
     simulated = [term for term in _DECLARED if term.simulated and term.part != "base"]
     per_joint = [*BASE_FRICTION, *(term.name for term in simulated if term.scope == "joint")]
@@ -318,7 +337,7 @@ def constants() -> tuple[str, ...]:
 
 
 def units_of(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Units of parameters."""
+    """Return the units of parameters."""
     return tuple(term_of(name).unit for name in names)
 
 

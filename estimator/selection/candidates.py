@@ -1,11 +1,11 @@
-"""Missing model terms, judged without fitting them: the score test, and the effect of omission on standard errors.
+"""Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
 
-About an estimate the motion is linear in small changes of any parameter, those of terms that the model lacks too. One
-simulation with the derivatives by all of them gives the decrease of the sum of squares if a term were added
-(C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50), and how far the fitted parameters would move. Terms
-that cannot be ruled out, such as an encoder's zero or torque saturation, thus widen the standard errors even where the
-motion does not show them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with what is
-usual of them as the prior and what the motion says of them on top.
+Near an estimate the motion is linear in small changes of any parameter, including those of terms that the model lacks.
+One simulation with the derivatives by all of them yields the decrease of the sum of squares if a term were added (C. R.
+Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted parameters. Terms
+that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard errors even if
+the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with
+their typical size as the prior and the information from the motion in addition.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.fit.objective import Run
-from hil.estimator.fit.reparametrisation import Sizes
+from hil.estimator.fit.reparametrisation import Lever, Sizes
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.identify import Estimate
@@ -27,7 +27,7 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import FRICTIONS, OPTIONS, term_of
 from hil.estimator.options import IntegrationOptions
 
-MAX_LAG_SHARE = 0.05  # of the samples, over which a residual's correlation is summed
+MAX_LAG_SHARE = 0.05  # fraction of the samples over which a residual's autocorrelation is summed
 INTEGRATION = IntegrationOptions()
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 
@@ -38,52 +38,71 @@ class Candidate:
 
     model: Model
     part: str
-    """The option or friction law that it adds."""
+    """The option or friction law that is added."""
     names: tuple[str, ...]
-    """The parameters that it adds."""
+    """Names of the parameters that are added."""
     evidence: float
     """Decrease of the sum of squares relative to that expected by chance: above 1 it is significant."""
     explained: float
-    """Share of the sum of squares that it explains."""
+    """Fraction of the sum of squares that it explains."""
     values: Mapping[str, float]
-    """First guesses of the added parameters."""
+    """Initial guesses of the added parameters."""
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """The weighted sum of squares about an estimate, by changes of parameters, then of the first state."""
+    """Quadratic approximation of the weighted sum of squares near an estimate.
+
+    The causes are the parameters, followed by the initial state.
+    """
 
     names: tuple[str, ...]
-    """Of the parameters: those of the estimate and those of candidates."""
+    """Names of the parameters: those of the estimate and those of candidates."""
     value: Array
     """Point of expansion (parameters,) [SI]."""
     normal: Array
     """J'WJ (causes, causes)."""
     gradient: Array
-    """J'Wr, r simulated minus measured (causes,)."""
+    """J'Wr with r simulated minus measured (causes,)."""
     samples: int
-    """Of all joints: the sum of squares, weighted by the residual as it is."""
+    """Number of valid samples over all joints; it equals the sum of squares, which is weighted by the residual."""
     colour: float
-    """By how much the residual's correlation makes chance larger: 1 is white."""
+    """Factor by which the residual's correlation raises the decrease expected by chance; 1 for white residuals."""
     precision: Array
-    """Inverse variances expected of the parameters (parameters,), 0 where nothing is."""
+    """Inverse prior variances of the parameters (parameters,), 0 without a prior."""
+    lever: Lever | None = None
+    """Prior on coupling and gravity_2 together."""
+
+    @cached_property
+    def expected(self) -> Array:
+        """Normal equations of the priors of all causes (causes, causes)."""
+        expected = np.zeros_like(self.normal)
+        count = len(self.names)
+        expected[:count, :count] = np.diag(self.precision)
+        if self.lever is not None:
+            _, slope = self.lever.residual(self.value)
+            expected[:count, :count] += np.outer(slope, slope)
+        return expected
 
     @cached_property
     def states(self) -> list[int]:
-        """Places of the first state's causes."""
+        """Indices of the initial state among the causes."""
         return list(range(len(self.names), len(self.normal)))
 
     def places(self, names: Sequence[str]) -> list[int]:
-        """Places of parameters."""
+        """Return the indices of parameters among the causes."""
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
-        """Decrease of the sum of squares when these parameters and the first state are freed, and their changes."""
+        """Return the decrease of the sum of squares if these parameters are freed, and their changes.
+
+        The initial state is freed as well.
+        """
         at = [*self.places(names), *self.states]
         normal, gradient = self.normal[np.ix_(at, at)], self.gradient[at]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        prior = np.concatenate((self.precision[at[: len(names)]], np.zeros(len(self.states)))) * self.colour
-        inverse = np.linalg.pinv((normal + np.diag(prior)) / np.outer(scale, scale), rcond=1e-11, hermitian=True)
+        prior = self.expected[np.ix_(at, at)] * self.colour
+        inverse = np.linalg.pinv((normal + prior) / np.outer(scale, scale), rcond=1e-11, hermitian=True)
         step = -(inverse @ (gradient / scale)) / scale
         return float(-gradient @ step), step[: len(names)]
 
@@ -93,7 +112,7 @@ def linearised(
 ) -> Linearised:
     """Expand the sum of squares of `period` about `estimate`, which was fitted to it.
 
-    `names`: parameters beside the estimate's; they are expanded about what `known` says, else where they are absent.
+    `names`: additional parameters; they are expanded about their value in `known`, or else where they have no effect.
     """
     used = without_spikes(period)
     added = [name for name in names if name not in estimate.names]
@@ -121,27 +140,36 @@ def linearised(
         int(np.isfinite(estimate.residual).sum()),
         colour(estimate.residual * weight),
         1.0 / spread**2,
+        Lever.of(estimate.model, estimate.parameters.get("gravity_2", 0.0), sizes),
     )
 
 
 def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
-    """Terms that could be added to the estimate's model, most significant first.
+    """Return the terms that could be added to the estimate's model, most significant first.
 
-    `known`: where ripple repeats (`ripple_cycles`), by parameter name; without it ripple is none of them.
+    `known`: the period of ripple (`ripple_cycles`), by parameter name; without it, ripple is not considered.
     """
     model = estimate.model
-    richer = _richer(model)
+    richer = richer_models(model)
     if not known:
         richer.pop("ripple", None)
     new = {part: tuple(n for n in more.names if n not in model.names) for part, more in richer.items()}
     about = linearised(period, estimate, [n for names in new.values() for n in names], known)
-    base, _ = about.fall(estimate.names)
+    return ranked(about, estimate.names, richer, known)
+
+
+def ranked(
+    about: Linearised, fitted: Sequence[str], richer: Mapping[str, Model], known: Mapping[str, float]
+) -> list[Candidate]:
+    """Score tests of the models `richer`, by the part that each adds to the parameters `fitted`."""
+    new = {part: tuple(n for n in more.names if n not in fitted) for part, more in richer.items()}
+    base, _ = about.fall(fitted)
     found = []
     for part, more in richer.items():
-        fall, step = about.fall((*estimate.names, *new[part]))
+        fall, step = about.fall((*fitted, *new[part]))
         free = sum(term_of(name).part != "ripple" or "cycles" not in name for name in new[part])
         chance = about.colour * free * np.log(max(about.samples / about.colour, 3.0))
-        moved = dict(zip(new[part], step[len(estimate.names) :].tolist(), strict=True))
+        moved = dict(zip(new[part], step[len(fitted) :].tolist(), strict=True))
         found.append(
             Candidate(
                 more,
@@ -156,47 +184,59 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 
 
 def considered(period: SettledPeriod, estimate: Estimate) -> Array:
-    """The estimate's covariance (parameters, parameters) including omitted terms that cannot be ruled out.
+    """Return the estimate's covariance (parameters, parameters) including omitted terms that cannot be ruled out.
 
-    Of each such parameter the prior and what the motion says of it are taken together. It is as if it were fitted too,
-    but for the value, which stays where it is: by how far it would move comes on top.
+    Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
+    Since its value actually stays unchanged, the resulting shift of the other parameters is added.
     """
-    model = estimate.model
-    absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
-    left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
-    left_out = [name for name in left_out if term_of(name).spread is not None]
+    left_out = unruled(estimate.model)
     if not left_out:
         return estimate.covariance
-    about = linearised(period, estimate, left_out, {})
-    fitted = [*about.places(estimate.names), *about.states]
+    return widened(linearised(period, estimate, left_out, {}), estimate.names, estimate.covariance, left_out)
+
+
+def unruled(model: Model) -> list[str]:
+    """Parameters that the model lacks and that have an expected size."""
+    absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
+    left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
+    return [name for name in left_out if term_of(name).spread is not None]
+
+
+def widened(about: Linearised, names: Sequence[str], covariance: Array, left_out: Sequence[str]) -> Array:
+    """The covariance of the fitted parameters `names` including that those `left_out` may not be what they are taken
+    for."""
+    fitted = [*about.places(names), *about.states]
     extra = about.places(left_out)
     scale = np.sqrt(np.maximum(np.diag(about.normal), 1e-300))
     normal, gradient = about.normal / np.outer(scale, scale), about.gradient / scale
     own = normal[np.ix_(fitted, fitted)]
     across = normal[np.ix_(fitted, extra)]
     prior = about.precision[extra] / scale[extra] ** 2
-    inverse = np.linalg.pinv(own, rcond=1e-11, hermitian=True)
+    expected = about.expected[np.ix_(fitted, fitted)] / np.outer(scale[fitted], scale[fitted]) * about.colour
+    inverse = np.linalg.pinv(own + expected, rcond=1e-11, hermitian=True)
     follow = -inverse @ across
     told = (normal[np.ix_(extra, extra)] + across.T @ follow) / about.colour
     open_ = np.linalg.inv(0.5 * (told + told.T) + np.diag(prior) + 1e-12 * np.eye(len(extra)))
     moved = -open_ @ (gradient[extra] + follow.T @ gradient[fitted]) / about.colour
-    count = len(estimate.names)
+    count = len(names)
     wider = follow[:count] / scale[:count, None]
-    widened = wider @ (open_ + np.outer(moved, moved)) @ wider.T
-    seen = np.isfinite(np.diag(estimate.covariance))
-    covariance: Array = estimate.covariance + np.where(np.outer(seen, seen), widened, 0.0)
-    return covariance
+    more = wider @ (open_ + np.outer(moved, moved)) @ wider.T
+    seen = np.isfinite(np.diag(covariance))
+    return np.asarray(covariance + np.where(np.outer(seen, seen), more, 0.0))
 
 
 def simulated_run(period: SettledPeriod) -> Run:
-    """A period as simulated here, with the integration steps of a fit's result."""
+    """Return a period's simulation with the integration steps of a fit's result."""
     if period.stabiliser is None:
         return SimulatedRun.of(period, INTEGRATION)
     return StabilisedRun.of(period, period.stabiliser, INTEGRATION)
 
 
 def colour(residual: Array) -> float:
-    """Integrated autocorrelation of a residual (joints, samples), worst joint, missing samples as 0; 1 is white."""
+    """Return the integrated autocorrelation of a residual (joints, samples), worst joint; 1 is white.
+
+    Missing samples count as 0.
+    """
     worst = 1.0
     for row in np.nan_to_num(residual):
         rho = autocorrelation(row, max(2, int(MAX_LAG_SHARE * row.size)))
@@ -206,7 +246,7 @@ def colour(residual: Array) -> float:
     return worst
 
 
-def _richer(model: Model) -> dict[str, Model]:
+def richer_models(model: Model) -> dict[str, Model]:
     """Models with one option, or one law of friction, more: those that are linear in what they add."""
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     richer: dict[str, Model] = {option: model.having(option) for option in absent if option != "presliding"}
@@ -239,9 +279,10 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
 
 
 def ripple_cycles(period: SettledPeriod, estimate: Estimate, cycles: Sequence[float]) -> dict[str, float]:
-    """Where ripple of each joint would explain most of what `estimate` leaves, of these `cycles` a turn, by name.
+    """Return the numbers of `cycles` per turn for which ripple of each joint would explain most of the residual.
 
-    The score test of ripple for one number of cycles after the other, what the fitted parameters explain taken off.
+    This is the score test of ripple for one number of cycles after the other, after removing what the fitted parameters
+    explain. The result is by parameter name.
     """
     used = without_spikes(period)
     run = simulated_run(used).integrated(COARSE)
@@ -266,7 +307,7 @@ def ripple_cycles(period: SettledPeriod, estimate: Estimate, cycles: Sequence[fl
 
 
 def _columns(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
-    """Weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
+    """Return weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
     pieces = list(run.pieces(physics, start, names))
     derivative = np.concatenate([each for _, _, each in pieces], axis=1) * weight[:, :, None]
     position = np.concatenate([each for _, each, _ in pieces], axis=1)

@@ -1,11 +1,11 @@
 """Noise, nonlinear distortion and model error, separated by the lines on which they appear.
 
-Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. Driven on odd lines only, an arm answers on
-them and, as far as it is nonlinear, on others: what turns its sign with the motion (friction, gravity about a hanging
-pose) makes odd lines, what does not (an offset, friction that differs with direction, a pose aside) even ones. A driven
-odd line is left out here and there to see the former: a detection line. With even lines driven too, odd distortion
-lands everywhere, and lines that were not driven cannot be told odd from even: they are then all of one group. The
-residual of a fit on each group beyond the noise is its model error there.
+Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. If an arm is excited on odd lines only, it
+responds on these and, as far as it is nonlinear, on others: effects that change sign with the motion (friction, gravity
+about a hanging pose) produce odd lines, others (an offset, direction-dependent friction, any other pose) even ones.
+Some odd lines are left unexcited to observe the former: detection lines. If even lines are excited too, odd distortion
+appears on all lines, so the unexcited lines cannot be separated into odd and even and form a single group. The residual
+of a fit on each group, beyond the noise, is its model error there.
 """
 
 from dataclasses import dataclass
@@ -18,39 +18,39 @@ from hil.estimator.data.fourier import Lines, cut_off, lines_of, noise_power
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
 
-EXCITED = 1e-4  # of the strongest line's power; a command's rounding leaves 1e-7
+EXCITED = 1e-4  # fraction of the strongest line's power; the rounding of a command leaves 1e-7
 
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Lines of one kind."""
+    """A group of Fourier lines, such as all excited or all even ones."""
 
     lines: int
-    """How many."""
+    """Number of lines."""
     motion: Array
-    """RMS motion on one of them (joints,) [encoder steps]."""
+    """RMS of the motion per line (joints,) [encoder steps]."""
     left: Array
-    """The same of what the fit leaves of it."""
+    """RMS of the fit's residual per line (joints,) [encoder steps]."""
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """RMS of one line, group by group, in encoder steps (joints,)."""
+    """RMS per line for each group of lines, in encoder steps (joints,)."""
 
     noise: Array
-    """Of a line, from the scatter between periods or the upper half of the lines, whichever is more."""
+    """Noise per line: from the scatter between periods or the upper half of the lines, whichever is larger."""
     excited: LineGroup
-    """Lines that some joint was driven with."""
+    """Lines on which some joint was excited."""
     odd: LineGroup | None
-    """Odd lines up to the highest driven one that none was driven with; None unless all driven ones are odd."""
+    """Unexcited odd lines up to the highest excited one; None unless all excited lines are odd."""
     even: LineGroup | None
-    """Even ones likewise."""
+    """Unexcited even lines up to the highest excited one; None unless all excited lines are odd."""
     other: LineGroup | None
-    """All the others up to where motion meets noise."""
+    """All other lines with motion above the noise."""
 
 
 def excited_lines(period: SettledPeriod) -> Mask:
-    """Which harmonics, from 0, some joint was driven with (lines,)."""
+    """Return which harmonics, starting with 0, some joint was excited on (lines,)."""
     drive = period.torque if period.stabiliser is None else period.stabiliser.excitation
     power = np.abs(lines_of(drive)) ** 2
     power[:, 0] = 0.0
@@ -59,7 +59,7 @@ def excited_lines(period: SettledPeriod) -> Mask:
 
 
 def distortion(period: SettledPeriod, estimate: Estimate) -> Distortion:
-    """The levels of one period, and of the residual of `estimate`."""
+    """Return the levels of one period and of the residual of `estimate`."""
     lines = lines_of(period.filled())
     left = lines_of(np.nan_to_num(estimate.residual))
     order = np.arange(lines.shape[1])
@@ -76,7 +76,7 @@ def distortion(period: SettledPeriod, estimate: Estimate) -> Distortion:
         return LineGroup(count, _rms(lines, chosen) / step, _rms(left, chosen) / step) if count else None
 
     driven = group(excited)
-    assert driven is not None  # torque that is nowhere on a line is refused before
+    assert driven is not None  # a torque without any line was rejected before
     scatter = np.zeros(period.joints) if period.position_std is None else period.position_std
     noise = np.sqrt(2.0 * np.maximum(noise_power(lines), scatter**2 / period.samples)) / step
     return Distortion(

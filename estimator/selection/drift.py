@@ -1,8 +1,8 @@
-"""How friction changed while the arm moved: grease that warms up makes it fall by some percent within minutes.
+"""Changes of friction while the arm moved: as grease warms up, friction falls by a few percent within minutes.
 
-A fit of one period, or of the mean of several, holds for their middle. Other periods then show by how much friction was
-larger or smaller: what they differ by is nearly linear in one factor of each joint's friction, viscous and dry, and in
-the state with which the period began.
+A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
+whether friction was larger or smaller: the difference is nearly linear in one factor per joint, for viscous and dry
+friction, and in the period's initial state.
 """
 
 from dataclasses import dataclass, replace
@@ -17,21 +17,21 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import colour, simulated_run
 
 ITERATIONS = 3
-LEAST = 0.005  # of friction: a change that matters
-MOST = 0.3  # change of friction in one iteration
+LEAST = 0.005  # minimum relative change of friction that matters
+MOST = 0.3  # maximum relative change of friction in one iteration
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
 
 
 @dataclass(frozen=True)
 class Drift:
-    """By how much each joint's friction changed from the fitted periods to later ones."""
+    """Relative change of each joint's friction from the fitted periods to later ones."""
 
     change: Array
-    """As a fraction (joints,); negative when it fell."""
+    """Relative change (joints,); negative if friction fell."""
     std: Array
-    """Its standard error (joints,)."""
+    """Standard error of the change (joints,)."""
     seconds: float
-    """Time between the middles of what is compared [s]."""
+    """Time between the middles of the periods that are compared [s]."""
 
     @property
     def is_seen(self) -> bool:
@@ -39,7 +39,7 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def at_the_later(self, estimate: Estimate) -> Estimate:
-        """The estimate with friction as it was later."""
+        """Return the estimate with the friction of the later periods."""
         factor = 1.0 + self.change
         value = estimate.value.copy()
         for joint in range(estimate.model.joints):
@@ -50,9 +50,10 @@ class Drift:
 
 
 def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -> Drift:
-    """By how much friction in `period` differs from that of `estimate`, `seconds` [s] earlier.
+    """Return the change of friction from `estimate` to `period`, which is `seconds` [s] later.
 
-    Gauss-Newton on one factor of each joint and the first state; all else is taken as known.
+    It is found by Gauss-Newton iterations on one factor per joint and the initial state; all other parameters are
+    fixed.
     """
     joints = period.joints
     run = simulated_run(period)
@@ -86,7 +87,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
 
 
 def _first_state(period: SettledPeriod) -> Array:
-    """Angles and velocities at the first sample (2, joints), from the lines of the motion."""
+    """Return angles and velocities at the first sample (2, joints), from the lines of the motion."""
     lines = lines_of(period.filled())
     motion = motion_of(lines, cut_off(lines), period.fundamental, period.samples)
     return np.stack((motion.position[:, 0], motion.velocity[:, 0]))

@@ -16,7 +16,7 @@ from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.drive import motor_torque
 from hil.estimator.simulation.encoder import measured
 
-LEAST_WIDTH = 1e-3  # rad/s of a Coulomb step, where a method knows none
+LEAST_WIDTH = 1e-3  # rad/s: width of the smoothed Coulomb step for methods that do not estimate one
 SETTLING = SettlingOptions(max_periods=20, atol=1e-6)
 
 
@@ -28,9 +28,9 @@ def prediction_rms(
     zeros: Array | None = None,
     of: slice = ALL,
 ) -> Array:
-    """RMS of measured minus simulated position (joints,) [rad] over all that `prediction_errors` looks at.
+    """Return the RMS of measured minus simulated position (joints,) [rad] over all segments.
 
-    Arguments as there.
+    Arguments as in `prediction_errors`.
     """
     errors, samples = prediction_errors(recordings, parameters, length, joints, zeros, of)
     rms: Array = np.sqrt(samples @ errors**2 / samples.sum())
@@ -45,14 +45,18 @@ def prediction_errors(
     zeros: Array | None = None,
     of: slice = ALL,
 ) -> tuple[Array, Array]:
-    """RMS of measured minus simulated position (segments, joints) [rad], and samples (segments,) of each segment.
+    """Predict segments of recordings; return RMS errors (segments, joints) [rad] and numbers of samples (segments,).
 
-    The simulation is restarted every `length` [s].
+    The simulation is restarted for every segment from the angle and velocity estimated from the surrounding samples,
+    and then uses only the torque. A diverging simulation counts as an error of pi.
 
-    It starts from the angle and velocity estimated from the surrounding samples, and then uses only the
-    torque. `parameters` [SI] by the names of `Model.names`; `zeros` (recordings, joints) [rad]: true minus measured
-    angle of each recording, overriding `parameters`; `of`: which segments. A diverging simulation counts
-    as an error of pi.
+    Args:
+        recordings: recordings of one arm.
+        parameters: parameters by the names of `Model.names` [SI].
+        length: length of a segment [s].
+        joints: number of joints.
+        zeros: true minus measured angle of each recording (recordings, joints) [rad], overriding `parameters`.
+        of: the segments of each recording to use.
     """
     problem = Shooting(recordings, Model(joints), length, of=of)
     known = _complete(parameters, joints)
@@ -69,10 +73,11 @@ def prediction_errors(
 
 
 def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, float]) -> Array:
-    """RMS of measured minus open-loop predicted position over the RMS of the motion (joints,) of a settled period.
+    """Return the relative error of an open-loop prediction of a settled period (joints,).
 
-    The arm starts at rest where the period's positions lie on average and is simulated under the period's torque
-    until its motion repeats; no measurement enters. Raises PeriodicityError when it does not repeat.
+    This is the RMS of measured minus predicted position divided by the RMS of the motion. The arm starts at rest at the
+    period's mean position and is simulated under its torque until the motion repeats; no other measurement is used.
+    Raises PeriodicityError if the motion does not become periodic.
     """
     physics = Physics.of(_complete(parameters, period.joints))
     steps = steps_per_sample(period.rate)
@@ -93,7 +98,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
 
 
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:
-    """With a narrow Coulomb step where the method that found the parameters knows of no width."""
+    """Return the parameters with a narrow Coulomb step added if they include no width."""
     return {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)
 
 

@@ -1,13 +1,14 @@
 """Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
 
-A richer model always has a smaller residual on the motion it was fitted to. What it predicts of another motion, freely,
-from rest, gets better only by what is true in it, or by chance: so it must also leave less of its own motion than terms
-without meaning would. Without another motion the Bayesian information criterion judges (Schwarz, Annals of Statistics 6
-(1978) 461), samples counted as far as the residual is not correlated.
+A richer model always has a smaller residual on the motion to which it was fitted. Its free prediction of another
+motion, from rest, only improves if its terms are real, or by chance, so it must also reduce the residual more than
+meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
+Statistics 6 (1978) 461), with the number of samples reduced according to the residual's correlation.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -32,9 +33,9 @@ QUICK = LikelihoodOptions(
     integration=IntegrationOptions(max_substeps=16),
     coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
 )
-"""Bristles that turn out as stiff as none would take many substeps for nothing."""
+"""With these limits, bristles that become extremely stiff do not take many substeps without benefit."""
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
-"""What is nothing where it is small, and so costs a fit nothing but its columns."""
+"""Terms that vanish smoothly, so that including them costs a fit little."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,11 @@ class Trial:
 
     model: Model
     estimate: Estimate | None
-    """None where the fit or the prediction found no end."""
+    """Result of the fit; None if the fit or the prediction did not converge."""
     held_out: Array | None
-    """RMS error of the free prediction over the motion's RMS (joints,)."""
+    """RMS error of the free prediction relative to the motion's RMS (joints,)."""
     score: float
-    """RMS error of the free prediction in units of the noise, or without one what the criterion puts there."""
+    """RMS error of the free prediction in units of the noise; without a held-out motion, the equivalent criterion."""
     seconds: float
 
 
@@ -60,25 +61,27 @@ class Choice:
 
     @property
     def estimate(self) -> Estimate:
-        """Of the chosen model."""
+        """The estimate of the chosen model."""
         if self.chosen.estimate is None:
             raise ConvergenceError(f"{self.chosen.model.description} did not converge to full precision")
         return self.chosen.estimate
 
     @property
     def plainest(self) -> Trial:
-        """The trial with the fewest parameters that could be fitted."""
+        """The trial with the fewest parameters among those that could be fitted."""
         return min((each for each in self.trials if each.estimate is not None), key=lambda each: len(each.model.names))
 
     @property
     def gained(self) -> float:
-        """The plainest model's error over the chosen one's."""
+        """Ratio of the simplest model's error to the chosen one's."""
         return self.plainest.score / self.chosen.score
 
     @property
     def cost(self) -> float:
-        """How much larger the base parameters' standard errors are than they would be if the terms that the plainest
-        model lacks were known: what adding them cost (geometric mean)."""
+        """Increase of the base parameters' standard errors due to the added terms (geometric mean of ratios).
+
+        The reference is the standard errors if the terms that the simplest model lacks were known.
+        """
         estimate = self.estimate
         std = estimate.std
         seen = np.isfinite(std) & (std > 0.0)
@@ -100,38 +103,81 @@ def choose(
     drive: Drive,
     *,
     torque_scale: bool = False,
+    by_voltage: Collection[int] = (),
+    lever: float | None = None,
     starts: Sequence[Mapping[str, float]] = (),
     options: SelectionOptions = DEFAULTS,
+    executor: Executor | None = None,
 ) -> Choice:
     """Fit `periods` with the terms that the data support.
 
-    Stribeck friction comes first, with the encoders' zeros and the ratio of two torque constants, which are never known
-    exactly. If that does not explain the motion, or if the score test finds something in the residual
-    (`hil.estimator.selection.candidates`), all else that is smooth comes at once: load, direction, saturation, cables,
-    encoders that are not linear. Added one by one they mislead, since each takes over what the others lack; together,
-    with what is usual of them as a prior, they are told apart. Then come friction that yields before it slides and
-    ripple over the angle, and finally insignificant terms are removed. A model that predicts
-    `held_out` worse than a plainer one is not chosen.
+    First, Stribeck friction is fitted together with the encoders' zeros and the ratio of two torque constants, which
+    are never known exactly. If that does not explain the motion, or if the score test finds something in the residual
+    (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction, saturation,
+    cables, encoder nonlinearity. Adding them one by one would be misleading, since each takes over the effects of the
+    missing ones; together, with typical sizes as a prior, they can be separated. Then presliding friction and torque
+    ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler
+    one is not chosen.
 
     Args:
-        periods: what is fitted, settled periods of one arm; the first tells what is missing.
-        held_out: a settled period of another motion, which judges; without one, the Bayesian information criterion.
-        drive: the drive's terms, of every model.
-        torque_scale: whether the ratio of the torque constants stays in whatever it is.
-        starts: as of `hil.estimator.identify.identify`.
+        periods: settled periods of one arm to be fitted; the first is used to find missing terms.
+        held_out: a settled period of another motion, for validation; without one, the Bayesian information criterion is
+            used.
+        drive: drive model of all candidates.
+        torque_scale: whether the ratio of the torque constants is kept in any case.
+        by_voltage: joints, from 1, that are driven by voltage.
+        lever: as of `hil.estimator.models.model.Model`.
+        starts: additional initial guesses as in `hil.estimator.identify.identify`.
         options: thresholds.
+        executor: of concurrent.futures; fits that may be needed are begun before it is known that they are. The choice
+            is the same with and without it.
 
     Raises:
-        ConvergenceError: when no model can be fitted.
+        ConvergenceError: if no model can be fitted.
     """
-    search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None)
-    grown = search.grow(Model(periods[0].joints, "stribeck", drive))
-    pruned = search.prune(grown)
+    search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None, executor)
+    try:
+        grown = search.grow(Model(periods[0].joints, "stribeck", drive, by_voltage=by_voltage, lever=lever))
+        pruned = search.prune(grown)
+    finally:
+        search.end()
     return Choice(tuple(search.trials), search.judged(pruned))
 
 
+@dataclass(frozen=True)
+class Fitting:
+    """The fit of one model to one set of periods, as a value that another process can be given."""
+
+    periods: Sequence[SettledPeriod]
+    held_out: SettledPeriod | None
+    starts: Sequence[Mapping[str, float]]
+
+    def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
+        """From where `near` ended, with `values` for what it lacks, or from scratch; raises ConvergenceError."""
+        started = time.perf_counter()
+        place = None
+        if near is not None and near.estimate is not None:
+            place = Near({**near.estimate.parameters, **values}, near.estimate.start)
+        options = QUICK if coarse and "presliding" in model.options else THOROUGH
+        estimate = identify(self.periods, model, starts=self.starts, near=place, coarse=coarse, options=options)
+        relative, score = self._predicted(estimate)
+        return Trial(model, estimate, relative, score, time.perf_counter() - started)
+
+    def _predicted(self, estimate: Estimate) -> tuple[Array | None, float]:
+        other = self.held_out
+        if other is None:
+            return None, _criterion(estimate, self.periods)
+        try:
+            predicted = predict_period(estimate, other)
+        except PeriodicityError:
+            return None, np.inf
+        return relative_error(other, predicted), float(
+            np.sqrt(np.nanmean(((other.position - predicted) / other.noise[:, None]) ** 2))
+        )
+
+
 class Selection:
-    """Models tried on one set of periods, each from where the one before it ended."""
+    """Models tried on one set of periods, each starting from the result of the previous one."""
 
     def __init__(
         self,
@@ -140,25 +186,42 @@ class Selection:
         starts: Sequence[Mapping[str, float]],
         options: SelectionOptions,
         fixed: Option | None,
+        executor: Executor | None = None,
     ) -> None:
         self._periods = [without_spikes(period) for period in periods]
         self._held_out = held_out
-        self._starts = starts
+        self._fitting = Fitting(self._periods, held_out, starts)
         self._options = options
         self._fixed = fixed
+        self._executor = executor
+        self._begun: dict[tuple[Model, int, bool], Future[Trial]] = {}
         self.trials: list[Trial] = []
-        """In the order in which they were made."""
+        """All trials in chronological order."""
+
+    def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
+        """Begin a fit that may be needed, if there is an executor; one that is not needed is no trial."""
+        key = (model, id(near), coarse)
+        if self._executor is not None and key not in self._begun:
+            self._begun[key] = self._executor.submit(self._fitting.trial, model, near, {}, coarse)
+
+    def end(self) -> None:
+        """Give up fits that were begun and not needed."""
+        for future in self._begun.values():
+            future.cancel()
 
     def grow(self, model: Model) -> Trial:
-        """Extend `model` to the richest one that the data support. Raises ConvergenceError."""
+        """Extend `model` to the richest one that the data support; raises ConvergenceError."""
         unknown: set[Option] = {"zeros"}
         if model.joints == 2:
             unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
+        smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
+        self._begin(model.having(*unknown), coarse=True)
+        self._begin(smooth)
+        self._begin(smooth.having("presliding"), coarse=True)
         plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
             return plain
-        smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
             best = self._better(self._try_or_none(smooth, plain), plain)
@@ -187,7 +250,7 @@ class Selection:
         return best
 
     def _reshaped(self, best: Trial) -> Trial:
-        """The same model from other widths of friction's step, each joint's for itself: there are local minima."""
+        """Refit the model from other widths of each joint's Coulomb step, since there are local minima."""
         for joint in range(1, best.model.joints + 1):
             for width in self._options.initial_widths:
                 name = f"coulomb_width_{joint}"
@@ -197,7 +260,7 @@ class Selection:
         return best
 
     def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:
-        """`richer` if its terms gain what they must, else `plainer`."""
+        """Return `richer` if its terms reduce the residual sufficiently, otherwise `plainer`."""
         if richer is None or plainer is None:
             return richer or plainer
         if richer.model == plainer.model:
@@ -208,7 +271,11 @@ class Selection:
         """Remove insignificant terms if the motion is explained as well without them."""
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
-            return best  # what is missing would be taken for what is there
+            return best  # effects of missing terms would be attributed to present ones
+        for level in self._options.prune_levels:
+            plainest = _without_nothings(best.estimate, level, self._fixed)
+            if plainest != best.model:
+                self._begin(plainest, best)
         for level in self._options.prune_levels:
             plainer = self._pruned_at(level, best)
             if plainer is best or self._gain(best, plainer) < self._worth(best, plainer):
@@ -216,7 +283,7 @@ class Selection:
         return best
 
     def _pruned_at(self, level: float, best: Trial) -> Trial:
-        """Pruned and fitted again until nothing more is doubtful: a fit of fewer terms knows the rest better."""
+        """Prune and refit until no more terms are insignificant; with fewer terms, the others become more certain."""
         while best.estimate is not None:
             plainer = _without_nothings(best.estimate, level, self._fixed)
             trial = None if plainer == best.model else self._try_or_none(plainer, best)
@@ -226,7 +293,7 @@ class Selection:
         return best
 
     def judged(self, chosen: Trial) -> Trial:
-        """`chosen`, unless another trial predicts the motion held out much better."""
+        """Return `chosen`, unless another trial predicts the held-out motion much better."""
         if self._held_out is None:
             return chosen
         fitted = [trial for trial in self.trials if trial.estimate is not None]
@@ -238,7 +305,7 @@ class Selection:
         return int(sum(period.valid.sum() for period in self._periods))
 
     def _left(self, trial: Trial) -> float:
-        """Mean square of the residual, in units of the noise."""
+        """Return the mean square of the residual, in units of the noise."""
         assert trial.estimate is not None
         return float(np.nanmean((trial.estimate.residual / self._periods[0].noise[:, None]) ** 2))
 
@@ -246,13 +313,13 @@ class Selection:
         return self._left(trial) < self._options.explained_residual**2
 
     def _gain(self, richer: Trial, plainer: Trial) -> float:
-        """Twice the gain in log-likelihood, of samples that are counted as far as they are independent."""
+        """Return twice the gain in log-likelihood, with the number of samples reduced for correlation."""
         assert richer.estimate is not None
         independent = self._samples / colour(richer.estimate.residual)
         return independent * float(np.log(max(self._left(plainer), 1e-12) / max(self._left(richer), 1e-12)))
 
     def _worth(self, richer: Trial, plainer: Trial) -> float:
-        """The gain required of additional terms: the penalty of the Bayesian information criterion."""
+        """Return the gain required of additional terms: the penalty of the Bayesian information criterion."""
         assert richer.estimate is not None
         independent = max(self._samples / colour(richer.estimate.residual), 3.0)
         return max(1, len(richer.model.names) - len(plainer.model.names)) * float(np.log(independent))
@@ -265,7 +332,7 @@ class Selection:
         *,
         coarse: bool = False,
     ) -> Trial | None:
-        """A trial; None where the fit does not converge."""
+        """Return a trial; None if the fit does not converge."""
         try:
             return self._try(model, near, values, coarse=coarse)
         except ConvergenceError:
@@ -273,35 +340,17 @@ class Selection:
             return None
 
     def _try(self, model: Model, near: Trial | None, values: Mapping[str, float], *, coarse: bool = False) -> Trial:
-        """From where `near` ended, with `values` for what it lacks, or from scratch."""
-        started = time.perf_counter()
-        place = None
-        if near is not None and near.estimate is not None:
-            place = Near({**near.estimate.parameters, **values}, near.estimate.start)
-        options = QUICK if coarse and "presliding" in model.options else THOROUGH
-        estimate = identify(self._periods, model, starts=self._starts, near=place, coarse=coarse, options=options)
-        relative, score = self._predicted(estimate)
-        trial = Trial(model, estimate, relative, score, time.perf_counter() - started)
+        """Fit from the result of `near`, using `values` for what it lacks, or from scratch."""
+        begun = None if values else self._begun.pop((model, id(near), coarse), None)
+        trial = self._fitting.trial(model, near, values, coarse) if begun is None else begun.result()
         self.trials.append(trial)
         return trial
 
-    def _predicted(self, estimate: Estimate) -> tuple[Array | None, float]:
-        other = self._held_out
-        if other is None:
-            return None, _criterion(estimate, self._periods)
-        try:
-            predicted = predict_period(estimate, other)
-        except PeriodicityError:
-            return None, np.inf
-        return relative_error(other, predicted), float(
-            np.sqrt(np.nanmean(((other.position - predicted) / other.noise[:, None]) ** 2))
-        )
-
 
 def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
-    """Positions (joints, samples) [rad] that `estimate` predicts of another settled period, by its torque alone.
+    """Predict the positions (joints, samples) [rad] of another settled period by `estimate`, from its torque alone.
 
-    Raises PeriodicityError when the simulated arm does not settle.
+    Raises PeriodicityError if the simulated arm does not settle.
     """
     if other.stabiliser is None:
         return predict(estimate, other.torque, other.rate, other.command_to_sample)
@@ -312,13 +361,20 @@ def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
 
 
 def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
-    """The model without what is not told from nothing, the least sure taken out first.
+    """Return the model without parts that do not differ significantly from zero, the least significant removed first.
 
-    What a part lacks in significance is A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero
-    in standard errors, compared with chi^2 at `level`. The remaining parameters follow from a linearised model.
+    Significance is judged by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
+    errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.
     """
-    model, value, covariance = estimate.model, estimate.value.copy(), estimate.covariance.copy()
-    names = list(estimate.names)
+    return pruned_model(estimate.model, estimate.names, estimate.value, estimate.covariance, level, fixed)
+
+
+def pruned_model(
+    model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
+) -> Model:
+    """`model` without what its parameters (parameters,) and covariance do not tell from nothing at `level`; `fixed`
+    stays in."""
+    names, value, covariance = list(names), value.copy(), covariance.copy()
     covariance[~np.isfinite(covariance)] = 0.0
     while True:
         doubtful = []
@@ -337,7 +393,7 @@ def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) ->
 
 
 def _parts(model: Model) -> list[tuple[str, Model]]:
-    """The removable terms of a model, each with the reduced model; presliding has no significance test."""
+    """Return the removable parts of a model, each with the reduced model; presliding has no significance test."""
     parts: list[tuple[str, Model]] = [
         (option, model.without(option)) for option in sorted(model.options) if option != "presliding"
     ]
@@ -348,20 +404,23 @@ def _parts(model: Model) -> list[tuple[str, Model]]:
 
 
 def _tested(model: Model, plainer: Model) -> list[str]:
-    """What is tested of what `plainer` lacks; where that is nothing, what it scales says nothing."""
+    """Return the tested parameters of the part that `plainer` lacks.
+
+    Parameters that only have an effect together with others, such as a ripple's period, are not tested.
+    """
     lacking = [name for name in model.names if name not in plainer.names]
     return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "stribeck_velocity")]
 
 
 def relative_error(period: SettledPeriod, predicted: Array) -> Array:
-    """RMS of measured minus predicted position over the RMS of the motion about its mean (joints,)."""
+    """Return the RMS of measured minus predicted position relative to that of the motion about its mean (joints,)."""
     motion = period.position - np.nanmean(period.position, axis=1, keepdims=True)
     error: Array = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1) / np.nanmean(motion**2, axis=1))
     return error
 
 
 def _criterion(estimate: Estimate, periods: Sequence[SettledPeriod]) -> float:
-    """exp(BIC / 2n) of the residual in units of the noise, so that it compares like an error of prediction."""
+    """Return exp(BIC / 2n) of the residual in units of the noise, comparable to a prediction error."""
     noise = periods[0].noise
     size = np.nanmean((estimate.residual / noise[:, None]) ** 2)
     samples = sum(period.valid.sum() for period in periods) / estimate.correlation_time

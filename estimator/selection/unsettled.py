@@ -1,13 +1,17 @@
-"""Friction model selection for recordings without a settled period, judged on held-out segments.
+"""Friction model selection for recordings without a settled period.
 
-Every other segment of each recording is fitted and the others are predicted, each from the state given by its first
-samples. The model that predicts them best is fitted once more to all. (The short segments that only find a start are
-not kept apart so; what is judged has seen none but its own half.)
+As for settled periods (`hil.estimator.selection.settled`): Stribeck friction first; if that does not explain the
+motion or score tests find something, all else that is smooth at once, with what is usual of it as the prior; then
+insignificant terms are removed. Every fit but the first begins where one before ended.
+
+Where the motion is explained down to the noise, the likelihood decides. Where it is not, what a richer model gains may
+be another term's error: then every other segment of each recording is fitted, the others are predicted, and the model,
+with friction that yields before it slides among them, that predicts them best is fitted once more to all.
 """
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,14 +19,22 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.data.segments import Grid, cut
 from hil.estimator.errors import ConvergenceError, RecordingError
-from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
+from hil.estimator.fit.multiple_shooting import ALL, ShootingEstimate, estimate_by_shooting
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, Drive, Option
-from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.prediction import prediction_errors
+from hil.estimator.options import SelectionOptions, ShootingOptions
+from hil.estimator.selection.segments import held_out_errors, missing_terms
+from hil.estimator.selection.settled import pruned_model
 
 DEFAULTS = SelectionOptions()
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
+SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
+"""What is nothing where it is small, and so costs a fit nothing but its columns."""
+FINE = ShootingOptions()
+QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
+"""Of fits that are only compared."""
+EXPLAINED = 1.1  # residual over noise: the noise is estimated from the same samples
+NEARLY = 1.5  # residual over noise up to which the likelihood can be trusted to choose
 
 
 @dataclass(frozen=True)
@@ -31,15 +43,15 @@ class SegmentTrial:
 
     model: Model
     held_out: Array | None
-    """RMS error over the motion's RMS (joints,); None where the fit found no end."""
+    """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Of the usual segment, the median, all joints together: where an arm turns over, one can be off by any amount."""
+    """Median of the segments' relative errors over all joints: a segment in which the arm turns over can be far off."""
     seconds: float
 
 
 @dataclass(frozen=True)
 class SegmentChoice:
-    """The models tried, in order, the one chosen, and its fit to all segments."""
+    """The models tried, in order, the chosen one, and its fit to all segments."""
 
     trials: tuple[SegmentTrial, ...]
     chosen: SegmentTrial
@@ -48,7 +60,8 @@ class SegmentChoice:
     @property
     def gained(self) -> float:
         """The plainest model's error over the chosen one's."""
-        return self.trials[0].score / self.chosen.score
+        fitted = [each for each in self.trials if each.held_out is not None]
+        return min(fitted, key=lambda each: len(each.model.names)).score / self.chosen.score
 
 
 def choose_by_shooting(
@@ -61,47 +74,153 @@ def choose_by_shooting(
     torque_scale: bool = False,
     options: SelectionOptions = DEFAULTS,
 ) -> SegmentChoice:
-    """Fit richer and richer friction, presliding and asymmetry on the best, as long as held-out segments are predicted
-    better.
+    """Fit friction with the terms that the recordings support.
 
-    Arguments as of `estimate_by_shooting`; `torque_scale` is part of every model, or of none. Raises RecordingError for
-    recordings of fewer than two segments each, ConvergenceError when no model can be fitted.
+    Arguments as of `estimate_by_shooting`; `torque_scale`: whether the ratio of the torque constants stays in whatever
+    it is. Raises RecordingError for recordings of fewer than two segments each, ConvergenceError when no model can be
+    fitted.
     """
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(
-            f"no recording holds two segments of {length:g} s, one to fit and one to check: set model.friction to one "
-            "of the models, record longer, or choose shorter segments"
+            f"no recording has two segments of {length:g} s, one to fit and one to check: set model.friction to a "
+            "specific model, record longer, or choose shorter segments"
         )
-
-    def tried(model: Model) -> SegmentTrial:
-        return _try(recordings, model, start, length, zeros)
-
     joints = recordings[0].joints
-    always: tuple[Option, ...] = ("torque_scale",) if torque_scale else ()
-    trials = [tried(Model(joints, friction, drive, always)) for friction in FRICTIONS]
-    best = trials[0]
-    for trial in trials[1:]:
-        best = trial if trial.score < options.keep_ratio * best.score else best
-    further: tuple[Option, ...] = ("presliding", "asymmetry")
-    for option in further:
-        trials.append(tried(best.model.having(option)))
-        best = trials[-1] if trials[-1].score < options.keep_ratio * best.score else best
-    if best.held_out is None:
+    unknown: tuple[Option, ...] = ("torque_scale",) if joints == 2 else ()
+    search = _Search(recordings, start, length, zeros, options, "torque_scale" if torque_scale else None)
+    plain = search.fit(Model(joints, "stribeck", drive, unknown), options=QUICK)
+    if plain is None:
+        plain = search.fit(Model(joints, "coulomb", drive), options=QUICK)
+    if plain is None:
         raise ConvergenceError("no friction model could be fitted: check the recording and its units")
-    estimate = estimate_by_shooting(recordings, best.model, start, length=length, zeros=zeros)
-    return SegmentChoice(tuple(trials), best, estimate)
+    best = search.grown(plain)
+    return search.judged(plain, best)
 
 
-def _try(recordings: Sequence[Recording], model: Model, start: Array, length: float, zeros: bool) -> SegmentTrial:
-    began = time.perf_counter()
-    try:
-        found = estimate_by_shooting(recordings, model, start, length=length, zeros=zeros, of=FITTED)
-    except ConvergenceError:
-        return SegmentTrial(model, None, np.inf, time.perf_counter() - began)
-    shifts = found.zeros if zeros else None
-    errors, _ = prediction_errors(recordings, found.parameters, length, model.joints, shifts, PREDICTED)
-    motion = np.sqrt(np.mean([np.var(each.filled(), axis=1) for each in recordings], axis=0))
-    relative = errors / motion
-    score = float(np.median(np.sqrt(np.mean(relative**2, axis=1))))
-    held_out = np.sqrt(np.mean(relative**2, axis=0))
-    return SegmentTrial(model, held_out, score, time.perf_counter() - began)
+def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, start: Array) -> Array | None:
+    """Error of the estimate's model, fitted to every other segment, on the others (joints,); None for one segment."""
+    length, zeros = estimate.segment_length, bool(estimate.zeros.size)
+    if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
+        return None
+    search = _Search(recordings, start, length, zeros, DEFAULTS, None)
+    return search.trial(estimate, estimate.model).held_out
+
+
+class _Search:
+    """Fits of one set of recordings, each from where another ended."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        start: Array,
+        length: float,
+        zeros: bool,
+        options: SelectionOptions,
+        fixed: Option | None,
+    ) -> None:
+        self._recordings = recordings
+        self._start = start
+        self._length = length
+        self._zeros = zeros
+        self._options = options
+        self._fixed = fixed
+        self._trials: dict[Model, SegmentTrial] = {}
+
+    def fit(
+        self,
+        model: Model,
+        near: ShootingEstimate | None = None,
+        of: slice = ALL,
+        options: ShootingOptions = FINE,
+    ) -> ShootingEstimate | None:
+        """An estimate; None where the fit finds no end."""
+        try:
+            return estimate_by_shooting(
+                self._recordings,
+                model,
+                self._start,
+                length=self._length,
+                zeros=self._zeros,
+                of=of,
+                near=near,
+                options=options,
+            )
+        except ConvergenceError:
+            return None
+
+    def trial(self, near: ShootingEstimate, model: Model) -> SegmentTrial:
+        """How well `model` predicts segments that it is not fitted to; the fit begins where `near` ended.
+
+        That end has seen the held-out segments, but only chooses the minimum, not where in it the fit ends.
+        """
+        if model not in self._trials:
+            began = time.perf_counter()
+            half = self.fit(model, near, FITTED, QUICK)
+            error, score = (None, np.inf) if half is None else held_out_errors(self._recordings, half, PREDICTED)
+            self._trials[model] = SegmentTrial(model, error, score, time.perf_counter() - began)
+        return self._trials[model]
+
+    def grown(self, plain: ShootingEstimate) -> ShootingEstimate:
+        """The richest model that the recordings support."""
+        if _left(plain) < EXPLAINED and not self._seen(plain):
+            return self._pruned(plain)
+        smooth = replace(plain.model, friction=FRICTIONS[-1]).having(*SMOOTH)
+        rich = self.fit(smooth, plain, options=QUICK)
+        if rich is not None and _left(rich) < NEARLY:
+            kept = rich if self._gain(rich, plain) > self._worth(rich, plain) else plain
+            return self._pruned(kept)
+        return self._by_prediction(plain)
+
+    def _by_prediction(self, plain: ShootingEstimate) -> ShootingEstimate:
+        """Where nothing explains the motion: what predicts best, of models from plain to rich."""
+        best, near = self.trial(plain, plain.model), plain
+        loaded = replace(plain.model, friction=FRICTIONS[-1])
+        for richer in (loaded, loaded.having("presliding"), loaded.having(*SMOOTH)):
+            model = richer.having("presliding") if "presliding" in best.model.options else richer
+            found = self.trial(near, model)
+            if found.score < self._options.keep_ratio * best.score:
+                best = found
+        return self.fit(best.model, near) or plain
+
+    def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
+        """The choice, after all segments were fitted: the plainer one if it predicts the held-out ones much better."""
+        simple = Model(plain.model.joints, "coulomb", plain.model.drive)
+        plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)
+        if plainest.score < self._options.overrule_ratio * chosen.score:
+            best, chosen = self.fit(simple, plain) or best, plainest
+        if not np.isfinite(chosen.score):
+            raise ConvergenceError("no friction model could be fitted to half of the segments: record longer")
+        return SegmentChoice(tuple(self._trials.values()), chosen, best)
+
+    def _seen(self, estimate: ShootingEstimate) -> bool:
+        found = missing_terms(self._recordings, estimate)
+        return bool(found) and found[0].evidence > 1.0
+
+    def _pruned(self, best: ShootingEstimate) -> ShootingEstimate:
+        """Fitted finely, without what is not told from nothing."""
+        for level in self._options.prune_levels:
+            model = pruned_model(best.model, best.names, best.value, best.covariance, level, self._fixed)
+            if model == best.model:
+                continue
+            plainer = self.fit(model, best, options=QUICK)
+            if plainer is not None and self._gain(best, plainer) < self._worth(best, plainer):
+                best = plainer
+                break
+        return self.fit(best.model, best) or best
+
+    def _gain(self, richer: ShootingEstimate, plainer: ShootingEstimate) -> float:
+        """Twice the gain in log-likelihood."""
+        return 2.0 * self._samples * float(np.log(_left(plainer) / _left(richer)))
+
+    def _worth(self, richer: ShootingEstimate, plainer: ShootingEstimate) -> float:
+        """The gain required of additional terms: the penalty of the Bayesian information criterion."""
+        return max(1, len(richer.names) - len(plainer.names)) * float(np.log(self._samples))
+
+    @property
+    def _samples(self) -> float:
+        return float(sum(np.isfinite(each.position).sum() for each in self._recordings))
+
+
+def _left(estimate: ShootingEstimate) -> float:
+    """RMS residual in units of the noise."""
+    return max(1e-6, float(np.sqrt(np.mean(estimate.residual_over_noise**2))))

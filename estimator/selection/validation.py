@@ -1,20 +1,21 @@
-"""How far an estimate can be trusted: residual against rounding, whiteness, conditioning, free simulation, lines."""
+"""Checks of an estimate: residual compared with rounding, whiteness, conditioning, free simulation, lines."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from hil.estimator.arrays import Array, Mask
-from hil.estimator.data.fourier import cut_off, lines_of, noise_power
+from hil.estimator.data.fourier import cut_off, lines_of, motion_of, noise_power
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.identify import Estimate, predict
+from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import joint_of, kind_of
 from hil.estimator.selection.distortion import Distortion, distortion, excited_lines
 
 LAGS = 100
-LITTLE_TORQUE = 0.1  # of the RMS torque: less gravity than that is as good as none
+LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 
 
 @dataclass(frozen=True)
@@ -22,17 +23,17 @@ class Levels:
     """RMS by source, in encoder steps (joints,)."""
 
     excited: Array
-    """Motion on the lines that some joint was driven with."""
+    """Motion on the lines that were excited at some joint."""
     distortion: Array
-    """Motion on the other lines, which is what the arm's nonlinearity made."""
+    """Motion on the other lines, caused by the arm's nonlinearity."""
     noise: Array
-    """Of a sample, from the upper half of the lines."""
+    """Noise of a sample, from the upper half of the lines."""
     scatter: Array
-    """Of a sample of the mean period, from the scatter between periods; 0 if only one was kept."""
+    """Noise of a sample of the mean period, from the scatter between periods; 0 if there was only one."""
     model_error: Array
-    """What the fit leaves beyond rounding and scatter."""
+    """Residual of the fit beyond rounding and scatter."""
     lines: Distortion
-    """Line by line, odd and even told apart where the excitation allows it."""
+    """Levels per line, with odd and even lines separated if the excitation allows it."""
 
 
 @dataclass(frozen=True)
@@ -40,19 +41,27 @@ class Validation:
     """Results of the checks."""
 
     residual_over_floor: Array
-    """RMS residual over the noise that is known, rounding and scatter (joints,); 1 explains everything."""
+    """RMS residual relative to the known noise, rounding and scatter (joints,); 1 means that everything is explained.
+    """
     correlated_lags: Array
-    """Share of the residual's autocorrelations at 1 to LAGS samples outside the 95 % band of white noise
-    (joints,); 0.05 is white."""
+    """Fraction of the residual's autocorrelations outside the 95 % band of white noise (joints,); 0.05 is white.
+
+    Lags of 1 to LAGS samples are used.
+    """
     free_run: Array | None
-    """RMS error of a simulation from rest over the motion's RMS (joints,), of the fitted period itself; None when
-    it does not settle."""
+    """RMS error of simulating the fitted period from rest, relative to the motion's RMS (joints,).
+
+    None if the simulation does not settle.
+    """
     condition: float
-    """Condition number of the correlations between base parameters: 1 is independent."""
+    """Condition number of the base parameters' correlation matrix: 1 means independent."""
     confounded: tuple[str, str, float]
-    """The two base parameters that are hardest to tell apart, and their correlation."""
+    """The two base parameters that are hardest to separate, and their correlation."""
     relative_std: dict[str, float]
     """Relative standard error of each base parameter except offsets."""
+    torque_std: dict[str, float]
+    """Standard error of the torque that each of these contributes to the fitted motion, RMS over that of the joint's
+    torque, worst joint."""
     levels: Levels
 
     @property
@@ -62,7 +71,7 @@ class Validation:
 
 
 def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
-    """Check `estimate` against the period it was fitted to."""
+    """Check `estimate` against the period to which it was fitted."""
     residual = np.nan_to_num(estimate.residual)
     lags = min(LAGS, period.samples // 4)
     band = 1.96 / np.sqrt(period.samples)
@@ -78,14 +87,15 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
         float(np.linalg.cond(correlation)),
         (names[first], names[second], float(correlation[first, second])),
         _relative_std(period, estimate),
+        _torque_std(period, estimate),
         levels(period, estimate),
     )
 
 
 def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
-    """Relative standard error of each base parameter except offsets.
+    """Return the relative standard error of each base parameter except offsets.
 
-    Gravity may be zero, on a horizontal arm: then its error is compared with the torque that moved the arm.
+    On a horizontal arm gravity may be zero; its error is then relative to the torque that moved the arm.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean(period.torque**2, axis=1))
     relative = {}
@@ -98,8 +108,19 @@ def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]
     return relative
 
 
+def _torque_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
+    """Standard error of each base parameter except offsets, as a share of the torque that moved the joints."""
+    lines = lines_of(estimate.position)
+    motion = motion_of(lines, cut_off(lines), period.fundamental, period.samples)
+    torque = np.sqrt(np.mean(period.torque**2, axis=1))
+    Y = regressor(motion.position, motion.velocity, motion.acceleration)
+    per_unit = np.sqrt(np.mean(Y**2, axis=1)) / torque[:, None]
+    named = zip(estimate.model.base_names, estimate.std.tolist(), per_unit.max(axis=0).tolist(), strict=False)
+    return {name: std * share for name, std, share in named if kind_of(name) != "offset"}
+
+
 def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
-    """Noise, distortion and model error of one period, separated."""
+    """Return noise, distortion and model error of one period."""
     lines = lines_of(period.filled())
     order = np.arange(lines.shape[1])
     excited = excited_lines(period)
@@ -125,7 +146,7 @@ def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
 
 def _free_run(period: SettledPeriod, estimate: Estimate) -> Array | None:
     if period.stabiliser is not None:
-        return None  # by itself it would fall over, or wander off
+        return None  # without the stabiliser it would fall over or drift away
     try:
         predicted = predict(estimate, period.torque, period.rate, period.command_to_sample)
     except PeriodicityError:

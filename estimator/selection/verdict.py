@@ -1,10 +1,9 @@
-"""A verdict in words: whether to trust the estimate, its weaknesses and their causes, and which experiment would
-improve it.
+"""A verdict in words: whether to trust the estimate, its weaknesses, their causes, and how to improve it.
 
-"Yes" means that every inertia, gravity and friction parameter is, as far as can be judged, within 2 % or three of its
-standard errors. So it rests on standard errors that hold: those of the estimate are widened by what its model leaves
-out (`hil.estimator.selection.candidates.considered`) and by what it leaves of the motion
-(`hil.estimator.fit.covariance`). No sentence advises what the tool has already tried.
+"Yes" means that, as far as can be judged, every inertia, gravity and friction parameter is accurate to 2 % or three
+standard errors. This relies on valid standard errors: those of the estimate are widened for effects that the model
+omits (`hil.estimator.selection.candidates.considered`) and for the unexplained part of the motion
+(`hil.estimator.fit.covariance`). No sentence advises something that the tool has already tried.
 """
 
 from collections.abc import Sequence
@@ -20,12 +19,13 @@ from hil.estimator.selection.candidates import Candidate
 from hil.estimator.selection.drift import LEAST, Drift
 from hil.estimator.selection.validation import Validation
 
-EXPLAINED = 1.06  # residual over noise up to which the model has explained the motion
-GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # of the motion's RMS
-MUCH_LEFT = 5.0  # residual over noise from which parameters are doubtful without a held-out check
+EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains the motion
+GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to the motion's RMS
+MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
-ALIKE = 0.99  # correlation
-NOISY = 1.25  # noise over rounding from which it is said
+LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
+ALIKE = 0.99  # correlation above which two parameters are hard to separate
+NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
 IMPROVEMENT = {
     "inertia": "faster motion: raise the upper edge of experiment.band or peak_torque",
     "coupling": "faster motion of both joints together: raise peak_torque",
@@ -43,7 +43,7 @@ Trust = Literal["yes", "with care", "no"]
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement and its reasons, each a sentence for a person."""
+    """The verdict and its reasons, each a sentence for users."""
 
     trust: Trust
     weakest: str
@@ -52,22 +52,22 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence besides the estimate and its validation."""
+    """Evidence in addition to the estimate and its validation."""
 
     held_out: Array | None = None
-    """RMS error of the free prediction of a motion not fitted, over that motion's RMS (joints,)."""
+    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,)."""
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None
-    """How friction changed while the arm moved."""
+    """Change of friction while the arm moved."""
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
     tried_all: bool = False
-    """Whether the tool chose the model from all that it knows."""
+    """Whether the model was selected from all available terms."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
-    """The verdict on `estimate`."""
+    """Return the verdict on `estimate`."""
     explained = float(validation.residual_over_floor.max()) <= EXPLAINED
     sentences = (
         _noise(validation) if explained else _unexplained(estimate, validation, evidence),
@@ -84,7 +84,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
 
 def _trust(validation: Validation, evidence: Evidence) -> Trust:
     left = float(validation.residual_over_floor.max())
-    doubtful = max(validation.relative_std.values()) > WEAK or bool(evidence.doubts)
+    doubtful = any(_is_weak(validation, name) for name in validation.relative_std) or bool(evidence.doubts)
     if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"
@@ -93,6 +93,11 @@ def _trust(validation: Validation, evidence: Evidence) -> Trust:
     if not worst <= USABLE_PREDICTION:
         return "no"
     return "with care" if doubtful or left > MUCH_LEFT or worst > GOOD_PREDICTION else "yes"
+
+
+def _is_weak(validation: Validation, name: str) -> bool:
+    """Whether a parameter is poorly known and the arm's torque depends on it."""
+    return validation.relative_std[name] > WEAK and not validation.torque_std[name] <= LITTLE_EFFECT
 
 
 def _noise(validation: Validation) -> str:
@@ -112,14 +117,13 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence)
     error = float(validation.levels.model_error.max())
     said = (
         f"Joint {joint + 1} moves in a way that the model cannot explain: its residual is {left[joint]:.1f} times the "
-        "noise, a "
-        f"model error of {error:.2g} encoder steps RMS."
+        f"noise, a model error of {error:.2g} encoder steps RMS."
     )
     return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation)))
 
 
 def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
-    """The most likely cause, with the evidence."""
+    """Return the most likely cause of the residual, with the evidence."""
     seen = [each for each in evidence.candidates if each.evidence > 1.0]
     if seen:
         what = _in_words(seen[0].part)
@@ -138,7 +142,7 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation) -> str:
-    """The parameters that model error may have biased, by their widened errors."""
+    """Return which parameters the model error may have biased, judged by their widened errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst:
         return "It does not affect the parameters significantly: including it, each is known to 2 % or better."
@@ -149,10 +153,10 @@ def _spoilt(validation: Validation) -> str:
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
-    """Where the excitation left lines out: what answers there, and what of it the model does not have."""
+    """Return the response on lines that were left unexcited, and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        return ("experiment.detection = true would show whether this is odd (friction) or even (offsets, direction).",)
+        return ("experiment.detection = true would tell odd causes (friction) from even ones (offsets, direction).",)
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 
@@ -161,10 +165,8 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
 
     found = (
         f"On lines that were not excited, joint {joint + 1} responds with {share(levels.odd.motion)} of an excited "
-        "line's "
-        f"motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, "
-        "direction-dependent "
-        f"effects); noise is {share(levels.noise)}. The model leaves {share(levels.odd.left)} and "
+        f"line's motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, "
+        f"direction-dependent effects); noise is {share(levels.noise)}. The model leaves {share(levels.odd.left)} and "
         f"{share(levels.even.left)}."
     )
     beyond = [
@@ -200,8 +202,14 @@ def _weak(validation: Validation) -> tuple[str, ...]:
     if part <= WELL_KNOWN:
         return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
     improvement = IMPROVEMENT[kind_of(name)]
+    if part > WEAK and not _is_weak(validation, name):
+        share = 100 * validation.torque_std[name]
+        return (
+            f"The least well known parameter is {name}, to {100 * part:.2g} %, which hardly affects this arm: its "
+            f"standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
+        )
     if not np.isfinite(part):
-        return (f"This motion reveals nothing of {name}. To identify it: {improvement}.",)
+        return (f"This motion provides no information on {name}. To identify it: {improvement}.",)
     return (f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}.",)
 
 
@@ -211,13 +219,13 @@ def _alike(validation: Validation) -> tuple[str, ...]:
     if abs(correlation) < ALIKE or both <= WELL_KNOWN:
         return ()
     return (
-        f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more lines, or with "
-        "more torque.",
+        f"{first} and {second} are hard to separate (correlation {correlation:.3f}): excite more lines or "
+        "use more torque.",
     )
 
 
 def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
-    # Where the model lacks something, what is far from it is no fault of the reading.
+    # If the model is incomplete, a reading far from it is not necessarily wrong.
     if not estimate.outliers or not explained:
         return ()
     return (

@@ -1,22 +1,24 @@
-"""The arm's motion under given motor torques, compiled: the one hot loop of the estimator.
+"""The arm's compiled simulation under given motor torques, the most time-critical loop of the estimator.
 
-The equations are those of `hil.estimator.models.regressor` with a friction law that is smooth:
+The equations are those of `hil.estimator.models.regressor` with a smooth friction law:
 
-    given torque = torque_scale torque (1 - saturation (torque_scale torque)^2)
+    driving torque = torque_scale torque - generated v
+    given torque = driving torque (1 - saturation (driving torque)^2)
     motor torque = given torque (1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q))
-    friction(v) = viscous v + viscous_asymmetry |v| + level(v) tanh(v / width)
+    friction(v) = (viscous - generated) v + viscous_asymmetry |v| + level(v) tanh(v / width)
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
 
-and cable_stiffness q beside friction, with |v| as smooth as the rest, v tanh(v / width). An asymmetry of the Coulomb
-level itself is the offset. With presliding the term level(v) tanh(v / width) makes way for the bristles of
-`hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these equations and this
-scheme.
+Here generated v is the back-EMF of a joint driven by voltage (`hil.estimator.simulation.back_emf`), 0 otherwise. In
+addition to friction there is the torque cable_stiffness q. |v| is smoothed as well, to v tanh(v / width). An
+asymmetry of the Coulomb level itself is the offset. With presliding, the term level(v) tanh(v / width) is replaced by
+the bristles of `hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these
+equations and this integration scheme.
 
-Each step is the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999): L-stable for the
-slope of the friction, which its Jacobian holds, and of second order whatever else that Jacobian leaves out.
-While a joint is near standstill, where tanh is steep, a step is cut into finer ones. Against a hundred
-steps per sample, three at 400 Hz are within 0.003 encoder steps RMS for widths from 0.0003 to 0.05 rad/s, one within
-0.05 for a third of the time.
+Each step uses the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999), which is L-stable for the
+slope of friction, the only part of the Jacobian that is included, and second-order regardless of what the Jacobian
+omits. While a joint is near standstill, where tanh is steep, a step is divided into smaller ones. Compared with a
+hundred steps per sample, three at 400 Hz are accurate to 0.003 encoder steps RMS for widths from 0.0003 to 0.05 rad/s;
+one is accurate to 0.05 in a third of the time.
 """
 
 import math
@@ -31,36 +33,41 @@ from hil.estimator.models.parameters import Physics, place_of
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
 
-# Of joint 1 in `Physics.vector`; joint 2 follows.
+# Indices of joint 1's constants in `Physics.vector`; joint 2's follow.
 VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING = map(
     place_of, ("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity")
 )
 LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
     place_of, ("load", "viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale")
 )
-SATURATION, CABLE = map(place_of, ("saturation", "cable_stiffness"))
+SATURATION, CABLE, GENERATED = map(place_of, ("saturation", "cable_stiffness", "back_emf"))
 
 INTEGRATION = IntegrationOptions()
 MAX_SUBSTEPS = INTEGRATION.max_substeps
-FADED = 40.0  # e to minus this is lost beside 1, and takes a library longer than any other power
+FADED = 40.0  # exp(-40) is negligible compared with 1, and the library takes longer for such arguments
 GAMMA = 1.0 - math.sqrt(0.5)
 
 
 def steps_per_sample(rate: float, longest: float = INTEGRATION.max_step) -> int:
-    """Integration steps of at most `longest` [s] in one sample at `rate` [1/s]."""
+    """Return the number of integration steps of at most `longest` [s] per sample at `rate` [1/s]."""
     return math.ceil(1.0 / (rate * longest))
 
 
 def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tuple[Array, Array]:
-    """Simulate from one sample to as many as `torque` has.
+    """Simulate as many samples as `torque` has.
 
-    `start` (2 or 3, joints): angles [rad], velocities [rad/s] and the torque of friction's bristles [N m] at the first
-    sample, the last as of a sliding joint where it is not given; `torque` (joints, samples, steps): mean motor torque
-    over each step after each sample [N m]; `step` [s]: length of one. Returns the angles at the samples
-    (joints, samples) and the state after the last sample's steps (3, joints).
+    Args:
+        physics: physical constants.
+        start: state at the first sample (2 or 3, joints): angles [rad], velocities [rad/s] and optionally the torque of
+            the bristles [N m], by default that of sliding joints.
+        torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
+        step: length of a step [s].
+
+    Returns:
+        The angles at the samples (joints, samples) [rad] and the state after the last sample's steps (3, joints).
     """
     joints, samples, _ = torque.shape
-    # A pendulum is a two-joint arm whose second joint has no torque and moves nothing.
+    # A one-joint arm is simulated as a two-joint arm whose second joint has no torque and moves nothing.
     state = np.zeros((3, 2))
     state[2, :joints] = first_bend(physics, start[1])
     state[: len(start), :joints] = start
@@ -74,23 +81,23 @@ def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tupl
 
 
 def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> int:
-    """Finer steps in place of one of `step` [s] near standstill, at most `most`.
+    """Return the number of substeps for a step of `step` [s] near standstill, at most `most`.
 
-    Dry friction turned round may carry a joint across a quarter of its step's width in one of them. A power of
-    two, so that small changes of the physics seldom change it, and with it the last digits of the motion.
+    Within one substep, reversed dry friction may move a joint through a quarter of its step's width. The number is a
+    power of two, so that small changes of the physics seldom change it, and with it the last digits of the motion.
     """
     needed = min(4.0 * step / physics.crossing_time(), most)
     return int(2 ** math.ceil(math.log2(max(needed, 1.0))))
 
 
 def bump_at(ratio: float) -> float:
-    """exp(-ratio^2)."""
+    """Return exp(-ratio^2)."""
     past = ratio * ratio
     return math.exp(-past) if past < FADED else 0.0
 
 
 def bend_at(v: float, sharp: float) -> tuple[float, float]:
-    """tanh(v sharp) and its slope over v, by one exponential: the library's tanh takes twice as long."""
+    """Return tanh(v sharp) and its derivative by v, from one exponential: the library's tanh takes twice as long."""
     past = 2.0 * abs(v) * sharp
     if not past < FADED:
         return math.copysign(1.0, v), 0.0
@@ -101,21 +108,29 @@ def bend_at(v: float, sharp: float) -> tuple[float, float]:
 
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
 def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, float]:
-    """Torque that a drive leaves its joint after friction, and the slope of that friction."""
+    """Return the torque of a drive minus friction, and the slope of that friction."""
     viscous, cycles = p[VISCOUS + joint], p[CYCLES + joint]
-    t *= p[SCALE + joint]
+    generated = p[GENERATED + joint] * v
+    t = t * p[SCALE + joint] - generated
     t -= p[SATURATION + joint] * t * t * t
     if cycles != 0.0:
         t *= 1.0 + p[SINE + joint] * math.sin(cycles * q) + p[COSINE + joint] * math.cos(cycles * q)
     level = p[COULOMB + joint] * (1.0 + p[RISE + joint] * bump_at(v / p[FADING + joint])) + p[LOAD + joint] * abs(t)
     bend, bent = bend_at(v, 1.0 / p[WIDTH + joint])
-    left = t - p[OFFSET + joint] - p[CABLE + joint] * q - viscous * v - (p[ASYMMETRY + joint] * v + level) * bend
+    left = (
+        t
+        + generated
+        - p[OFFSET + joint]
+        - p[CABLE + joint] * q
+        - viscous * v
+        - (p[ASYMMETRY + joint] * v + level) * bend
+    )
     slope = viscous + level * bent
     return left, slope
 
 
 def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> tuple[float, ...]:
-    """Mass matrix's first row, torques left for acceleration, and the slopes of friction."""
+    """Return the first row of the mass matrix, the torques available for acceleration, and the slopes of friction."""
     left_1, slope_1 = _drive(p, 0, q1, v1, t1)
     left_2, slope_2 = _drive(p, 1, q2, v2, t2)
     q1 += p[ZERO]
@@ -135,9 +150,9 @@ def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: f
 
 
 def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, left: int) -> int:
-    """Of the `left` pieces [s] of a step, how many may be done at once: 1 where a joint may come near standstill.
+    """Return how many of the `left` substeps of length `piece` [s] may be taken at once: 1 near standstill.
 
-    From velocities [rad/s] and the last accelerations [rad/s^2].
+    v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2].
     """
     ahead = 2.0 * left * piece
     u1, u2 = v1 + ahead * a1, v2 + ahead * a2
@@ -149,7 +164,7 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
 def step_on(
     p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, h: float
 ) -> tuple[float, float, float, float, float, float]:
-    """Angles, velocities and mean accelerations after one step of `h` [s] under the motor torques t1 and t2 [N m]."""
+    """Return angles, velocities and mean accelerations after a step of `h` [s] with motor torques t1 and t2 [N m]."""
     m22 = p[2] + p[3]
     m11, m12, f1, f2, slope_1, slope_2 = _forces(p, q1, q2, v1, v2, t1, t2)
     # Stage 1: (M + gamma h S) k = f, with S the slopes of friction.
@@ -160,7 +175,7 @@ def step_on(
     k2 = (w11 * f2 - m12 * f1) / w
     u1 = v1 + h * k1
     u2 = v2 + h * k2
-    # Stage 2: (M + gamma h S) l = M (M'^-1 f' - 2 k), with M' and f' at the end that stage 1 foresees.
+    # Stage 2: (M + gamma h S) l = M (M'^-1 f' - 2 k), with M' and f' at the end predicted by stage 1.
     n11, n12, f1, f2, _, _ = _forces(p, q1 + h * v1, q2 + h * v2, u1, u2, t1, t2)
     n = n11 * m22 - n12 * n12
     r1 = (m22 * f1 - n12 * f2) / n - 2.0 * k1
@@ -187,7 +202,7 @@ def step_bent(
     t2: float,
     h: float,
 ) -> tuple[float, float, float, float, float, float]:
-    """`step_on` between the two halves of the bristles' step; a1 and a2 are the last accelerations [rad/s^2]."""
+    """Apply `step_on` between the two halves of the bristles' step; a1 and a2 are the last accelerations [rad/s^2]."""
     half = 0.5 * h
     if bristly:
         bend(p, b, m, v1, v2, v1 + half * a1, v2 + half * a2, t1, t2, half)
@@ -215,8 +230,8 @@ def _loop(p: Any, bristly: bool, m: Any, state: Any, torque: Any, step: float, p
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
 
 
-# What is only called from compiled code needs no wrappers, which take a second to compile. It is inlined: a call
-# counts references to its arrays, which takes longer than a step's arithmetic.
+# Functions called only from compiled code need no wrappers, which take a second to compile. They are inlined because
+# the reference counting for their arrays would take longer than the arithmetic of a step.
 bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
     inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
 )

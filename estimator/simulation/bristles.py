@@ -1,17 +1,18 @@
-"""Presliding friction: bristles between the surfaces, which bend, and slip when bent far enough.
+"""Presliding friction: bristles between the surfaces that deflect, and slip when deflected far enough.
 
     friction = b + damping (1 - b / +-level(v)) v        b' = stiffness v (1 - b / +-level(v))
 
 with the sign of the velocity v and the level of `hil.estimator.simulation.arm`: C. Canudas de Wit, H. Olsson, K. J.
 Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic Control 40
-(1995) 419, its b being the bristles' torque here. Viscous friction is added as usual.
+(1995) 419. Here b is the bristles' torque. Viscous friction is added as usual.
 
-A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506): the bristles bend for half of it
-at the velocity where it starts, exactly; the arm moves with their torque, which then is one more offset, and their
-damping, one more viscous friction; and they bend for the other half at the velocity where it ends. The arm's own step
-is that of every other friction law. The level is taken at the velocity in the middle of the step, in the first half as
-the last step's acceleration foresees it: bristles that slip are the level and nothing else, and would be half a step
-late. Against a hundred steps per sample, three at 400 Hz are within 0.03 encoder steps RMS for 5 to 1000 N m/rad.
+A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506). The bristles deflect for the first
+half at the velocity at its start, exactly; the arm moves with their torque as an additional offset and their damping as
+additional viscous friction; and they deflect for the second half at the velocity at its end. The arm's own step is the
+same as for every other friction law. The level is evaluated at the velocity in the middle of the step, which for the
+first half is predicted with the last step's acceleration: once the bristles slip, friction equals the level, which
+would otherwise be half a step late. Compared with a hundred steps per sample, three at 400 Hz are accurate to 0.03
+encoder steps RMS for 5 to 1000 N m/rad.
 """
 
 import math
@@ -23,25 +24,25 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import SLIDING, Physics, place_of
 
-# Of joint 1 in `Physics.vector`; joint 2 follows.
-VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING, SATURATION = map(
+# Indices of joint 1's constants in `Physics.vector`; joint 2's follow.
+VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING, SATURATION, GENERATED = map(
     place_of,
     (
         *("viscous", "coulomb", "offset", "stribeck_rise", "stribeck_velocity", "load", "torque_scale"),
-        *("presliding_stiffness", "presliding_damping", "saturation"),
+        *("presliding_stiffness", "presliding_damping", "saturation", "back_emf"),
     ),
 )
 
 
 def has_bristles(physics: Physics) -> bool:
-    """Whether dry friction yields before it slides, at one joint at least."""
+    """Return whether dry friction of at least one joint yields before the joint slides."""
     return bool(np.any(physics.vector[STIFFNESS : STIFFNESS + 2] > 0.0))
 
 
 def first_bend(physics: Physics, velocity: Array) -> Array:
-    """The bristles' torque (joints,) [N m] where a simulation starts: as they are bent once a joint slides.
+    """Return the bristles' torque (joints,) [N m] at the start of a simulation, as for sliding joints.
 
-    `velocity` (joints,) [rad/s]. For a joint that hardly moves their bend is unknown and taken as small.
+    `velocity` (joints,) [rad/s]. For a joint that hardly moves, the deflection is unknown and assumed to be small.
     """
     joints = velocity.size
     p = physics.vector
@@ -53,17 +54,18 @@ def first_bend(physics: Physics, velocity: Array) -> Array:
 
 # Compiled code takes its arguments by position; p is `Physics.vector`, joint is 0 or 1.
 def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1: float, t2: float, time: float) -> None:
-    """Bend the bristles b (2,) [N m] for `time` [s] at the velocities v1 and v2 under the motor torques t1 and t2.
+    """Deflect the bristles for `time` [s] at the velocities v1 and v2 under the motor torques t1 and t2.
 
-    u1 and u2 are the velocities in the middle of the arm's step, where the level is taken: it is the whole of friction
-    once the bristles slip. Puts into the constants `m` what the arm then feels of them.
+    b: torque of the bristles (2,) [N m], updated in place. u1 and u2 are the velocities in the middle of the arm's
+    step, at which the level is evaluated, since it is the whole friction once the bristles slip. Their effect on the
+    arm is written into the constants `m`.
     """
     for joint in range(2):
         stiffness = p[STIFFNESS + joint]
         if stiffness > 0.0:
             v, u, t = (v1, u1, t1) if joint == 0 else (v2, u2, t2)
             rise = p[RISE + joint] * math.exp(-((u / p[FADING + joint]) ** 2))
-            t *= p[SCALE + joint]
+            t = t * p[SCALE + joint] - p[GENERATED + joint] * u
             given = t - p[SATURATION + joint] * t * t * t
             level = p[COULOMB + joint] * (1.0 + rise) + p[LOAD + joint] * abs(given)
             end = math.copysign(level, v)
@@ -73,7 +75,7 @@ def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1:
 
 
 def without_dry_friction(vector: Array) -> Array:
-    """The constants of an arm whose dry friction is all in its bristles, for `bend` to fill in."""
+    """Return the constants of an arm with all dry friction in its bristles, to be completed by `bend`."""
     left = vector.copy()
     for joint in range(2):
         if vector[STIFFNESS + joint] > 0.0:

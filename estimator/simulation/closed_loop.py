@@ -1,9 +1,8 @@
-"""The arm's motion under commands that depend on its motion: a spring and damper in software, a brake.
+"""The arm's motion under commands that depend on its state: a software spring and damper, a brake.
 
-The equations and the integration step are those of `hil.estimator.simulation.arm`, torque scale and all. A command
-is computed once per sample from the state at the previous sample, as on the bus, clipped, and held;
-the motor follows it with a first-order lag. A pure delay of the drive is taken as more of that lag, which is the same
-to first order.
+The equations and the integration step are those of `hil.estimator.simulation.arm`, including the torque scale. A
+command is computed once per sample from the state at the previous sample, as on the bus, limited, and held; the motor
+follows it with a first-order lag. A pure delay of the drive is added to that lag, which is equivalent to first order.
 """
 
 import math
@@ -25,9 +24,9 @@ SETTLING_PERIODS = 4
 
 @dataclass(frozen=True)
 class Feedback:
-    """torque = command + stiffness (pose - position) - damping velocity, of the former sample, within +-limit.
+    """Feedback: torque = command + stiffness (pose - position) - damping velocity, within +-limit.
 
-    All (joints,) [N m/rad, N m s/rad, rad, N m].
+    It uses the state at the previous sample. All arrays are (joints,) [N m/rad, N m s/rad, rad, N m].
     """
 
     stiffness: Array
@@ -37,7 +36,7 @@ class Feedback:
 
     @classmethod
     def none(cls, joints: int) -> "Feedback":
-        """Commands as they are."""
+        """Return feedback that leaves commands unchanged."""
         nothing = np.zeros(joints)
         return cls(nothing, nothing, nothing, np.full(joints, np.inf))
 
@@ -47,22 +46,25 @@ class Response:
     """A simulated motion."""
 
     position: Array
-    """At the samples (joints, samples) [rad]."""
+    """Angles at the samples (joints, samples) [rad]."""
     velocity: Array
-    """(joints, samples) [rad/s]."""
+    """Velocities at the samples (joints, samples) [rad/s]."""
     torque: Array
-    """Commanded, feedback included (joints, samples) [N m]."""
+    """Commanded torque including feedback (joints, samples) [N m]."""
     state: Array
-    """After the last sample: angles, velocities, motor torques, then angles and velocities at the last sample, and the
-    torque of friction's bristles (6, joints) [rad, rad/s, N m, rad, rad/s, N m]; what `respond` takes to go on."""
+    """State after the last sample (6, joints), from which `respond` can continue.
+
+    The rows are angles [rad], velocities [rad/s], motor torques [N m], angles [rad] and velocities [rad/s] at the last
+    sample, and the torque of the bristles [N m].
+    """
 
 
 @dataclass(frozen=True)
 class Stabilised:
-    """A period during which `feedback` gave part of the torque.
+    """A period in which `feedback` applied part of the torque.
 
-    In the simulation the feedback acts on the simulated arm, as it did on the real one: the arm's instability is no
-    longer the simulation's, and where model and arm agree the torque is the one that was really commanded.
+    In the simulation the feedback acts on the simulated arm, as it did on the real one, so an arm that is unstable on
+    its own can be simulated; where model and arm agree, the torque is the one that was actually commanded.
     """
 
     feedback: Feedback
@@ -71,15 +73,18 @@ class Stabilised:
     former: Array
     """Angles and velocities at the sample before the first (2, joints) [rad, rad/s]."""
     former_torque: Array
-    """Commanded before the first command (joints,) [N m]."""
+    """Torque commanded before the first command (joints,) [N m]."""
 
     def positions(self, physics: Physics, start: Array, rate: float, command_to_sample: float) -> Array:
-        """Simulated angles (joints, samples) [rad] from `start` (2, joints) at the first sample."""
+        """Return the simulated angles (joints, samples) [rad] from the initial state `start` (2, joints)."""
         state = np.concatenate((start, self.former_torque[None], self.former))
         return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
 
     def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
-        """What encoders read when nothing of the motion is known: from rest in `pose`, after some periods."""
+        """Return the encoder readings (joints, samples) [rad] predicted without measurements, from rest in `pose`.
+
+        The last of SETTLING_PERIODS simulated periods is returned.
+        """
         state = resting(pose)
         for _ in range(SETTLING_PERIODS):
             response = respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback)
@@ -88,27 +93,27 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Commands take effect `command_to_sample` [s] before the sample of the same index: so much less lag."""
+    """Return the physics with the lag reduced by `command_to_sample` [s], as commands take effect that much earlier."""
     return replace(physics, lag=max(physics.lag - command_to_sample, 1e-5))
 
 
 def resting(pose: Array) -> Array:
-    """The state of an arm at rest in `pose` (joints,) [rad], as `respond` takes it."""
+    """Return the state of an arm at rest in `pose` (joints,) [rad], as `respond` expects it."""
     nothing = np.zeros_like(pose)
     return np.stack((pose, nothing, nothing, pose, nothing, nothing))
 
 
 def respond(physics: Physics, state: Array, command: Array, rate: float, feedback: Feedback) -> Response:
-    """Simulate one sample for each of `command` (joints, samples) [N m], at `rate` [1/s], from `state`.
+    """Simulate the samples of `command` (joints, samples) [N m] at `rate` [1/s] from `state`.
 
-    Without its last row friction's bristles are bent as those of a sliding joint.
+    `state` is as in `Response.state`; without its last row, the bristles are deflected as in sliding joints.
     """
     joints, samples = command.shape
     steps = steps_per_sample(rate)
     step = 1.0 / (rate * steps)
     gains = np.zeros((4, 2))
     gains[:, :joints] = feedback.stiffness, feedback.damping, feedback.pose, feedback.limit
-    # A pendulum is a two-joint arm whose second joint has no torque and moves nothing.
+    # A one-joint arm is simulated as a two-joint arm whose second joint has no torque and moves nothing.
     both = np.zeros((2, samples))
     both[:joints] = command
     full = np.zeros((6, 2))
@@ -161,7 +166,7 @@ def _loop(
         torque[0, k] = c1
         torque[1, k] = c2
         for _ in range(steps):
-            # The motor's mean torque over the step, exactly, while the command holds.
+            # Exact mean of the motor's torque over the step, under a constant command.
             m1 = c1 + (t1 - c1) * share
             m2 = c2 + (t2 - c2) * share
             t1 += (c1 - t1) * fallen

@@ -1,6 +1,6 @@
-"""From commanded to motor torque: held, delayed, averaged over each integration step.
+"""Motor torque from the commanded torque: held, delayed, and averaged over each integration step.
 
-Compiled, since the likelihood asks for it with every simulation, beside which numpy takes a third of the time.
+It is compiled because the likelihood needs it for every simulation, of which it would take a third with numpy.
 """
 
 import math
@@ -16,12 +16,17 @@ from hil.estimator.arrays import Array
 def motor_torque(
     command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float | Array
 ) -> Array:
-    """Mean motor torque over each of `steps` equal steps after each sample (joints, samples, steps) [N m].
+    """Return the mean motor torque over each of `steps` equal steps after each sample (joints, samples, steps) [N m].
 
-    `command` (joints, samples) [N m] is periodic, each value held until the next; sample k is taken
-    `command_to_sample` [s] after command k takes effect. The torque follows `delay` [s] later through a
-    first-order lag [s], one for all joints or each its own. The means are exact, of a step in which the command
-    changes too.
+    The means are exact, even for a step in which the command changes.
+
+    Args:
+        command: periodic command (joints, samples) [N m], each value held until the next.
+        rate: sampling rate [1/s].
+        command_to_sample: time from command k's effect to sample k [s].
+        steps: integration steps per sample.
+        delay: delay of the torque [s].
+        lag: time constant of a subsequent first-order lag [s], one value or one per joint.
     """
     return _torque(command, rate, command_to_sample, steps, delay, lag)[0]
 
@@ -29,9 +34,9 @@ def motor_torque(
 def torque_and_slopes(
     command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float | Array
 ) -> tuple[Array, Array]:
-    """`motor_torque`, and its derivatives by delay and by each joint's own lag (2, joints, samples, steps) [N m/s].
+    """Return `motor_torque` and its derivatives by delay and by each joint's lag (2, joints, samples, steps) [N m/s].
 
-    Where a command changes at the very edge of a step and no lag softens it, the derivative by delay is that of less.
+    If a command changes exactly at the edge of a step and there is no lag, the derivative is that for a smaller delay.
     """
     torque, late, change = _torque(command, rate, command_to_sample, steps, delay, lag)
     return torque, np.stack((late, change))
@@ -40,7 +45,7 @@ def torque_and_slopes(
 def _torque(
     command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float | Array
 ) -> tuple[Array, Array, Array]:
-    """The mean torque over each step, and its derivatives by delay and lag."""
+    """Return the mean torque over each step, and its derivatives by delay and lag."""
     joints, samples = command.shape
     total = np.zeros((joints, samples + 1))
     np.cumsum(command, axis=1, out=total[:, 1:])
@@ -66,8 +71,8 @@ def _torque(
     return torque, late, change
 
 
-# Compiled code takes its arguments by position. Edge i of each sample's steps is `phases[i]` [s] after the command
-# `shifts[i]` commands later, by when `fading[j, i]` of what the lag held back then is left.
+# Compiled code takes its arguments by position. Edge i of each sample's steps lies `phases[i]` [s] after the command
+# that is `shifts[i]` commands later; `fading[j, i]` is the fraction of the lag's deviation that remains by then.
 def _average_loop(
     command: Any,
     total: Any,
@@ -97,10 +102,10 @@ def _average_loop(
                 gathered = (turns * total[j, samples] + total[j, at]) / rate + held * phases[i]
                 left = (lagging[0, at] - held) * fading[j, i]
                 present = held + left
-                # Without a lag the torque changes by lag times the command's steps, which has no derivative here.
+                # Without a lag, the torque jumps with the command and has no derivative by the lag here.
                 by_lag = left * phases[i] / (lag * lag) + lagging[1, at] * fading[j, i] if lag > 0.0 else 0.0
                 if i > 0:
-                    # lag y' = u - y, integrated over a step: the mean of y is that of u less what the lag has stored.
+                    # lag y' = u - y, integrated over a step: the mean of y is that of u minus what the lag stores.
                     stored = (present - present_before) * per_time
                     torque[j, k, i - 1] = (gathered - gathered_before) * per_time - lag * stored
                     late[j, k, i - 1] = -stored
@@ -109,10 +114,10 @@ def _average_loop(
 
 
 def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None:
-    """The lagging torque at the instants of joint j's commands, in its periodic steady state, and its derivative by the
-    lag, into `lagging` (2, samples).
+    """Compute joint j's periodic steady-state lagging torque at the commands, and its derivative by the lag.
 
-    It obeys y[k + 1] = a y[k] + (1 - a) u[k]. What it comes to from rest in one period tells the steady state.
+    The result is written to `lagging` (2, samples). The torque obeys y[k + 1] = a y[k] + (1 - a) u[k]; the steady state
+    follows from its value after one period starting from zero.
     """
     samples = command.shape[1]
     a = math.exp(-1.0 / (rate * lag)) if lag > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""Encoder errors: errors that repeat once and twice a turn, and their derivatives."""
+"""Periodic encoder errors, once and twice per turn, and their derivatives."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from hil.estimator.models.terms import joint_of, kind_of
 
 
 def measured(physics: Physics, position: Array) -> Array:
-    """What encoders read of joints at `position` (joints, samples), both [rad]."""
+    """Return the encoder readings for joints at `position` (joints, samples), both in [rad]."""
     if not physics.encoder.any():
         return position
     joints = position.shape[0]
@@ -17,19 +17,20 @@ def measured(physics: Physics, position: Array) -> Array:
 
 
 def by_motion(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Those of the parameters `names` on which the motion itself depends."""
+    """Return those of the parameters `names` on which the motion itself depends."""
     return tuple(name for name in names if kind_of(name) not in ENCODER)
 
 
 def measured_and_slopes(
     physics: Physics, names: tuple[str, ...], position: Array, derivative: Array
 ) -> tuple[Array, Array]:
-    """What encoders read (joints, samples) [rad], and its derivatives by `names` and then the rest.
+    """Return the encoder readings (joints, samples) [rad] and their derivatives by `names`, then by the initial state.
 
-    `derivative` (joints, samples, causes) is that of the true angles by `by_motion(names)` and then the rest.
+    position: true angles (joints, samples) [rad]. derivative: derivatives of the true angles (joints, samples, causes)
+    by `by_motion(names)`, then by the initial state.
     """
     wanted = [name for name in names if kind_of(name) in ENCODER]
-    if not wanted:
+    if not wanted and not physics.encoder.any():
         return position, derivative
     joints = position.shape[0]
     waves = _waves(position)
@@ -47,5 +48,5 @@ def measured_and_slopes(
 
 
 def _waves(position: Array) -> Array:
-    """In the order of ENCODER (joints, samples, terms)."""
+    """Return the error waves in the order of ENCODER (joints, samples, terms)."""
     return np.stack((np.sin(position), np.cos(position), np.sin(2.0 * position), np.cos(2.0 * position)), axis=2)

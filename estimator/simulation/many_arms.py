@@ -1,7 +1,7 @@
-"""Many arms under the same commands, in one call of compiled code, as a dry run needs.
+"""Simulation of many arms under the same commands in one call of compiled code, as needed by a dry run.
 
-Equations, integration and feedback are those of `hil.estimator.simulation.closed_loop`, in longer steps: peaks are
-off by a few milliradians at most, for a tenth of the time.
+Equations, integration and feedback are those of `hil.estimator.simulation.closed_loop` with longer steps: peaks are
+accurate to a few milliradians, in a tenth of the time.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,14 +19,14 @@ from hil.estimator.simulation.arm import finer_pieces, steps_per_sample
 from hil.estimator.simulation.bristles import has_bristles, without_dry_friction
 from hil.estimator.simulation.closed_loop import Feedback, respond_compiled
 
-ROUGH_STEP, ROUGH_PIECES = 2.6e-3, 4  # s; pieces of a step near standstill
+ROUGH_STEP, ROUGH_PIECES = 2.6e-3, 4  # s; substeps near standstill
 LOWEST, HIGHEST, VELOCITY, TORQUE, POWER = range(5)
-"""Rows of the peaks."""
+"""Rows of the peak values."""
 
 
 @dataclass(frozen=True)
 class Commands:
-    """Torques of one multisine as commanded, without feedback (joints, samples) [N m]."""
+    """Commanded torques of one multisine, without feedback (joints, samples) [N m]."""
 
     ramp_in: Array
     period: Array
@@ -34,9 +34,13 @@ class Commands:
 
 
 @dataclass(frozen=True)
-class Settling:
-    """Stopping rule of a stream's periods: until two differ by at most `within` of the motion's RMS, for at
-    most `most_periods` more than the first; then `periods` settled ones in all are played."""
+class SettlingRule:
+    """Rule for how many periods are played.
+
+    within: two successive periods that differ by at most this fraction of the motion's RMS count as settled.
+    most_periods: maximum number of periods after the first until that is the case.
+    periods: total number of settled periods that are then played.
+    """
 
     within: float
     most_periods: int
@@ -45,10 +49,11 @@ class Settling:
 
 @dataclass(frozen=True)
 class ManyArms:
-    """Arms and the effect of the commands on each.
+    """Several arms and their feedback.
 
-    scale: ratio of true to assumed torque of each command (arms, joints). pose: where each starts, at rest (arms,
-    joints) [rad]. feedback: in terms of assumed torques.
+    scale: ratio of true to assumed torque of each command (arms, joints).
+    pose: initial pose of each arm, at rest (arms, joints) [rad].
+    feedback: in terms of assumed torques.
     """
 
     physics: Sequence[Physics]
@@ -60,12 +65,18 @@ class ManyArms:
     def joints(self) -> int:
         return int(self.scale.shape[1])
 
+    def part(self, first: int, last: int) -> "ManyArms":
+        """The arms from number `first` up to, not including, `last`."""
+        return ManyArms(self.physics[first:last], self.scale[first:last], self.pose[first:last], self.feedback)
+
     def peaks(
-        self, multisines: Sequence[Commands], rate: float, settling: Settling
+        self, multisines: Sequence[Commands], rate: float, settling: SettlingRule
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Extreme values of every arm (arms, 5, joints): lowest and highest angle [rad], speed [rad/s], supposed torque
-        [N m], supposed torque times speed [W]; and after how many periods of the first multisine it was settled, 0
-        where it never was, which ends its experiment.
+        """Return the extreme values of every arm, and when it settled.
+
+        The values (arms, 5, joints) are lowest and highest angle [rad], speed [rad/s], assumed torque [N m], and
+        assumed torque times speed [W]. The second array (arms,) is the number of periods of the first multisine until
+        the arm was settled, 0 if it never was, which ends its experiment.
         """
         count = len(self.physics)
         values, settled = np.empty((count, 5, 2)), np.zeros(count, dtype=np.int64)
@@ -79,7 +90,7 @@ class ManyArms:
         return values[:, :, : self.joints], settled
 
     def positions(self, command: Array, rate: float, every: int = 1) -> Array:
-        """Angles (arms, joints, kept) [rad] under `command` (joints, samples) [N m], every so many samples."""
+        """Return the angles (arms, joints, kept) [rad] at every `every`-th sample; command: (joints, samples) [N m]."""
         both = _two(command)
         kept = np.empty((len(self.physics), 2, -(-both.shape[1] // every)))
         _positions(*self._arguments(rate), both, every, kept)
@@ -104,7 +115,7 @@ class ManyArms:
 
 
 def _two(torque: Array) -> Array:
-    """A pendulum is a two-joint arm whose second joint has no torque and moves nothing."""
+    """Extend torques to two joints: a one-joint arm has a second joint without torque that moves nothing."""
     both = np.zeros((2, torque.shape[1]))
     both[: len(torque)] = torque
     return both
@@ -125,7 +136,7 @@ def _resting(pose: Any) -> Any:
 
 @_inner
 def _felt(gains: Any, scale: Any) -> Any:
-    """The feedback of an arm whose torques are `scale` times as large as supposed."""
+    """Return the feedback as applied to an arm whose torques are `scale` times the assumed ones."""
     felt = gains.copy()
     for joint in range(2):
         for row in (0, 1, 3):
@@ -147,7 +158,7 @@ def _raise(values: Any, position: Any, velocity: Any, torque: Any, scale: Any) -
     for joint in range(2):
         for k in range(position.shape[1]):
             q, v, t = position[joint, k], abs(velocity[joint, k]), abs(torque[joint, k]) / scale[joint]
-            # A motion that is no number has passed every limit.
+            # A motion that is not finite has exceeded every limit.
             if not (abs(q) < 1e6 and v < 1e6):
                 values[0, joint], values[1, joint], values[2, joint] = -1e6, 1e6, 1e6
                 return
@@ -160,7 +171,7 @@ def _raise(values: Any, position: Any, velocity: Any, torque: Any, scale: Any) -
 
 @_inner
 def _difference(former: Any, latest: Any) -> float:
-    """RMS difference between the later halves of two periods, relative to the motion's RMS, worst joint."""
+    """Return the RMS difference of the second halves of two periods, relative to the motion's RMS, worst joint."""
     samples = former.shape[1]
     half = samples // 2
     count = samples - half

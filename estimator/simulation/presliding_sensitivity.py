@@ -1,7 +1,8 @@
-"""Forward sensitivities of an arm whose dry friction yields before it slides: those of the bristles, put between.
+"""Forward sensitivities of an arm with presliding friction.
 
-`hil.estimator.simulation.bristles` splits a step; here the derivatives of what it does are carried along with those of
-the arm's own step, in which the bristles' torque is one more offset and their damping one more viscous friction.
+`hil.estimator.simulation.bristles` splits a step. Here the derivatives of its parts are propagated together with those
+of the arm's own step, in which the bristles' torque is an additional offset and their damping additional viscous
+friction.
 """
 
 import math
@@ -19,6 +20,7 @@ from hil.estimator.simulation.bristles import (
     COULOMB,
     DAMPING,
     FADING,
+    GENERATED,
     LOAD,
     OFFSET,
     RISE,
@@ -47,12 +49,12 @@ from hil.estimator.simulation.sensitivity import (
 
 
 def sensitive(physics: Physics) -> "type[Sensitive]":
-    """The simulation with derivatives that fits these physics."""
+    """Return the class that simulates these physics with derivatives."""
     return PreslidingSensitive if has_bristles(physics) else Sensitive
 
 
 class PreslidingSensitive(Sensitive):
-    """`Sensitive` of an arm with bristles, which start bent as those of a sliding joint."""
+    """A simulation with derivatives for presliding friction, starting with bristles deflected as in sliding joints."""
 
     def __init__(
         self,
@@ -65,7 +67,7 @@ class PreslidingSensitive(Sensitive):
     ) -> None:
         super().__init__(physics, start, causes, step, max_substeps, tracking_stiffness)
         *room, at = self._room
-        # Dry friction is the bristles' here: within the arm's step its derivatives go nowhere.
+        # Dry friction is modelled by the bristles: within the arm's step its derivatives are discarded.
         within = at.copy()
         for joint in range(2):
             if physics.vector[STIFFNESS + joint] > 0.0:
@@ -82,7 +84,7 @@ class PreslidingSensitive(Sensitive):
 
 
 def _first_slopes(p: Array, velocity: Array, at: npt.NDArray[np.int64]) -> Array:
-    """Derivatives of `first_bend` (2, WIDE), by the causes in the columns `at`."""
+    """Return the derivatives of `first_bend` (2, WIDE) by the causes in the columns `at`."""
     slopes = np.zeros((2, WIDE))
     for joint in np.flatnonzero(p[STIFFNESS : STIFFNESS + 2] > 0.0):
         coulomb, rise, fading, v = p[COULOMB + joint], p[RISE + joint], p[FADING + joint], velocity[joint]
@@ -98,13 +100,13 @@ def _first_slopes(p: Array, velocity: Array, at: npt.NDArray[np.int64]) -> Array
     return slopes
 
 
-# Compiled code takes its arguments by position; see `hil.estimator.simulation.sensitivity`. `bristles` is
+# Compiled code takes its arguments by position; see `hil.estimator.simulation.sensitivity`. `bristles` consists of
 #   at             the column of each cause
-#   D              derivatives of the bristles' torque (joints, WIDE), flat as the rest
-#   level_by       those of the level at a given velocity
-#   give_by        those of what the bristles add to viscous friction
-#   faster_by      those of the last step's accelerations
-#   began          velocities with which the arm's step began (joints,)
+#   D              derivatives of the bristles' torque (joints, WIDE), flattened like the others
+#   level_by       derivatives of the level at a given velocity
+#   give_by        derivatives of the bristles' contribution to viscous friction
+#   faster_by      derivatives of the last step's accelerations
+#   began          velocities at the start of the arm's step (joints,)
 #   faster         accelerations of the last step (joints,)
 def _bend(
     p: Any,
@@ -120,7 +122,7 @@ def _bend(
     Z: Any,
     count: int,
 ) -> None:
-    """`hil.estimator.simulation.bristles.bend` and its derivatives; the middle of the step is `ahead` [s] of now."""
+    """Apply `hil.estimator.simulation.bristles.bend` and its derivatives; the step's middle is `ahead` [s] from now."""
     at, D, level_by, give_by, faster_by, began, faster = bristles
     for joint in range(2):
         stiffness = p[STIFFNESS + joint]
@@ -128,14 +130,15 @@ def _bend(
             v, commanded = x[1, joint], t1 if joint == 0 else t2
             coulomb, rise, fading, load = p[COULOMB + joint], p[RISE + joint], p[FADING + joint], p[LOAD + joint]
             scale, damping = p[SCALE + joint], p[DAMPING + joint]
-            t = scale * commanded
+            u = v + ahead * faster[joint]
+            per_speed = p[GENERATED + joint]
+            t = scale * commanded - per_speed * u
             cube, eased = t * t * t, 1.0 - 3.0 * p[SATURATION + joint] * t * t
             t -= p[SATURATION + joint] * cube
             loaded = load if t > 0.0 else -load
-            u = v + ahead * faster[joint]
             bump = math.exp(-((u / fading) ** 2))
             level = coulomb * (1.0 + rise * bump) + load * abs(t)
-            level_u = -2.0 * coulomb * rise * bump * u / fading**2
+            level_u = -2.0 * coulomb * rise * bump * u / fading**2 - loaded * eased * per_speed
             way = math.copysign(1.0, v)
             turns = stiffness * abs(v) * time / level
             left = math.exp(-turns)
@@ -149,6 +152,7 @@ def _bend(
             level_by[r + at[LOAD + joint]] = abs(t)
             level_by[r + at[SCALE + joint]] = loaded * commanded * eased
             level_by[r + at[SATURATION + joint]] = -loaded * cube
+            level_by[r + at[GENERATED + joint]] = -loaded * eased * u
             for cause in range(2):
                 level_by[r + at[DELAY + cause]] = loaded * scale * eased * dt[cause, joint]
             if joint == 1:
@@ -168,7 +172,7 @@ def _bend(
 
 
 def _clear(rows: Any, now: int) -> None:
-    """What the arm's step will write of friction's rows; the bristles have written all of them before."""
+    """Clear the friction rows that the arm's step will write; the bristles have written to all of them before."""
     for stage in range(2):
         first = (2 * now + stage) * STAGE
         for i in range(4 * WIDE):
@@ -176,7 +180,7 @@ def _clear(rows: Any, now: int) -> None:
 
 
 def _press(rows: Any, here: Any, bristles: Any, now: int, count: int) -> None:
-    """Add to the rows of the step at `now` what the bristles' torque and damping change in it."""
+    """Add the effect of the bristles' torque and damping to the rows of the step at `now`."""
     _, D, _, give_by, _, began, _ = bristles
     for stage in range(2):
         for joint in range(2):
@@ -188,7 +192,7 @@ def _press(rows: Any, here: Any, bristles: Any, now: int, count: int) -> None:
 
 
 def _accelerate(bristles: Any, Z: Any, kept: float, share: float, count: int) -> None:
-    """Derivatives of the accelerations: those that were, `kept` times, and those of the velocities, `share` times."""
+    """Update the accelerations' derivatives: `kept` times the previous ones plus `share` times the velocities'."""
     faster_by = bristles[4]
     for joint in range(2):
         r, z = joint * WIDE, (2 + joint) * WIDE
@@ -238,7 +242,7 @@ def _loop(
                 _accelerate(bristles, Z, 0.0, -1.0 / h, count)
                 faster[0], faster[1] = arm_step(m, x, t1, t2, h, now, room)
                 _press(rows, here, bristles, now, count)
-                # At once: the bristles' other half needs what this step does to the velocities.
+                # Immediately, since the bristles' second half needs the effect of this step on the velocities.
                 follow(rows, numbers, Z, now, count)
                 _accelerate(bristles, Z, 1.0, 1.0 / h, count)
                 _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, -0.5 * h, dt, Z, count)

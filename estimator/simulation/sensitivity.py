@@ -1,18 +1,18 @@
 """Forward sensitivities: the simulated motion and its derivatives by parameters and initial state, in one pass.
 
-The derivative is that of the discrete scheme of `hil.estimator.simulation.arm` itself, step by step, so that it
-is the exact gradient of the objective. One step is, with W = M + gamma h S (M mass
-matrix, S slopes of friction) and primes where stage 1 foresees the end,
+The derivative is that of the discrete scheme of `hil.estimator.simulation.arm`, step by step, so it is the exact
+gradient of the objective. With W = M + gamma h S (M mass matrix, S slopes of friction) and primes for quantities at the
+end predicted by stage 1, a step is
 
     W k = f        M' a = f'        W l = M (a - 2 k)        v += h (3 k + l) / 2        q += h v + h^2 k / 2
 
-All that depends on a parameter enters through three gaps: of W k = f, of M' a = f' and of the third equation.
-A change of them by r, g, e moves the new velocity by A r + B g + C e; A, B and C are two-by-two and common to
-all parameters. So one more parameter costs a few dozen operations a step, not one more simulation.
+A parameter only enters through the residuals of W k = f, of M' a = f' and of the third equation. Changing them by r, g,
+e changes the new velocity by A r + B g + C e, where A, B and C are two-by-two matrices common to all parameters.
+Therefore one more parameter costs a few dozen operations per step instead of one more simulation.
 
-A processor does those for several parameters at once, if its compiler knows that no row of their derivatives overlaps
-another: rows lie WIDE apart in arrays of one dimension. They are done one step behind the rest, since what was just
-written value by value cannot be read several at once without a wait.
+A processor handles several parameters at once if its compiler knows that no rows of derivatives overlap: rows are WIDE
+apart in one-dimensional arrays. They are processed one step behind the rest, since values that were just written one by
+one cannot be read several at a time without a stall.
 """
 
 import math
@@ -34,6 +34,7 @@ from hil.estimator.simulation.arm import (
     CYCLES,
     FADING,
     GAMMA,
+    GENERATED,
     LOAD,
     MAX_SUBSTEPS,
     OFFSET,
@@ -50,31 +51,33 @@ from hil.estimator.simulation.arm import (
     pieces_now,
 )
 
-# What can be differentiated by: the constants, the drive's times, the state at the first sample.
+# Quantities by which one can differentiate: the constants, the drive's times, the state at the first sample.
 CAUSES = (*CONSTANTS, "delay", "lag", "lag_difference_2", "position_1", "position_2", "velocity_1", "velocity_2")
 DELAY, LAG_DIFFERENCE, STATE = len(CONSTANTS), len(CONSTANTS) + 2, len(CONSTANTS) + 3
 COUPLING, GRAVITY_1, GRAVITY_2 = map(CONSTANTS.index, ("coupling", "gravity_1", "gravity_2"))
 ZERO_1, ZERO_2 = ZERO, ZERO + 1
 
-AT_ONCE = 8  # causes that a processor may take at once: they are filled up to that, so that none is left over
-NOWHERE = AT_ONCE * math.ceil(len(CAUSES) / AT_ONCE)  # the column of what nobody asked for
+AT_ONCE = 8  # causes that a processor may handle at once; their number is padded to a multiple of this
+NOWHERE = AT_ONCE * math.ceil(len(CAUSES) / AT_ONCE)  # column for unwanted derivatives
 WIDE = NOWHERE + AT_ONCE
 # Rows of each step by causes: f1, f2, slope_1, slope_2, m11, m12, m22 of stage 1, then of stage 2.
 STAGE = 7 * WIDE
 SLOPES, MASSES = 2 * WIDE, 4 * WIDE  # from the stage's first row
-# Numbers of each step. By the state, of either stage: f1 and f2 by q1, q2, v1, v2; slope_1 by q1, v1; slope_2 by q2,
-# v2; m11 and m12 by q2. Then those of all parameters, see `arm_step`.
+# Scalars of each step. For each stage, derivatives by the state: f1 and f2 by q1, q2, v1, v2; slope_1 by q1, v1;
+# slope_2 by q2, v2; m11 and m12 by q2. Then scalars common to all parameters, see `arm_step`.
 BY_STATE = 14
 NUMBERS = 2 * BY_STATE + 24
 
 
 class Sensitive:
-    """A simulation that advances piece by piece, so that long recordings need little memory.
+    """A simulation with derivatives that advances piece by piece, so that long recordings need little memory.
 
-    `start` (2, joints): angles [rad] and velocities [rad/s] at the first sample; `causes`: names of what to
-    differentiate by, from CAUSES; `step` [s]: length of one integration step, cut into at most
-    `max_substeps` where a joint is near standstill; `tracking_stiffness` (joints,) [N m/rad]: stiffness of
-    springs from the simulated joints to angles given beside the torque, which are not there in the arm.
+    physics: physical constants.
+    start: angles [rad] and velocities [rad/s] at the first sample (2, joints).
+    causes: names of the quantities by which to differentiate, from CAUSES.
+    step: length of an integration step [s].
+    max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.
+    tracking_stiffness: stiffness of additional springs that pull the joints to given angles (joints,) [N m/rad].
     """
 
     def __init__(
@@ -97,7 +100,7 @@ class Sensitive:
         self._places[[CAUSES.index(name) for name in causes]] = np.arange(len(causes))
         z = np.zeros((4, WIDE))
         z[np.arange(4), self._places[STATE:]] = 1.0
-        # Two steps' rows and numbers, of which one waits to be followed: before the first nothing changes.
+        # Rows and scalars of two steps, one of which waits to be processed by `follow`; initially nothing changes.
         rows = np.zeros((4, 7, WIDE))
         # The mass matrix, m11, m12 and m22, is linear in the inertias.
         for row, inertia in ((4, 0), (4, 2), (5, 2), (6, 2), (6, 3)):
@@ -109,12 +112,15 @@ class Sensitive:
         self._turn = np.zeros(1, dtype=np.int64)
 
     def advance(self, torque: Array, torque_slopes: Array, tracked: Array | None = None) -> tuple[Array, Array]:
-        """Advance by as many samples as `torque` has.
+        """Simulate as many samples as `torque` has.
 
-        `torque` (joints, samples, steps): mean motor torque over each step after each sample [N m];
-        `torque_slopes` (2, joints, samples, steps): its derivatives by delay and by each joint's lag [N m/s]; `tracked`
-        (joints, samples) [rad]: the springs' other ends, held from sample to sample. Returns the angles (joints,
-        samples) [rad] and their derivatives (joints, samples, causes).
+        Args:
+            torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
+            torque_slopes: its derivatives by delay and by each joint's lag (2, joints, samples, steps) [N m/s].
+            tracked: angles to which the springs pull, held between samples (joints, samples) [rad].
+
+        Returns:
+            The angles (joints, samples) [rad] and their derivatives (joints, samples, causes).
         """
         joints, samples, steps = torque.shape
         both = np.zeros((2, samples, steps))
@@ -135,24 +141,23 @@ class Sensitive:
         _advance(*given)
 
 
-# Compiled code takes its arguments by position; p is `Physics.vector`, joint and stage are 0 or 1, `now` is 0 or 1 too,
-# the place of the step's rows and numbers. `room` is
-#   rows, numbers  as above, flat
-#   here           angles and velocities that the stage looks at (2, joints)
-#   left, slope    torques left for acceleration and slopes of friction (stages, joints)
-#   dt             motor torques by delay and lag (causes, joints)
-#   spring         stiffness and other end of the springs (2, joints)
+# Compiled code takes its arguments by position; p is `Physics.vector`, joint and stage are 0 or 1, and `now` (0 or 1)
+# selects the step's rows and scalars. `room` consists of
+#   rows, numbers  rows and scalars as above, flattened
+#   here           angles and velocities at which the stage is evaluated (2, joints)
+#   left, slope    torques available for acceleration and slopes of friction (stages, joints)
+#   dt             derivatives of the motor torques by delay and lag (causes, joints)
+#   spring         stiffness and target angle of the springs (2, joints)
 #   at             the column of each cause
 def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:  # noqa: PLR0915 a call costs time
-    """Torque that a drive leaves its joint and the slope of its friction, as in the simulation, and what they change
-    with."""
+    """Compute the torque of a drive minus friction and the slope of friction, with all derivatives, into `room`."""
     rows, numbers, here, left, slope, dt, _, at = room
     q, v = here[0, joint], here[1, joint]
     viscous, coulomb, offset, width = p[VISCOUS + joint], p[COULOMB + joint], p[OFFSET + joint], p[WIDTH + joint]
     rise, fading, load, asymmetry = p[RISE + joint], p[FADING + joint], p[LOAD + joint], p[ASYMMETRY + joint]
     ripple_sin, ripple_cos, cycles = p[SINE + joint], p[COSINE + joint], p[CYCLES + joint]
-    commanded, scale = t, p[SCALE + joint]
-    t *= scale
+    commanded, scale, per_speed = t, p[SCALE + joint], p[GENERATED + joint]
+    t = scale * t - per_speed * v
     cube, eased = t * t * t, 1.0 - 3.0 * p[SATURATION + joint] * t * t
     t -= p[SATURATION + joint] * cube
     sine, cosine, shape = 0.0, 1.0, 1.0
@@ -179,7 +184,7 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     rows[s + at[WIDTH + joint]] = -level * (bent + 2.0 * bend * bend_w) * sharp
     rows[f + at[RISE + joint]], rows[s + at[RISE + joint]] = -coulomb * bump * bend, coulomb * bump * bent
     rows[f + at[FADING + joint]], rows[s + at[FADING + joint]] = -level_f * bend, level_f * bent
-    # Writing all this takes longer than working it out: what nobody asked for is left alone.
+    # Writing these values takes longer than computing them, so unwanted ones are skipped.
     if at[LOAD + joint] != NOWHERE:
         rows[f + at[LOAD + joint]], rows[s + at[LOAD + joint]] = -abs(motor) * bend, abs(motor) * bent
     if at[ASYMMETRY + joint] != NOWHERE:
@@ -194,28 +199,34 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     if at[SATURATION + joint] != NOWHERE:
         lost = -cube * shape
         rows[f + at[SATURATION + joint]], rows[s + at[SATURATION + joint]] = lost * passed, lost * loaded * bent
+    # By the torque before saturation and ripple, which back-EMF is a part of.
+    driven, driven_slope = eased * shape * passed, eased * shape * loaded * bent
+    if at[GENERATED + joint] != NOWHERE:
+        rows[f + at[GENERATED + joint]], rows[s + at[GENERATED + joint]] = v - v * driven, -v * driven_slope
     if at[CABLE + joint] != NOWHERE:
         rows[f + at[CABLE + joint]] = -q
     for cause in range(2):
         given = scale * eased * shape * dt[cause, joint]
         rows[f + at[DELAY + cause]], rows[s + at[DELAY + cause]] = given * passed, given * loaded * bent
     if joint == 1:
-        # The last was that by its own lag.
+        # `given` still holds the derivative by the joint's own lag.
         rows[f + at[LAG_DIFFERENCE]], rows[s + at[LAG_DIFFERENCE]] = given * passed, given * loaded * bent
     cable = p[CABLE + joint]
-    left[stage, joint] = motor - offset - cable * q - viscous * v - dry * bend
+    left[stage, joint] = motor - offset - cable * q - (viscous - per_speed) * v - dry * bend
     slope[stage, joint] = viscous + level * bent
     left_by = now * NUMBERS + stage * BY_STATE + 5 * joint
     slope_by = left_by + 8 - 3 * joint
     numbers[left_by] = cycles * turn * passed - cable
-    numbers[left_by + 2] = -viscous - dry * bent - (asymmetry + level_v) * bend
+    numbers[left_by + 2] = per_speed * (1.0 - driven) - viscous - dry * bent - (asymmetry + level_v) * bend
     numbers[slope_by] = cycles * turn * loaded * bent
-    numbers[slope_by + 1] = level_v * bent + level * bent_v
+    numbers[slope_by + 1] = level_v * bent + level * bent_v - per_speed * driven_slope
 
 
 def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple[float, float]:
-    """Mass matrix's first row under the motor torques t1 and t2; torques left and slopes of friction in `room`, and
-    what all of them change with."""
+    """Return the first row of the mass matrix; compute torques, slopes of friction and all derivatives into `room`.
+
+    t1, t2: motor torques [N m].
+    """
     rows, numbers, here, left, _, _, spring, at = room
     for joint in range(2):
         _drive(p, joint, stage, now, t1 if joint == 0 else t2, room)
@@ -252,7 +263,7 @@ def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple
 
 
 def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any) -> tuple[float, float]:
-    """One step of the state x (2, joints), its rows and numbers; the accelerations."""
+    """Advance the state x (2, joints) by one step, with its rows and scalars; return the accelerations."""
     _, numbers, here, left, slope, _, _, _ = room
     gh, half = GAMMA * h, 0.5 * h * h
     m22 = p[2] + p[3]
@@ -306,8 +317,8 @@ def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any
 
 
 def follow(rows: Any, numbers: Any, Z: Any, before: int, count: int) -> None:
-    """Propagate the state's derivatives Z through the step at `before`."""
-    # That this is 0 or 1 tells the compiler that no index is negative, which Python would count from the end.
+    """Propagate the state's derivatives Z through the previous step, whose rows and scalars are at index `before`."""
+    # This tells the compiler that `before` is 0 or 1, so that no index can be negative (counting from the end).
     before &= 1
     w, v = 2 * before * STAGE, before * NUMBERS
     e, n = v + BY_STATE, v + 2 * BY_STATE
@@ -325,7 +336,7 @@ def follow(rows: Any, numbers: Any, Z: Any, before: int, count: int) -> None:
         r2 = f2 - m12 * numbers[n] - m22 * numbers[n + 1] - s2 * numbers[n + 3]
         e1 = m11 * numbers[n + 4] + m12 * numbers[n + 5] - s1 * numbers[n + 6]
         e2 = m12 * numbers[n + 4] + m22 * numbers[n + 5] - s2 * numbers[n + 7]
-        # Stage 2 looks at angles that have moved by h v.
+        # Stage 2 is evaluated at angles that have moved by h v.
         y1, y2 = z1 + h * z3, z2 + h * z4
         m11 = rows[w + 11 * WIDE + i] + numbers[e + 12] * y2
         m12 = rows[w + 12 * WIDE + i] + numbers[e + 13] * y2
@@ -400,8 +411,8 @@ def _loop(
     turn[0] = now
 
 
-# Only the loop is called from Python; wrappers for the others would take a second more to compile. Calls that are not
-# inlined would spend more time counting references to arrays than on arithmetic.
+# Only the loop is called from Python; wrappers for the others would take another second to compile. Calls that are not
+# inlined would spend more time on counting references to arrays than on arithmetic.
 fused: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True,
     error_model="numpy",

@@ -1,1 +1,1 @@
-"""The half-duplex bus, its wires and its faults."""
+"""The half-duplex bus, its timing and its faults."""

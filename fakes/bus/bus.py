@@ -1,13 +1,13 @@
-"""A half-duplex serial bus with fake servos on it and a plant behind them, in the bus's own time.
+"""A half-duplex serial bus with fake servos and the plant they drive, on the bus's own clock.
 
-Bytes take wire time (ten bits each). A packet acts when its last byte arrives: the plant is advanced to that moment
-with the motor currents in force before, then the addressed servos act. Replies go onto the wire after the servo's
-return delay and reach the host `adapter_latency_us` later. Everything is worked out when the host writes, up to the
-last packet of that write, even where that lies ahead of the clock; between two packets only Bus Watchdogs, the servos'
-own loops and faults can act, and the plant's advance is split at the moment they do.
+Bytes take wire time (ten bits each). A packet takes effect when its last byte arrives: the plant is advanced to that
+moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
+reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
+computed, even where it lies ahead of the clock. Between two packets only Bus Watchdogs, the servos' own loops and
+faults can act, and the plant's advance is split at the moment they do.
 
-When two speak at once, host and servo or two servos, both are lost: the later packet, and the former's bytes from there
-on. Which servos act and answer is decided in `hil.fakes.bus.instructions`.
+When two transmit at once, host and servo or two servos, both are lost: the later packet, and the rest of the earlier
+one. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
 """
 
 import math
@@ -26,26 +26,28 @@ from hil.fakes.bus.sync_reads import Reply
 from hil.fakes.bus.wire import Wire
 from hil.fakes.plants.plant import Plant
 from hil.fakes.servo.present import PRESENT_END, PRESENT_START
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 GAP_S = 1.5e-3
-"""A pause between two bytes of a packet after which a servo forgets its beginning [s]."""
+"""Pause between two bytes of a packet after which a servo discards the incomplete packet [s]."""
 
 TICK_S = 1e-3
 """Period of the servos' own loops [s]."""
 
 
 class FakeBus:
-    """The wire, the adapter and everything behind it. Servo `i` of the sequence moves joint `i` of the plant, or where
-    `joints` is given joint `joints[i]`, so that two of them may move one.
+    """The wire, the adapter, the servos and the plant.
 
-    The plant's time is 0 when the bus is made. Times in this class are seconds on `clock`, but for `time` and those of
-    faults, which count from when the bus was made.
+    joints: for each servo, the index of the plant joint that it moves, so that two servos may move one joint; by
+    default servo i moves joint i.
+
+    The plant's time is 0 when the bus is created. Times in this class are in seconds on `clock`, except `time` and
+    those of faults, which count from the creation of the bus.
     """
 
     def __init__(
         self,
-        servos: Sequence[Servo],
+        servos: Sequence[EmulatedServo],
         plant: Plant,
         clock: Clock,
         *,
@@ -59,12 +61,12 @@ class FakeBus:
         self.plant = plant
         self.clock = clock
         self.packets = 0
-        """Good packets that the host has sent."""
+        """Number of valid packets that the host has sent."""
         self.pulls = 0
-        """How often the adapter's cable was pulled. What was open then stays lost."""
+        """Number of times the adapter's cable was unplugged. A port that was open at the time stays lost."""
         self.cable_is_out = False
         self.pulled_at = -math.inf
-        """When the cable was pulled last."""
+        """Time at which the cable was last unplugged."""
         self._servos = tuple(servos)
         self._joints = Joints(servos, plant, joints)
         self._one_each = self._joints.one_each
@@ -86,9 +88,10 @@ class FakeBus:
 
     @property
     def baud(self) -> int:
-        """The host's baud. Servos set to another rate understand nothing and stay silent.
+        """The host's baud rate. Servos set to another rate understand nothing and stay silent.
 
-        Set while a reply is on its way, what is left of it arrives as the garbage that a receiver makes of it.
+        If it is changed while a reply is being received, the rest arrives as the garbage that a receiver at the wrong
+        rate reads.
         """
         return self._wire.baud
 
@@ -98,20 +101,20 @@ class FakeBus:
             self._wire.change_baud(baud, self.clock.now())
 
     @property
-    def servos(self) -> dict[int, Servo]:
-        """The servos by their present ID, in the state they have at the clock's present time."""
+    def servos(self) -> dict[int, EmulatedServo]:
+        """The servos by current ID, in their state at the clock's current time."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
     @property
     def hand(self) -> Hand:
-        """Moves joints whose torque is off; as it is at the clock's present time."""
+        """Moves joints whose torque is off; in its state at the clock's current time."""
         self.advance(self.clock.now())
         return self._hand
 
     @property
     def time(self) -> float:
-        """Seconds since the bus was made, by its clock."""
+        """Seconds since the bus was created, on its clock."""
         return self.clock.now() - self._origin
 
     @property
@@ -126,13 +129,13 @@ class FakeBus:
 
     @property
     def damaged_packets(self) -> int:
-        """Packets of the host whose CRC was wrong."""
+        """Number of packets from the host with a wrong CRC."""
         return self._receiver.damaged
 
     # The host's side
 
     def write(self, data: bytes) -> None:
-        """Put bytes on the wire, behind those still being sent. With the cable out they are lost."""
+        """Put bytes on the wire, after those still being sent. They are lost if the cable is unplugged."""
         wire, receiver = self._wire, self._receiver
         now = self.clock.now()
         self.notice_faults()
@@ -152,16 +155,16 @@ class FakeBus:
             start = arrived
 
     def read(self, size: int, timeout_s: float) -> bytes:
-        """Up to `size` bytes, waiting on the clock until they are there, at most `timeout_s` (0: take what is there).
+        """Return up to `size` bytes, waiting on the clock for at most `timeout_s` (0: only what has already arrived).
 
-        Nothing but the host's own writing brings new bytes, so a wait without end (`math.inf`) is over when all bytes
-        on their way have come. The wait is over too when the cable is pulled.
+        New bytes only appear when the host writes, so an infinite wait (`math.inf`) ends when all bytes in transit have
+        arrived. The wait also ends when the cable is unplugged.
         """
         now = self.clock.now()
         deadline = now + timeout_s
         if timeout_s > 0:
-            # Time moves on even when the timeout is too short to change the sum: a client that waits in a loop for the
-            # end of its timeout gets there.
+            # Advance time even when the timeout is too small to change the sum, so that a client polling in a loop
+            # until its timeout expires does get there.
             deadline = max(deadline, math.nextafter(now, math.inf))
         taken = b""
         while True:
@@ -179,41 +182,41 @@ class FakeBus:
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that have reached the host and were not read."""
+        """Number of bytes that have reached the host and have not been read."""
         return self._wire.count_by(self.clock.now())
 
     @property
     def on_the_way(self) -> int:
-        """Bytes that have reached the host or will do so without further writing."""
+        """Number of bytes that have reached the host or will do so without a further write."""
         return self._wire.on_the_way
 
     @property
     def sent_by(self) -> float:
-        """When the last byte that the host wrote has left it."""
+        """Time at which the last byte written by the host has been sent."""
         return self._sent_by
 
     @property
     def next_reply_by(self) -> float:
-        """When the replies that are next to come, one directly after the other, will all be there; infinite if none."""
+        """Time at which the next contiguous group of replies will have arrived; infinite if there is none."""
         return self._wire.next_reply_by
 
     def discard_input(self) -> None:
-        """Drop the bytes that have reached the host. Those still on their way come later, as they do on a real port."""
+        """Drop the bytes that have reached the host. Those in transit arrive later, as on a real port."""
         now = self.clock.now()
         self._wire.take(self.in_waiting, now, now)
 
     # Time
 
     def notice_faults(self) -> None:
-        """Trigger the faults that are due by the clock."""
+        """Start and end the faults that are due by the clock."""
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:
             self.advance(now)
-            if now - self._origin >= self.faults.next_change:  # the bus was ahead of the clock already
+            if now - self._origin >= self.faults.next_change:  # the bus was already ahead of the clock
                 self._change_faults(now)
 
     def advance(self, until: float) -> None:
-        """Move plant, servos and faults on to `until`; nothing when that is past."""
+        """Advance plant, servos and faults to `until`; do nothing if that is in the past."""
         if until <= self._now:
             return
         event = until >= self._next_tick or until - self._origin >= self.faults.next_change
@@ -231,7 +234,7 @@ class FakeBus:
             self._move_plant(until)
 
     def _advance_by_events(self, until: float) -> None:
-        """Stop at each tick, fault and watchdog's trip, so that the plant sees its effect from that moment on."""
+        """Stop at each tick, fault and watchdog trip, so that the plant sees the effect from that moment on."""
         while self._now < until:
             counting = [servo for servo in self._servos if servo.watchdog_s]
             trip = min((servo.heard_at + servo.watchdog_s for servo in counting), default=math.inf)
@@ -248,7 +251,7 @@ class FakeBus:
                 self._tick(moment)
 
     def _change_faults(self, now: float) -> None:
-        # A sum of times may fall short of them by a rounding; what is due must not be due again and again.
+        # A sum of times may be too small by a rounding error; a fault that is due must not stay due forever.
         self.faults.change(max(now - self._origin, self.faults.next_change))
 
     def _tick(self, now: float) -> None:
@@ -266,12 +269,12 @@ class FakeBus:
         self._now = until
 
     def _servo_changed(self) -> None:
-        """A servo has another ID, or needs ticks, or needs none any more."""
+        """Update routing and ticking after a servo has changed its ID or its need for ticks."""
         self._instructions.route()
         self._ticks_wanted()
 
     def _ticks_wanted(self) -> None:
-        """Begin or end to tick, as servos and hand need it."""
+        """Start or stop ticking, depending on whether supply, hand or servos need it."""
         if self._supply is None and not self._hand.busy and not any(servo.needs_ticks for servo in self._servos):
             self._next_tick = math.inf
         elif self._next_tick == math.inf:
@@ -295,7 +298,7 @@ class FakeBus:
             end(fault, self._servos, self._joints.of, self.plant)
 
     def _other_master_speaks(self, servo_id: int) -> None:
-        """Another master reads a servo's Present Position; the host receives both request and reply."""
+        """Simulate another master that reads a Present Position; the host receives both request and reply."""
         request = encode(servo_id, Instruction.READ, b"\x84\x00\x04\x00")
         asked_by = self._wire.put(request, self._now)
         self._instructions.receive(Packet(servo_id, Instruction.READ, request[8:-2]), asked_by)
@@ -313,7 +316,10 @@ class FakeBus:
         self._instructions.receive(packet, now)
 
     def send(self, replies: Sequence[Reply], now: float) -> None:
-        """Put replies on the wire, each its delay after the end of the one before it; the first after `now`."""
+        """Put replies on the wire.
+
+        Each starts after its delay from the end of the previous one; the first delay counts from `now`.
+        """
         wire, faults = self._wire, self.faults
         if faults.on_replies:
             for servo_id, delay_s, data in replies:
@@ -326,12 +332,12 @@ class FakeBus:
                     now = wire.put(joined, now)
                 joined = b""
                 now += delay_s
-            joined += data  # what follows without a pause is one stretch of bytes
+            joined += data  # replies without a pause between them are sent as one block
         if joined:
             wire.put(joined, now)
 
-    def measure(self, servo: Servo, address: int, length: int) -> None:
-        """Bring the registers of a stretch up to date with the servo's joint."""
+    def measure(self, servo: EmulatedServo, address: int, length: int) -> None:
+        """Update the registers in this address range with the state of the servo's joint."""
         end_address = address + length
         if (address < PRESENT_END and end_address > PRESENT_START) or servo.memory.is_indirect(address, length):
             index = self._index[servo]
@@ -339,14 +345,14 @@ class FakeBus:
             servo.present.measure(address, end_address, self._now, position[index], velocity[index], current[index])
 
     def joints(self) -> States:
-        """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
+        """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
         if self._one_each:
             plant = self.plant
             return plant.position, plant.velocity, plant.current
         return self._joints.states()
 
-    def is_moving(self, servo: Servo) -> bool:
-        """Whether the servo's register Moving is 1."""
+    def is_moving(self, servo: EmulatedServo) -> bool:
+        """Return whether the servo's register Moving is 1."""
         return servo.present.moves(self.plant.velocity[self._joints.of[self._index[servo]]])
 
     @property
@@ -354,10 +360,10 @@ class FakeBus:
         """Whether an active fault makes servos refuse commands."""
         return bool(self.faults.on_answers)
 
-    def fault_error(self, servo: Servo, now: float) -> int:
-        """The ERR byte with which a fault has a servo answer."""
+    def fault_error(self, servo: EmulatedServo, now: float) -> int:
+        """Return the ERR byte that an active fault makes this servo answer with; 0 without a fault."""
         return self.faults.error(servo.id, now - self._origin)
 
     def count_collision(self) -> None:
-        """Two servos with one ID have answered at once."""
+        """Count a collision of two servos with the same ID that have replied at once."""
         self._wire.collisions += 1

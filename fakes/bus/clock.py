@@ -1,20 +1,20 @@
-"""Virtual time: the clock of a fake arm when nothing outside the process depends on it."""
+"""Virtual time: the clock of a fake arm that nothing outside the process depends on."""
 
 
 class VirtualClock:
     """A `hil.drivers.clock.Clock` that stands still while the program computes and jumps when it waits.
 
-    A run on it is deterministic and as fast as the program: twenty seconds of arm time last as long as their bytes
-    and their plant take to compute.
+    A run on it is deterministic and as fast as the program: twenty seconds of arm time take only as long as it takes to
+    compute their bytes and the plant.
     """
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
 
     def now(self) -> float:
-        """Seconds of virtual time."""
+        """Return the seconds of virtual time."""
         return self._now
 
     def wait_until(self, deadline: float) -> None:
-        """Jump to `deadline` [s]; do nothing when it has passed."""
+        """Jump to `deadline` [s]; do nothing if it has passed."""
         self._now = max(self._now, deadline)

@@ -1,4 +1,4 @@
-"""What faults do to packets, servos and joints."""
+"""The effects of faults on packets, servos and joints."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 from hil.drivers.packet import HardwareError
 from hil.fakes.bus.faults import Fault, FaultKind, Faults
 from hil.fakes.plants.plant import CanJam, Plant, PlantError
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 if TYPE_CHECKING:
     from hil.fakes.bus.wire import Wire
 
 
-def begin(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant, now: float) -> None:
-    """Apply the fault to servos and joints; nothing for kinds that do not concern them.
+def begin(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], plant: Plant, now: float) -> None:
+    """Apply a fault to servos and joints; do nothing for kinds that only affect packets.
 
-    joints: of each servo, which joint it moves. now: bus time [s].
+    joints: for each servo, the index of the joint it moves. now: bus time [s].
     """
     for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):
@@ -38,8 +38,8 @@ def begin(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: P
                 servo.present.jump_ticks += round(fault.size)
 
 
-def end(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Plant) -> None:
-    """Undo it where it passes by itself: a heated servo stays hot, an error stays until a reboot."""
+def end(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], plant: Plant) -> None:
+    """Undo a fault if its effect is temporary: a heated servo stays hot, and an error stays until a reboot."""
     for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):
             continue
@@ -55,7 +55,10 @@ def end(fault: Fault, servos: Sequence[Servo], joints: Sequence[int], plant: Pla
 
 
 def put_with_faults(faults: Faults, wire: "Wire", servo_id: int, data: bytes, start: float, now: float) -> float:
-    """Put a reply on the wire as the lasting faults leave it; when the servo is done speaking. now: bus time [s]."""
+    """Put a reply on the wire as modified by the active faults; return the time at which the transmission ends.
+
+    start, now: start of the transmission on the clock, and the same moment since the bus was created [s].
+    """
     late_s = 0.0
     copies = 1
     random = faults.random
@@ -95,5 +98,5 @@ def _flipped(data: bytes, bits: Sequence[int]) -> bytes:
 
 def _jam(plant: Plant, joint: int, jammed: bool) -> None:
     if not isinstance(plant, CanJam):
-        raise PlantError(f"{type(plant).__name__} has no jam(joint, jammed): a stuck joint needs it")
+        raise PlantError(f"{type(plant).__name__} has no jam(joint, jammed): the fault stuck_joint needs it")
     plant.jam(joint, jammed)

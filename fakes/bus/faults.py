@@ -1,14 +1,15 @@
-"""Faults of a fake bus: what can go wrong on a cable, in an adapter, in a servo and in a joint, timed and seeded.
+"""Faults of a fake bus: what can go wrong in cable, adapter, servos and joints, scheduled and seeded.
 
     bus.faults.add(Fault(kind="lost_reply", servo=2, at=3.0, duration=0.5, probability=0.2))
 
-The same from TOML, `[[fake.faults]]` with the same keys, and from the command line, `--fault lost_reply:servo=2,at=3`.
-`FAULTS` lists the kinds with what they do. Times are seconds since the bus was made (`bus.time`).
+Faults can also be given in TOML, as `[[fake.faults]]` with the same keys, and on the command line, as `--fault
+lost_reply:servo=2,at=3`. `FAULTS` describes each kind. Times are seconds since the bus was created (`bus.time`).
 
-Faults of packets (replies, instructions, noise) strike each packet while they last, with their probability. The others
-happen once, at their time, or do not happen at all if chance says so. The same seed gives the same faults.
+Faults of packets (replies, instructions, noise) affect each packet while they last, with their probability. The others
+happen once, at their time; with their probability, or not at all. The same seed gives the same faults.
 """
 
+import difflib
 import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -42,7 +43,7 @@ class FaultKind(StrEnum):
 
 
 class FaultFacts(NamedTuple):
-    """What a kind does, and what its `amount` is: its meaning, its value unless given."""
+    """What a kind of fault does, and the meaning and default of its `amount`."""
 
     does: str
     amount: str = ""
@@ -53,31 +54,31 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.LOST_REPLY: FaultFacts("a status packet never reaches the host"),
     FaultKind.CORRUPTED_REPLY: FaultFacts("bits of a status packet are flipped", "bits", 1),
     FaultKind.TRUNCATED_REPLY: FaultFacts("a status packet ends early"),
-    FaultKind.DUPLICATED_REPLY: FaultFacts("a status packet comes twice"),
-    FaultKind.LATE_REPLY: FaultFacts("the adapter holds a status packet back", "seconds", 0.02),
-    FaultKind.NOISE: FaultFacts("random bytes come before a status packet", "bytes", 8),
-    FaultKind.LOST_INSTRUCTION: FaultFacts("no servo hears an instruction packet"),
-    FaultKind.CORRUPTED_INSTRUCTION: FaultFacts("the servos hear an instruction packet with a wrong CRC"),
+    FaultKind.DUPLICATED_REPLY: FaultFacts("a status packet arrives twice"),
+    FaultKind.LATE_REPLY: FaultFacts("the adapter delays a status packet", "seconds", 0.02),
+    FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8),
+    FaultKind.LOST_INSTRUCTION: FaultFacts("no servo receives an instruction packet"),
+    FaultKind.CORRUPTED_INSTRUCTION: FaultFacts("the servos receive an instruction packet with a wrong CRC"),
     FaultKind.STATUS_ERROR: FaultFacts(
-        "a servo refuses what it is told and answers with an error; 128 is the Alert bit, with which alone it obeys",
+        "a servo refuses commands and answers with an error; with 128 (only the Alert bit) it obeys and sets Alert",
         "ERR byte",
         1,
     ),
     FaultKind.OTHER_MASTER: FaultFacts(
-        "another program on the bus asks a servo for its position, again and again", "seconds between", 0.01
+        "another program on the bus keeps requesting a servo's position", "seconds between requests", 0.01
     ),
-    FaultKind.SILENT_SERVO: FaultFacts("a servo's bus cable is out: it hears and says nothing, its motor goes on"),
-    FaultKind.REBOOT: FaultFacts("a servo's supply breaks down for a moment and it boots", "seconds deaf", 0.25),
+    FaultKind.SILENT_SERVO: FaultFacts("a servo's bus cable is disconnected; its motor keeps running"),
+    FaultKind.REBOOT: FaultFacts("a servo reboots after a dip of its supply", "seconds without response", 0.25),
     FaultKind.OVERHEATING: FaultFacts("a servo is hotter than its Temperature Limit", "kelvin above it", 10),
-    FaultKind.OVERLOAD: FaultFacts("a servo finds itself overloaded"),
-    FaultKind.LOW_VOLTAGE: FaultFacts("the supply falls below a servo's Min Voltage Limit", "volt below it", 1.0),
-    FaultKind.STUCK_JOINT: FaultFacts("something holds a joint fast"),
-    FaultKind.ENCODER_JUMP: FaultFacts("an encoder is wrong", "ticks", 512),
+    FaultKind.OVERLOAD: FaultFacts("a servo reports overload"),
+    FaultKind.LOW_VOLTAGE: FaultFacts("the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0),
+    FaultKind.STUCK_JOINT: FaultFacts("a joint is jammed"),
+    FaultKind.ENCODER_JUMP: FaultFacts("an encoder reads an offset position", "ticks", 512),
     FaultKind.CABLE_PULLED: FaultFacts(
-        "the adapter's cable is pulled, and put back at the end; the port must be reopened"
+        "the adapter's cable is unplugged and replugged at the end; the port must be reopened"
     ),
 }
-"""All kinds of faults, and what they are."""
+"""What every kind of fault does."""
 
 REPLY_FAULTS = frozenset(
     {
@@ -94,34 +95,37 @@ _LEAST_REPEAT_S = 1e-3
 
 
 class Fault(BaseModel):
-    """One injected fault. Immutable; `servo` is a bus ID at the time it begins, None is all of them."""
+    """One injected fault, immutable. `servo` is a bus ID at the time the fault begins; None means all servos."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     kind: Annotated[FaultKind, Field(strict=False, description="what goes wrong; see FAULTS")]
-    at: Annotated[float, Field(ge=0, allow_inf_nan=False, description="when it begins [s since the bus was made]")] = (
-        0.0
-    )
-    duration: Annotated[float, Field(gt=0, description="how long it lasts; without an end unless given [s]")] = math.inf
-    servo: Annotated[int | None, Field(ge=0, le=252, description="bus ID of the servo; all unless given")] = None
-    probability: Annotated[float, Field(ge=0, le=1, description="that it strikes a packet, or happens at all")] = 1.0
+    at: Annotated[
+        float, Field(ge=0, allow_inf_nan=False, description="when it begins [s since the bus was created]")
+    ] = 0.0
+    duration: Annotated[float, Field(gt=0, description="duration [s]; unlimited by default")] = math.inf
+    servo: Annotated[int | None, Field(ge=0, le=252, description="bus ID of the servo; all servos by default")] = None
+    probability: Annotated[
+        float, Field(ge=0, le=1, description="probability of affecting a packet or of happening")
+    ] = 1.0
     amount: Annotated[
-        float | None, Field(allow_inf_nan=False, description="how much; what of and the default depend on the kind")
+        float | None,
+        Field(allow_inf_nan=False, description="size; its meaning and default depend on the kind"),
     ] = None
 
     @property
     def end(self) -> float:
-        """When it is over [s since the bus was made]."""
+        """Time at which it ends [s since the bus was created]."""
         return self.at + self.duration
 
     @property
     def size(self) -> float:
-        """`amount`, or what the kind has instead of it."""
+        """`amount`, or the default of this kind of fault."""
         return FAULTS[self.kind].default if self.amount is None else self.amount
 
     @property
     def repeats_every(self) -> float:
-        """How often it happens anew while it lasts [s]; infinite for a fault that happens once."""
+        """Period with which it recurs while it lasts [s]; infinite for a fault that happens once."""
         return max(self.size, _LEAST_REPEAT_S) if self.kind is FaultKind.OTHER_MASTER else math.inf
 
     def concerns(self, servo_id: int) -> bool:
@@ -129,7 +133,7 @@ class Fault(BaseModel):
 
 
 class Happened(NamedTuple):
-    """A fault that struck: when [s since the bus was made], which kind, and which servo, if it was one."""
+    """A fault that took effect: time [s since the bus was created], kind, and servo (None: no single one)."""
 
     time: float
     kind: FaultKind
@@ -140,16 +144,16 @@ Effect = Callable[[Fault], None]
 
 
 class Faults:
-    """The faults of one bus: those to come, those that last, and a record of those that struck (`happened`)."""
+    """The faults of one bus: pending ones, active ones, and a record of those that took effect (`happened`)."""
 
     def __init__(self, seed: int, begin: Effect, end: Effect) -> None:
         self.happened: list[Happened] = []
         self.next_change = math.inf
-        """When the next fault begins or ends [s since the bus was made]."""
+        """Time at which the next fault begins or ends [s since the bus was created]."""
+        # Active faults that affect reply packets, instruction packets, and how servos answer.
         self.on_replies: list[Fault] = []
         self.on_instructions: list[Fault] = []
         self.on_answers: list[Fault] = []
-        """The faults of packets that last just now; on_answers: of what servos make of them."""
         self.random = Random(f"faults {seed}")
         self._begin = begin
         self._end = end
@@ -158,12 +162,12 @@ class Faults:
         self._repeats: list[tuple[float, Fault]] = []
 
     def add(self, *faults: Fault) -> None:
-        """Add faults. One whose time has passed begins at once."""
+        """Add faults. One whose time has passed begins immediately."""
         self._to_come.extend(faults)
         self._look_ahead()
 
     def clear(self) -> None:
-        """End all that last and forget those to come."""
+        """End all active faults and cancel the pending ones."""
         self._to_come.clear()
         for fault in list(self._lasting):
             self._finish(fault)
@@ -175,7 +179,7 @@ class Faults:
         return tuple(self._lasting)
 
     def change(self, now: float) -> None:
-        """Begin and end what is due by `now` [s since the bus was made]."""
+        """Begin and end all faults that are due by `now` [s since the bus was created]."""
         for fault in [fault for fault in self._lasting if fault.end <= now]:
             self._finish(fault)
         for fault in sorted((fault for fault in self._to_come if fault.at <= now), key=lambda fault: fault.at):
@@ -189,14 +193,17 @@ class Faults:
         self._look_ahead()
 
     def error(self, servo_id: int, now: float) -> int:
-        """The ERR byte with which a servo answers instead of obeying; 0 when it obeys. now: seconds of the bus."""
+        """Return the ERR byte with which a servo answers under a status_error fault; 0 without one.
+
+        now: time since the bus was created [s].
+        """
         for fault in self.on_answers:
             if self.strikes(fault, servo_id, now):
                 return round(fault.size) & 0xFF
         return 0
 
     def strikes(self, fault: Fault, servo_id: int | None, now: float) -> bool:
-        """Whether a fault of packets strikes this one; if so, that is kept in `happened`."""
+        """Return whether a fault affects this packet, recording it in `happened` if it does."""
         if fault.servo is not None and fault.servo != servo_id:
             return False
         if fault.probability < 1.0 and self.random.random() >= fault.probability:
@@ -240,14 +247,18 @@ class Faults:
 
 
 def parse_fault(text: str) -> Fault:
-    """A fault as on the command line, `KIND` or `KIND:key=value,key=value`; raises ValueError."""
+    """Parse a fault given on the command line as `KIND` or `KIND:key=value,key=value`; raises ValueError."""
     kind, _, rest = text.partition(":")
+    if kind not in set(FaultKind):
+        near = difflib.get_close_matches(kind, list(FaultKind), 1)
+        meant = f" Did you mean {near[0]}?" if near else ""
+        raise ValueError(f'fault "{text}": there is no kind {kind!r}.{meant} Its kinds: {", ".join(FaultKind)}')
     keys = [name for name in Fault.model_fields if name != "kind"]
     values: dict[str, object] = {"kind": kind}
     for part in filter(None, rest.split(",")):
         key, equals, value = part.partition("=")
         if key not in keys or not equals:
-            raise ValueError(f'fault "{text}": "{part}" is not KEY=VALUE with a key of {", ".join(keys)}')
+            raise ValueError(f'fault "{text}": "{part}" is not KEY=VALUE with one of the keys {", ".join(keys)}')
         try:
             values[key] = int(value) if key == "servo" else float(value)
         except ValueError:
@@ -257,5 +268,4 @@ def parse_fault(text: str) -> Fault:
     except ValidationError as error:
         detail = error.errors(include_url=False)[0]
         key = ".".join(map(str, detail["loc"]))
-        allowed = f"; kinds: {', '.join(FaultKind)}" if key == "kind" else ""
-        raise ValueError(f'fault "{text}": {key} = {detail["input"]!r}: {detail["msg"]}{allowed}') from None
+        raise ValueError(f'fault "{text}": {key} = {detail["input"]!r}: {detail["msg"]}') from None

@@ -1,14 +1,14 @@
-"""A hand that moves joints of the fake arm whose torque is off, as a person calibrating an arm does.
+"""A hand that moves joints of the fake arm while their torque is off, like a person calibrating an arm.
 
-    bus.hand.move(Move(servo=2, to=0.5))                        # joint of servo 2 to 0.5 rad, one second from now
+    bus.hand.move(Move(servo=2, to=0.5))  # move the joint of servo 2 to 0.5 rad within one second, starting now
     bus.hand.move(Move(servo=2, ticks=3000, at=4.0, duration=2.0))
     bus.hand.release(2)
 
-The same from TOML, `[[fake.moves]]` with the same keys, and from the command line: `--move 2:to=0.5,at=4`, and while
-the terminal is served `hil fake --at /tmp/arm --move 2:to=0.5`.
+Moves can also be given in TOML, as `[[fake.moves]]` with the same keys, on the command line, as `--move 2:to=0.5,at=4`,
+and while a fake terminal is being served, with `hil fake --at /tmp/arm --move 2:to=0.5`.
 
-The hand overcomes friction and gravity but never opposes motor torque, so it releases a joint as soon as the
-torque of one of its servos comes on, and does not take one whose torque is on.
+The hand overcomes friction and gravity but never opposes motor torque: it releases a joint as soon as the torque of one
+of its servos comes on, and does not grip a joint whose torque is on.
 """
 
 import math
@@ -22,20 +22,20 @@ from hil.fakes.bus.joints import Joints
 from hil.fakes.plants.plant import CanBeHeld, Plant, PlantError
 
 _PULL_S = 0.01
-"""How fast the hand makes up for where the joint is not yet where the hand is [s]."""
+"""Time constant with which the hand corrects the joint's deviation from the wanted path [s]."""
 
 
 class Move(BaseModel):
-    """One movement of the hand. It holds the joint at its end for `hold`, without an end unless given."""
+    """One movement of the hand, after which it holds the joint for `hold` seconds, indefinitely by default."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     servo: Annotated[int, Field(ge=0, le=252, description="bus ID of a servo of the joint")]
     to: Annotated[float | None, Field(allow_inf_nan=False, description="joint angle at the end [rad]")] = None
     ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
-    at: Annotated[float, Field(ge=0, allow_inf_nan=False, description="when it begins [s]; see where it is used")] = 0.0
-    duration: Annotated[float, Field(gt=0, allow_inf_nan=False, description="how long it takes [s]")] = 1.0
-    hold: Annotated[float, Field(ge=0, description="how long the joint is held then [s]")] = math.inf
+    at: Annotated[float, Field(ge=0, allow_inf_nan=False, description="delay before it starts [s]")] = 0.0
+    duration: Annotated[float, Field(gt=0, allow_inf_nan=False, description="duration of the movement [s]")] = 1.0
+    hold: Annotated[float, Field(ge=0, description="how long the joint is held afterwards [s]")] = math.inf
 
     @model_validator(mode="after")
     def _one_end(self) -> Self:
@@ -46,7 +46,14 @@ class Move(BaseModel):
 
 @dataclass(slots=True)
 class _Grip:
-    """A joint in the hand: from where [rad], to where, from when [s of the bus], how long, and until when."""
+    """A joint held by the hand.
+
+    joint: index of the joint.
+    start, end: angles between which it moves [rad].
+    began: start time [s since the bus was created].
+    duration: duration of the movement [s].
+    until: time of release [s since the bus was created].
+    """
 
     joint: int
     start: float
@@ -57,9 +64,9 @@ class _Grip:
 
 
 class Hand:
-    """The hand of one bus. Times are seconds since the bus was made.
+    """The hand of one bus. Times are in seconds since the bus was created.
 
-    tell: called whenever it has begun or ended to need the bus's ticks.
+    tell: called whenever the hand starts or stops needing the bus's ticks.
     """
 
     def __init__(self, joints: Joints, plant: Plant, time: Callable[[], float], tell: Callable[[], None]) -> None:
@@ -72,16 +79,19 @@ class Hand:
 
     @property
     def busy(self) -> bool:
-        """Whether it holds a joint or has a pending move."""
+        """Whether the hand holds a joint or has a pending move."""
         return bool(self._grips or self._to_come)
 
     @property
     def holds(self) -> frozenset[int]:
-        """The joints in the hand, counted from 0."""
+        """Indices of the joints that the hand holds."""
         return frozenset(self._grips)
 
     def move(self, *moves: Move) -> None:
-        """Do these, `at` seconds from now. Raises PlantError for a plant that cannot be held, ValueError for an ID."""
+        """Schedule moves, each `at` seconds from now.
+
+        Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has.
+        """
         now = self._time()
         for move in moves:
             self._joint_of(move)
@@ -92,7 +102,7 @@ class Hand:
         self._tell()
 
     def release(self, servo: int | None = None) -> None:
-        """Let go of a servo's joint, or of all, and forget what was to come for it."""
+        """Release the joint of a servo, or all joints, and cancel their pending moves."""
         joints = set(self._joints.of) if servo is None else {self._joint(servo)}
         self._to_come = [move for move in self._to_come if self._joint_of(move) not in joints]
         for joint in joints & self._grips.keys():
@@ -100,7 +110,10 @@ class Hand:
         self._tell()
 
     def tick(self, now: float) -> None:
-        """One period of the servos' loops ends, `now` [s since the bus was made]: move what is held."""
+        """Start due moves and move the joints held; called once per period of the servos' loops.
+
+        now: time since the bus was created [s].
+        """
         while self._to_come and self._to_come[0].at <= now:
             self._take(self._to_come.pop(0), now)
         for grip in list(self._grips.values()):
@@ -109,7 +122,7 @@ class Hand:
                 continue
             share = min((now - grip.began) / grip.duration, 1.0)
             away = grip.end - grip.start
-            # Of all ways from rest to rest the one with the least jerk (Flash and Hogan 1985): as people move.
+            # Minimum-jerk profile, as in human reaching movements (Flash and Hogan 1985).
             wanted = grip.start + away * share**3 * (10 - 15 * share + 6 * share**2)
             rate = away * 30 * share**2 * (1 - share) ** 2 / grip.duration
             self._hold(grip.joint, rate + (wanted - self._plant.position[grip.joint]) / _PULL_S)
@@ -135,7 +148,7 @@ class Hand:
         self._hold(joint, None)
 
     def _hold(self, joint: int, velocity: float | None) -> None:
-        assert isinstance(self._plant, CanBeHeld)  # looked at when the move was asked for
+        assert isinstance(self._plant, CanBeHeld)  # checked in `move`
         self._plant.hold(joint, velocity)
 
     def _joint_of(self, move: Move) -> int:
@@ -149,14 +162,14 @@ class Hand:
 
 
 def parse_move(text: str) -> Move:
-    """A move as on the command line, `ID:key=value,key=value`; raises ValueError."""
+    """Parse a move given on the command line as `ID:key=value,key=value`; raises ValueError."""
     servo, _, rest = text.partition(":")
     keys = {name: int if name in ("servo", "ticks") else float for name in Move.model_fields}
     values: dict[str, object] = {}
     for part in (f"servo={servo}", *filter(None, rest.split(","))):
         key, equals, value = part.partition("=")
         if key not in keys or not equals:
-            raise ValueError(f'move "{text}": "{part}" is not KEY=VALUE with a key of {", ".join(keys)}')
+            raise ValueError(f'move "{text}": "{part}" is not KEY=VALUE with one of the keys {", ".join(keys)}')
         try:
             values[key] = keys[key](value)
         except ValueError:

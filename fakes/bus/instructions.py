@@ -1,15 +1,15 @@
-"""Who acts on an instruction packet, who answers it, and in which order.
+"""Which servos act on an instruction packet, which reply, and in which order.
 
-Where the manual is silent:
+Where the manual is silent, the fake behaves as follows:
 
-- The registers of a Sync Read are sampled when its instruction's last byte arrives, in all servos alike.
-- In a group read each servo waits for the one listed before it. Behind one that does not answer all stay silent, and a
-  fast read then breaks off in the middle (source: ROBOTIS in DynamixelSDK issue 364).
-- To a broadcast Ping the servos answer one directly after the other by rising ID.
-- Two servos with one ID that answer at once are heard as nothing; both act on what they are told.
-- The status of a write to ID or Baud Rate still comes from the old ID at the old baud, and a Factory Reset's too.
-- A servo executes what is addressed to its Secondary ID and does not answer it; its EEPROM stays as it is.
-- In a fast read a servo that refuses sends its error and zeros.
+- A Sync Read samples the registers of all servos when the last byte of its instruction arrives.
+- In a group read each servo waits for the one listed before it. After one that does not reply, all others stay silent,
+and the reply to a fast read ends in the middle (source: ROBOTIS in DynamixelSDK issue 364).
+- Servos reply to a broadcast Ping one directly after the other, in ascending order of ID.
+- If two servos have the same ID and reply at once, the host receives nothing; both execute the instruction.
+- The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate.
+- A servo executes what is addressed to its Secondary ID but does not reply to it; its EEPROM is not written.
+- In a fast read, a servo that refuses sends its error and zeros.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,39 +28,45 @@ from hil.drivers.packet import (
 )
 from hil.fakes.bus.sync_reads import SPAN, Reply, StateReads
 from hil.fakes.servo.backup import RESET_ALL
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 Part = tuple[int, int, int]
-"""What a group read asks of one servo: ID, address, length."""
+"""What a group read requests from one servo: ID, address, length."""
 
 
 class Line(Protocol):
-    """Interface between the servos and the bus; `hil.fakes.bus.bus.FakeBus` is one."""
+    """Interface of the bus as the servos need it, implemented by `hil.fakes.bus.bus.FakeBus`."""
 
     @property
     def baud(self) -> int: ...
 
     def send(self, replies: Sequence[Reply], now: float) -> None:
-        """Put replies on the wire, each its delay after the end of the one before it; the first after `now`."""
+        """Put replies on the wire.
+
+        Each starts after its delay from the end of the previous one; the first delay counts from `now`.
+        """
         ...
 
-    def measure(self, servo: Servo, address: int, length: int) -> None:
-        """Bring the registers of a stretch up to date with the servo's joint."""
+    def measure(self, servo: EmulatedServo, address: int, length: int) -> None:
+        """Update the registers in this address range with the state of the servo's joint."""
         ...
 
     def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
+        """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
         ...
 
-    def is_moving(self, servo: Servo) -> bool: ...
+    def is_moving(self, servo: EmulatedServo) -> bool: ...
 
     @property
     def servos_refuse(self) -> bool:
         """Whether an active fault makes servos refuse commands."""
         ...
 
-    def fault_error(self, servo: Servo, now: float) -> int:
-        """The ERR byte with which a fault has a servo answer; its number other than 0: instead of obeying."""
+    def fault_error(self, servo: EmulatedServo, now: float) -> int:
+        """Return the ERR byte that an active fault makes this servo answer with.
+
+        If its error number (without the Alert bit) is not 0, the servo does not execute the instruction.
+        """
         ...
 
     def count_collision(self) -> None: ...
@@ -69,12 +75,12 @@ class Line(Protocol):
 class Instructions:
     """The servos on a line as receivers of packets. `route` must be called whenever an ID has changed."""
 
-    def __init__(self, servos: Sequence[Servo], line: Line) -> None:
+    def __init__(self, servos: Sequence[EmulatedServo], line: Line) -> None:
         self._servos = tuple(servos)
         self._line = line
-        self._by_id: dict[int, tuple[Servo, ...]] = {}
-        self._shadows: dict[int, tuple[Servo, ...]] = {}
-        self._writers: dict[int, tuple[Servo, ...]] = {}
+        self._by_id: dict[int, tuple[EmulatedServo, ...]] = {}
+        self._shadows: dict[int, tuple[EmulatedServo, ...]] = {}
+        self._writers: dict[int, tuple[EmulatedServo, ...]] = {}
         self._state_reads = StateReads(self._servos, line)
         self._broadcast: dict[int, Callable[[bytes, float], None]] = {
             Instruction.PING: self._broadcast_ping,
@@ -88,7 +94,7 @@ class Instructions:
         self.route()
 
     def route(self) -> None:
-        """Find out who listens to which ID."""
+        """Update the mapping from IDs to the servos that listen to them."""
         self._by_id, self._shadows, self._writers = {}, {}, {}
         self._state_reads.forget()
         for servo in self._servos:
@@ -106,7 +112,7 @@ class Instructions:
         baud = self._line.baud
         for servo in self._servos:
             if servo.baud == baud and servo.connected and now >= servo.ready_at:
-                servo.heard_at = now  # feeds its watchdog, and says below that it heard this packet
+                servo.heard_at = now  # feeds its watchdog, and marks it below as having received this packet
         if packet.id != BROADCAST_ID:
             self._single(packet, now)
         elif packet.instruction in self._broadcast:
@@ -136,9 +142,9 @@ class Instructions:
         self._address(packet.id, lambda servo: self._execute(servo, instruction, body, now), now, least_level)
 
     def _address(
-        self, servo_id: int, act: Callable[[Servo], tuple[int, bytes]], now: float, least_level: int = 2
+        self, servo_id: int, act: Callable[[EmulatedServo], tuple[int, bytes]], now: float, least_level: int = 2
     ) -> None:
-        """Let the servo of this ID act, and answer if its Status Return Level is at least `least_level`."""
+        """Let the servo with this ID act, and reply if its Status Return Level is at least `least_level`."""
         answers = []
         for servo in self._by_id.get(servo_id, ()):
             if servo.hears(now, self._line.baud):
@@ -154,7 +160,7 @@ class Instructions:
             self._line.count_collision()
 
     def _execute(
-        self, servo: Servo, instruction: int, body: bytes, now: float, *, shadow: bool = False
+        self, servo: EmulatedServo, instruction: int, body: bytes, now: float, *, shadow: bool = False
     ) -> tuple[int, bytes]:
         fault = self._line.fault_error(servo, now) if self._line.servos_refuse else 0
         if fault & ~ALERT:
@@ -162,7 +168,7 @@ class Instructions:
         error, data = servo.execute(instruction, body, now, self._line.is_moving(servo), shadow=shadow)
         return error | fault, data
 
-    def _read(self, servo: Servo, address: int, length: int, now: float) -> tuple[int, bytes]:
+    def _read(self, servo: EmulatedServo, address: int, length: int, now: float) -> tuple[int, bytes]:
         fault = self._line.fault_error(servo, now) if self._line.servos_refuse else 0
         if fault & ~ALERT:
             return fault, b""
@@ -170,13 +176,13 @@ class Instructions:
         error, data = servo.read(address, length)
         return error | fault, data
 
-    def _write(self, servo: Servo, addressed: int, address: int, data: bytes, now: float) -> None:
-        """One servo's part of a group write."""
+    def _write(self, servo: EmulatedServo, addressed: int, address: int, data: bytes, now: float) -> None:
+        """Apply one servo's part of a group write."""
         if self._line.servos_refuse and self._line.fault_error(servo, now) & ~ALERT:
             return
         (servo.write if servo.id == addressed else servo.write_as_shadow)(address, data)
 
-    # All of them, or several
+    # All servos, or several
 
     def _broadcast_ping(self, _body: bytes, now: float) -> None:
         replies = []
@@ -250,7 +256,7 @@ class Instructions:
             self._line.send(replies, now)
 
     def _fast_read(self, parts: Sequence[Part], now: float) -> None:
-        """One packet from all servos; each appends its part and the CRC over everything up to there."""
+        """Send one packet from all servos, to which each appends its part and a CRC over everything so far."""
         size = 1 + sum(length + 4 for _, _, length in parts)
         if not parts or size > MAX_LENGTH:
             return
@@ -268,14 +274,14 @@ class Instructions:
             sent = len(whole)
         self._line.send(replies, now)
 
-    def _answering(self, servo_id: int, now: float) -> Servo | None:
-        """The servo that answers a group read under this ID; None when there is none or more than one."""
+    def _answering(self, servo_id: int, now: float) -> EmulatedServo | None:
+        """Return the servo that answers a group read at this ID; None if there is none or more than one."""
         servos = self._by_id.get(servo_id, ())
         if len(servos) != 1 or servos[0].heard_at != now or servos[0].status_return_level == 0:
             return None
         return servos[0]
 
-    def _listening(self, now: float) -> list[Servo]:
+    def _listening(self, now: float) -> list[EmulatedServo]:
         return [servo for servo in self._servos if servo.hears(now, self._line.baud)]
 
 

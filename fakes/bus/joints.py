@@ -1,43 +1,44 @@
-"""Which servo moves which joint: one each as a rule, two where a joint is driven by a pair.
+"""Assignment of servos to joints: usually one each, two where a joint is driven by a pair.
 
-Two servos on one joint share its angle; the plant is given the sum of their motor currents. What each of them measures
-as its own is what it was told, and its part of what the plant's current is off that (the current loop's lag).
+Two servos on one joint share its angle; the plant receives the sum of their motor currents. Each of them measures the
+current it commands, plus its share of the difference between the plant's current and the total command, which is due to
+the current loop's lag.
 """
 
 from collections.abc import Sequence
 
 from hil.fakes.plants.plant import Plant
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 States = tuple[Sequence[float], Sequence[float], Sequence[float]]
-"""Positions [rad], velocities [rad/s] and motor currents [A], one each per servo."""
+"""Positions [rad], velocities [rad/s] and motor currents [A], one value per servo."""
 
 
 class Joints:
-    """The servos as the plant's joints see them. `of` gives each servo's joint, counted from 0."""
+    """Maps between servos and the plant's joints. `of` is the joint index of each servo."""
 
-    def __init__(self, servos: Sequence[Servo], plant: Plant, of: Sequence[int] | None = None) -> None:
+    def __init__(self, servos: Sequence[EmulatedServo], plant: Plant, of: Sequence[int] | None = None) -> None:
         self.of = tuple(range(len(servos)) if of is None else of)
         if len(self.of) != len(servos) or set(self.of) != set(range(plant.joints)):
-            raise ValueError(f"{len(servos)} servos for a plant of {plant.joints} joints: one servo per joint at least")
+            raise ValueError(f"{len(servos)} servos for a plant of {plant.joints} joints: each joint needs a servo")
         self._servos = tuple(servos)
         self._plant = plant
         self.one_each = self.of == tuple(range(plant.joints))
         """Whether servo i moves joint i, the usual case."""
 
-    def of_joint(self, joint: int) -> list[Servo]:
-        """The servos that move a joint."""
+    def of_joint(self, joint: int) -> list[EmulatedServo]:
+        """Return the servos that move a joint."""
         return [servo for servo, moved in zip(self._servos, self.of, strict=True) if moved == joint]
 
     def commands(self) -> list[float]:
-        """What the plant is told: a motor current per joint [A]."""
+        """Return the motor current commanded to each joint of the plant [A]."""
         commands = [0.0] * self._plant.joints
         for servo, joint in zip(self._servos, self.of, strict=True):
             commands[joint] += servo.motor_current_a
         return commands
 
     def states(self) -> States:
-        """The joints' states as the servos meet them."""
+        """Return the joint states, one value per servo."""
         plant = self._plant
         if self.one_each:
             return plant.position, plant.velocity, plant.current

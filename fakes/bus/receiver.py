@@ -6,7 +6,7 @@ from struct import Struct
 from hil.drivers.packet import BROADCAST_ID, HEADER, MAX_ID, MAX_LENGTH, Framer, Instruction, Packet, crc, unstuff
 
 MOST_ASKED = 1000
-"""How many different group reads are kept."""
+"""Number of different group reads that are cached."""
 
 _STUFFED = b"\xff\xff\xfd\xfd"
 _FRONT = Struct("<4sBHB")  # header, ID, LEN, INST
@@ -16,16 +16,16 @@ _GROUP_READS = frozenset(
 
 
 class Receiver:
-    """Finds packets as `hil.drivers.packet.Framer(damaged=True)` does, whole good ones, the usual case, faster."""
+    """Finds packets as `hil.drivers.packet.Framer(damaged=True)` does, with a fast path for complete, valid ones."""
 
     def __init__(self) -> None:
         self._framer = Framer(damaged=True)
         self._length = 0
         self._asked: dict[bytes, Packet] = {}
-        """Group reads heard before: a host sends the same ones again and again."""
+        """Cache of group reads by their bytes: a host sends the same ones again and again."""
 
     def feed(self, data: bytes) -> Iterator[tuple[Packet, int]]:
-        """Take bytes as they come; yield each whole packet, and how many bytes stand behind it."""
+        """Take bytes as they arrive; yield each complete packet and the number of bytes that follow it."""
         framer = self._framer
         at, size = 0, len(data)
         if not framer.pending:
@@ -38,20 +38,20 @@ class Receiver:
 
     @property
     def pending(self) -> int:
-        """How many bytes were taken and not yet given as a packet or dropped as noise."""
+        """Number of buffered bytes: received, but neither returned as a packet nor dropped as noise."""
         return self._framer.pending
 
     @property
     def damaged(self) -> int:
-        """How many packets with a wrong CRC were given so far."""
+        """Number of packets with a wrong CRC so far."""
         return self._framer.bad_crc
 
     def reset(self) -> None:
-        """Forget a packet that was begun, as a servo does after a gap of 1.5 ms between bytes."""
+        """Drop an incomplete packet, as a servo does after a gap of 1.5 ms between bytes."""
         self._framer.reset()
 
     def _whole(self, data: bytes, at: int, size: int) -> Packet | None:
-        """The packet that begins right at `at`, if it is all there and undamaged; its length is in `_length` then."""
+        """Return the packet that begins at `at` and set `_length`; None unless it is complete and undamaged."""
         if size < at + 10:
             return None
         header, packet_id, length, instruction = _FRONT.unpack_from(data, at)

@@ -1,7 +1,7 @@
-"""The group reads of a control cycle, prepared once: Present Current, Velocity and Position of several servos.
+"""Precomputed group reads of the control cycle: Present Current, Velocity and Position of several servos.
 
-They give the same bytes as the long way in `hil.fakes.bus.instructions`, at half the time; that is where a fake bus
-spends it.
+They return the same bytes as the general path in `hil.fakes.bus.instructions`, in half the time; a fake bus spends most
+of its time here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,19 +9,19 @@ from typing import NamedTuple, Protocol
 
 from hil.drivers.packet import ALERT, BROADCAST_ID, HEADER, Instruction, crc, encode_status
 from hil.fakes.servo.present import STATE_END, STATE_START
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 Reply = tuple[int, float, bytes]
-"""Who speaks, how long it waits before it does [s], and its bytes."""
+"""One servo's reply: its ID, its delay [s], and the bytes."""
 
 SPAN = STATE_START.to_bytes(2, "little") + (STATE_END - STATE_START).to_bytes(2, "little")
-"""How the body of such a read begins."""
+"""Beginning of the body of such a read: address and length."""
 
 MOST_PREPARED = 1000
-"""How many different requests are kept."""
+"""Number of different requests that are cached."""
 
 MOST_SERVOS = 64
-"""How many servos fit into one fast read (LEN is at most 1024)."""
+"""Number of servos that fit into one fast read (LEN is at most 1024)."""
 
 _SIZE = STATE_END - STATE_START
 _FRONT_LENGTH = 8  # header, ID, LEN, INST of a status
@@ -29,37 +29,37 @@ _STUFFED = b"\xff\xff\xfd"
 _ALERT = {0: b"\0", ALERT: bytes((ALERT,))}
 
 
-class Joints(Protocol):
-    """Where the joints' states come from."""
+class JointStates(Protocol):
+    """Source of the joints' states."""
 
     def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Positions [rad], velocities [rad/s] and motor currents [A] of the servos' joints, one each per servo."""
+        """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
         ...
 
 
 class _Part(NamedTuple):
-    servo: Servo
+    servo: EmulatedServo
     place: int
-    """Among all servos."""
+    """Index among all servos."""
     front: bytes
-    """Of a status packet: header, ID, LEN, INST."""
+    """Beginning of the servo's status packet: header, ID, LEN, INST."""
     id_byte: bytes
 
 
 class StateReads:
-    """The requests heard so far, each with its servos. `forget` must be called whenever an ID has changed."""
+    """Cache of the requests received, each with its servos. `forget` must be called whenever an ID has changed."""
 
-    def __init__(self, servos: Sequence[Servo], joints: Joints) -> None:
+    def __init__(self, servos: Sequence[EmulatedServo], joints: JointStates) -> None:
         self._servos = tuple(servos)
         self._joints = joints
         self._prepared: dict[bytes, tuple[_Part, ...]] = {}
 
     def forget(self) -> None:
-        """Forget the prepared requests, since the servos' IDs have changed."""
+        """Clear the cache, since the servos' IDs have changed."""
         self._prepared.clear()
 
-    def sync_read(self, body: bytes, by_id: Mapping[int, Sequence[Servo]], now: float) -> list[Reply] | None:
-        """The replies to a Sync Read; None if it needs the general path."""
+    def sync_read(self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]], now: float) -> list[Reply] | None:
+        """Return the replies to a Sync Read; None if it needs the general path."""
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
         replies = []
@@ -75,8 +75,10 @@ class StateReads:
             replies.append((servo.id, servo.return_delay_s, reply))
         return replies or None
 
-    def fast_sync_read(self, body: bytes, by_id: Mapping[int, Sequence[Servo]], now: float) -> list[Reply] | None:
-        """The pieces of the reply to a Fast Sync Read; None if it needs the general path."""
+    def fast_sync_read(
+        self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]], now: float
+    ) -> list[Reply] | None:
+        """Return the parts of the reply to a Fast Sync Read; None if it needs the general path."""
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
         size = 1 + len(parts) * (_SIZE + 4)
@@ -93,7 +95,7 @@ class StateReads:
             sent = len(whole)
         return replies or None
 
-    def _parts(self, body: bytes, by_id: Mapping[int, Sequence[Servo]]) -> tuple[_Part, ...]:
+    def _parts(self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]]) -> tuple[_Part, ...]:
         parts = self._prepared.get(body)
         if parts is None:
             if len(self._prepared) >= MOST_PREPARED:
@@ -101,8 +103,11 @@ class StateReads:
             parts = self._prepared[body] = self._prepare(body[len(SPAN) :], by_id)
         return parts
 
-    def _prepare(self, ids: bytes, by_id: Mapping[int, Sequence[Servo]]) -> tuple[_Part, ...]:
-        """Empty when one of the servos is not as usual: absent, there twice, of a model half known."""
+    def _prepare(self, ids: bytes, by_id: Mapping[int, Sequence[EmulatedServo]]) -> tuple[_Part, ...]:
+        """Return the parts of a request; empty if it needs the general path.
+
+        That is the case if a servo is absent, if two have the same ID, or if a model is not fully known.
+        """
         parts: list[_Part] = []
         if len(ids) > MOST_SERVOS:
             return ()

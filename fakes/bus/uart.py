@@ -1,19 +1,19 @@
 """What a serial receiver reads from bytes sent at a different baud rate."""
 
 _IDLE = 1
-_STOP = 9  # of the ten bits of a byte: start, eight data bits, stop
+_STOP = 9  # index of the stop bit among the ten bits of a byte: start, eight data bits, stop
 
 
 def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float]]:
-    """The bytes that come out of a receiver at `heard_baud` while `data` is sent at `sent_baud`, one after the other.
+    """Return the bytes that a receiver at `heard_baud` reads while `data` is sent at `sent_baud` without pauses.
 
-    Each comes with the moment at which it is complete [s after the first start bit]. The receiver is a plain one: it
-    waits for a falling edge, looks into the middle of each bit, and passes bytes with a broken stop bit on, as USB
-    adapters do.
+    Each comes with the time at which it is complete [s after the first start bit]. The receiver is a simple one: it
+    waits for a falling edge, samples the middle of each bit, and passes on bytes with a wrong stop bit, as USB adapters
+    do.
     """
     line = [bit for byte in data for bit in (0, *(byte >> index & 1 for index in range(8)), 1)]
     ratio = sent_baud / heard_baud
-    """Bits on the line per bit of the receiver."""
+    """Number of bits sent per bit of the receiver."""
     received: list[tuple[int, float]] = []
     at = 0.0
     while (start := _falling_edge(line, at)) is not None:
@@ -27,7 +27,7 @@ def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float
 
 
 def _falling_edge(line: list[int], at: float) -> float | None:
-    """Where the line, idle high before and behind the bits, next goes low at or after `at`."""
+    """Return the position of the next falling edge at or after `at`, or None; the line idles high."""
     before = _level(line, at)
     if before == 0 and at == int(at) and (at == 0 or line[int(at) - 1] == _IDLE):
         return at

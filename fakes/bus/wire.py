@@ -1,4 +1,4 @@
-"""The half-duplex wire from the servos to the host: which bytes arrive when, and what a collision destroys."""
+"""The half-duplex wire from the servos to the host: when bytes arrive, and what a collision destroys."""
 
 from collections import deque
 from typing import NamedTuple
@@ -8,11 +8,15 @@ from hil.fakes.bus.uart import heard
 BITS_PER_BYTE = 10
 
 ROUNDING_S = 1e-9
-"""Less than this two bytes on the wire do not overlap, they follow each other [s]."""
+"""Two transmissions that overlap by less than this are taken to follow each other [s]."""
 
 
 class Arriving(NamedTuple):
-    """Bytes on their way to the host: when the first is there, and how far apart they come [s]."""
+    """Bytes on their way to the host.
+
+    first: arrival time of the first byte [s].
+    byte_s: time between two bytes [s].
+    """
 
     data: bytes
     first: float
@@ -23,7 +27,7 @@ class Arriving(NamedTuple):
         return self.first + (len(self.data) - 1) * self.byte_s
 
     def count_by(self, deadline: float) -> int:
-        """How many of the bytes are there by `deadline`."""
+        """Return the number of bytes that have arrived by `deadline`."""
         if self.last <= deadline:
             return len(self.data)
         if self.first > deadline:
@@ -31,25 +35,25 @@ class Arriving(NamedTuple):
         return min(int((deadline - self.first) / self.byte_s) + 1, len(self.data))
 
     def after(self, count: int) -> "Arriving":
-        """What is left when the first `count` bytes are gone."""
+        """Return what is left after the first `count` bytes."""
         return Arriving(self.data[count:], self.first + count * self.byte_s, self.byte_s)
 
 
 class Wire:
-    """Replies on their way, in the order in which they reach the host `latency_s` after they were on the wire."""
+    """Replies in transit, ordered by their arrival at the host, `latency_s` after they were on the wire."""
 
     def __init__(self, baud: int, latency_s: float) -> None:
         self.baud = baud
         self.collisions = 0
-        """How often two spoke at once."""
+        """Number of times that two transmitted at once."""
         self.reply_by = float("-inf")
-        """When the last servo will have spoken [s]."""
+        """Time at which the last servo will have finished transmitting [s]."""
         self._latency_s = latency_s
         self._arriving: deque[Arriving] = deque()
 
     @property
     def baud(self) -> int:
-        """The host's baud."""
+        """The host's baud rate."""
         return self._baud
 
     @baud.setter
@@ -58,7 +62,7 @@ class Wire:
         self.byte_s = BITS_PER_BYTE / baud
 
     def change_baud(self, baud: int, now: float) -> None:
-        """The host listens at another baud from `now` [s] on: what is still on its way comes as garbage."""
+        """Change the host's baud rate at `now` [s]; what is still in transit arrives as garbage."""
         sent_baud, self.baud = self._baud, baud
         kept: deque[Arriving] = deque()
         for segment in self._arriving:
@@ -71,9 +75,9 @@ class Wire:
         self._arriving = deque(sorted(kept, key=lambda segment: segment.first))
 
     def put(self, data: bytes, start: float, late_s: float = 0.0) -> float:
-        """A servo speaks from time `start`; the time at which it is done. `late_s`: how much longer the adapter takes.
+        """Transmit a servo's data from time `start`; return the time at which the transmission ends.
 
-        Both are lost when it speaks into another's reply.
+        late_s: additional delay in the adapter [s]. If another reply is being transmitted, both are lost.
         """
         byte_s = self.byte_s
         end = start + len(data) * byte_s
@@ -83,24 +87,24 @@ class Wire:
         arriving = self._arriving
         first = start + byte_s + self._latency_s + late_s
         arriving.append(Arriving(data, first, byte_s))
-        if len(arriving) > 1 and arriving[-2].first > first:  # before an earlier instruction's reply that is to come
+        if len(arriving) > 1 and arriving[-2].first > first:  # ahead of an earlier reply
             self._arriving = deque(sorted(arriving, key=lambda segment: segment.first))
         self.reply_by = max(self.reply_by, end)
         return end
 
     def echo(self, data: bytes, start: float) -> None:
-        """The host speaks from time `start`, and its adapter hears it."""
+        """Echo the host's own data back to it; they are sent from time `start`."""
         self._arriving.append(Arriving(data, start + self.byte_s + self._latency_s, self.byte_s))
         self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
 
     def occupy(self, until: float) -> None:
-        """A servo transmits without being heard."""
+        """Mark the wire as busy with a transmission that does not reach the host."""
         self.reply_by = max(self.reply_by, until)
 
     def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
-        """Up to `size` bytes that are there by `deadline`, and when the last of them came, at least `now`."""
+        """Return up to `size` bytes that have arrived by `deadline`, and when the last one arrived (at least `now`)."""
         arriving = self._arriving
-        if arriving and len(arriving[0].data) == size:  # the usual case: what one write brought, in one read
+        if arriving and len(arriving[0].data) == size:  # the usual case: the reply to one write, in one read
             segment = arriving[0]
             last = segment.first + (size - 1) * segment.byte_s
             if last <= deadline:
@@ -123,17 +127,17 @@ class Wire:
         return taken, now
 
     def count_by(self, now: float) -> int:
-        """Bytes that have reached the host by `now` [s]."""
+        """Return the number of bytes that have reached the host by `now` [s]."""
         return sum(segment.count_by(now) for segment in self._arriving)
 
     @property
     def on_the_way(self) -> int:
-        """Bytes that have reached the host or will do so."""
+        """Number of bytes that have reached the host or will do so."""
         return sum(len(segment.data) for segment in self._arriving)
 
     @property
     def next_reply_by(self) -> float:
-        """When the replies that follow each other without a pause will all have come [s]; infinite when none comes."""
+        """Arrival time of the end of the next contiguous group of replies [s]; infinite if there is none."""
         last = float("inf")
         for segment in self._arriving:
             if last < segment.first - 4 * segment.byte_s:
@@ -142,14 +146,15 @@ class Wire:
         return last
 
     def cut(self, now: float) -> None:
-        """Drop everything that has not arrived by `now`: the cable is out."""
+        """Drop everything that has not arrived by `now`, because the cable is unplugged."""
         kept = [segment._replace(data=segment.data[: segment.count_by(now)]) for segment in self._arriving]
         self._arriving = deque(segment for segment in kept if segment.data)
 
     def collide(self, start: float, end: float) -> bool:
-        """Whether a servo speaks while someone else does, from `start` to `end`.
+        """Return whether a transmission from `start` to `end` collides with one by a servo.
 
-        Then its bytes from `start` on are lost; who began at `start` is lost by not being heard.
+        If so, the servo's bytes from `start` on are lost. The other transmission is lost because the caller does not
+        deliver it.
         """
         kept: deque[Arriving] = deque()
         collided = False

@@ -1,1 +1,1 @@
-"""Mechanisms behind the fake servos."""
+"""Mechanisms driven by the fake servos."""

@@ -1,4 +1,4 @@
-"""The fake arm's physics: links, drives, and what the estimator should find in them."""
+"""The fake arm's physical description: links, drives, and the parameters that an identification should find."""
 
 import math
 from typing import Annotated, Self
@@ -15,9 +15,9 @@ class Link(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    length: Positive = Field(description="from its joint to the next joint [m]")
+    length: Positive = Field(description="distance from its joint to the next joint [m]")
     mass: NotNegative = Field(description="mass [kg]")
-    centre: Finite = Field(description="from its joint to its centre of mass [m]")
+    centre: Finite = Field(description="distance from its joint to its centre of mass [m]")
     inertia: NotNegative = Field(description="inertia about its centre of mass [kg m^2]")
 
 
@@ -26,52 +26,66 @@ class Drive(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    mass: NotNegative = Field(description="the servo's body, which sits at its joint [kg]")
-    rotor_inertia: NotNegative = Field(description="inertia of the rotor before the gears [kg m^2]")
+    mass: NotNegative = Field(description="mass of the servo's body, which is located at its joint [kg]")
+    rotor_inertia: NotNegative = Field(description="inertia of the rotor on the motor side of the gears [kg m^2]")
     gear_ratio: Positive = Field(description="turns of the rotor per turn of the joint")
     torque_constant: Positive = Field(description="torque at the output shaft per motor current [N m/A]")
     current_lag: NotNegative = Field(0.0, description="time constant of the current loop, first order [s]")
     saturation: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
-        0.0, description="share of the torque that is lost at saturation_current"
+        0.0, description="fraction of the torque lost at saturation_current"
     )
-    saturation_current: Positive = Field(1.0, description="current at which that share is lost [A]")
-    viscous: NotNegative = Field(0.0, description="friction per velocity, warm [N m s/rad]")
-    coulomb: NotNegative = Field(0.0, description="dry friction while sliding fast, warm [N m]")
-    cold_viscous: NotNegative = Field(0.0, description="viscous friction at time 0 above the warm one, as a fraction")
-    cold_coulomb: NotNegative = Field(0.0, description="dry friction at time 0 above the warm one, as a fraction")
-    warm_up_time: Positive = Field(60.0, description="time constant in which that goes [s]")
+    saturation_current: Positive = Field(1.0, description="current at which the fraction `saturation` is lost [A]")
+    viscous: NotNegative = Field(0.0, description="viscous friction, warm [N m s/rad]")
+    coulomb: NotNegative = Field(0.0, description="Coulomb friction, warm [N m]")
+    cold_viscous: NotNegative = Field(
+        0.0, description="excess of viscous friction at time 0, as a fraction of the warm one"
+    )
+    cold_coulomb: NotNegative = Field(
+        0.0, description="excess of Coulomb friction at time 0, as a fraction of the warm one"
+    )
+    warm_up_time: Positive = Field(60.0, description="time constant of the warm-up [s]")
     coulomb_width: NotNegative = Field(
         0.0,
-        description="0 sticks; more is smooth, coulomb * tanh(velocity / width) [rad/s]",
+        description="0: stiction; above 0: smooth friction, coulomb * tanh(velocity / width) [rad/s]",
     )
-    stribeck_rise: NotNegative = Field(0.0, description="static friction above Coulomb, as a fraction of it")
-    stribeck_velocity: Positive = Field(0.1, description="velocity where the rise is down to 1/e [rad/s]")
-    load: NotNegative = Field(0.0, description="dry friction added per motor torque [N m per N m]")
+    stribeck_rise: NotNegative = Field(
+        0.0, description="excess of static over Coulomb friction, as a fraction of the latter"
+    )
+    stribeck_velocity: Positive = Field(0.1, description="velocity at which stribeck_rise has fallen to 1/e [rad/s]")
+    load: NotNegative = Field(0.0, description="additional dry friction per motor torque [N m per N m]")
     presliding_stiffness: NotNegative = Field(
-        0.0, description="0 sticks; more is a spring that yields before the joint slides [N m/rad]"
+        0.0, description="stiffness of the presliding contact; 0 for rigid stiction [N m/rad]"
     )
-    presliding_damping: NotNegative = Field(0.0, description="of that spring's bending [N m s/rad]")
-    offset: Finite = Field(0.0, description="constant torque on the side of the load [N m]")
-    cable_stiffness: NotNegative = Field(0.0, description="of a cable that pulls the joint to cable_angle [N m/rad]")
-    cable_angle: Finite = Field(0.0, description="joint angle where the cable is slack [rad]")
-    ripple: NotNegative = Field(0.0, description="torque ripple over the angle, as a fraction of torque")
+    presliding_damping: NotNegative = Field(0.0, description="damping of the presliding contact [N m s/rad]")
+    offset: Finite = Field(0.0, description="constant load torque [N m]")
+    cable_stiffness: NotNegative = Field(
+        0.0, description="stiffness of a cable that pulls the joint to cable_angle [N m/rad]"
+    )
+    cable_angle: Finite = Field(0.0, description="joint angle at which the cable is slack [rad]")
+    ripple: NotNegative = Field(
+        0.0, description="amplitude of the torque ripple over the angle, as a fraction of torque"
+    )
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
     cogging: NotNegative = Field(0.0, description="amplitude of the cogging torque at the output shaft [N m]")
     cogging_cycles: Positive = Field(1.0, description="cycles of cogging per turn of the joint")
-    backlash: NotNegative = Field(0.0, description="free play of the gears, from flank to flank [rad]")
-    gear_stiffness: Positive = Field(1500.0, description="of the gears in contact; only with backlash [N m/rad]")
-    gear_damping: NotNegative = Field(2.0, description="of the gears in contact; only with backlash [N m s/rad]")
+    backlash: NotNegative = Field(0.0, description="total play of the gears [rad]")
+    gear_stiffness: Positive = Field(
+        1500.0, description="stiffness of the gears in contact; only with backlash [N m/rad]"
+    )
+    gear_damping: NotNegative = Field(
+        2.0, description="damping of the gears in contact; only with backlash [N m s/rad]"
+    )
     stops: tuple[Finite, Finite] | None = Field(None, strict=False, description="joint angles of the hard stops [rad]")
-    stop_stiffness: Positive = Field(200.0, description="of a hard stop [N m/rad]")
-    stop_damping: NotNegative = Field(1.0, description="of a hard stop [N m s/rad]")
+    stop_stiffness: Positive = Field(200.0, description="stiffness of a hard stop [N m/rad]")
+    stop_damping: NotNegative = Field(1.0, description="damping of a hard stop [N m s/rad]")
 
     @property
     def warms_up(self) -> bool:
-        """Whether its friction changes with time."""
+        """Whether the friction changes with time."""
         return bool(self.cold_viscous or self.cold_coulomb)
 
     def coldness(self, time: float) -> tuple[float, float]:
-        """Viscous and dry friction at `time` [s] since it was switched on, in units of the warm ones."""
+        """Return viscous and dry friction at `time` [s] since power-up, as multiples of the warm values."""
         cold = math.exp(-time / self.warm_up_time)
         return 1.0 + self.cold_viscous * cold, 1.0 + self.cold_coulomb * cold
 
@@ -79,23 +93,25 @@ class Drive(BaseModel):
     def _width_is_resolved(self) -> Self:
         if 0.0 < self.coulomb_width < 1e-3:
             raise ValueError(
-                f"coulomb_width is {self.coulomb_width:g} rad/s: give 0 for friction that sticks, "
-                "or at least 0.001 rad/s for a smooth step"
+                f"coulomb_width is {self.coulomb_width:g} rad/s: give 0 for stiction, or at least 0.001 rad/s for "
+                "smooth friction"
             )
         if self.presliding_stiffness and self.coulomb_width:
             raise ValueError(
-                "presliding_stiffness and coulomb_width both say what friction does near standstill: give one of them"
+                "presliding_stiffness and coulomb_width both define friction near standstill: give only one of them"
             )
         if self.presliding_stiffness and not self.coulomb:
-            raise ValueError("presliding_stiffness needs a coulomb greater than 0: without it nothing holds the joint")
+            raise ValueError("presliding_stiffness needs a coulomb greater than 0: otherwise nothing holds the joint")
         if self.presliding_damping and not self.presliding_stiffness:
             raise ValueError(
                 "presliding_damping needs a presliding_stiffness greater than 0: there is no spring to damp"
             )
         if self.stops is not None and self.stops[0] >= self.stops[1]:
-            raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be the smaller")
+            raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be less than the second")
         if self.backlash and not self.rotor_inertia:
-            raise ValueError("backlash needs a rotor_inertia greater than 0: the rotor moves by itself inside the play")
+            raise ValueError(
+                "backlash needs a rotor_inertia greater than 0: within the play the rotor moves on its own"
+            )
         return self
 
 
@@ -104,13 +120,15 @@ class Arm(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    gravity: NotNegative = Field(9.81, description="0 for an arm in a horizontal plane [m/s^2]")
+    gravity: NotNegative = Field(9.81, description="acceleration of gravity; 0 for a horizontal arm [m/s^2]")
     tilt: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)] = Field(
-        0.0, description="of the arm's plane against the vertical; pi/2 is horizontal [rad]"
+        0.0, description="inclination of the arm's plane from the vertical; pi/2 is horizontal [rad]"
     )
     start: tuple[Finite, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
-    links: tuple[Link, ...] = Field(strict=False, min_length=1, max_length=2, description="from the base outwards")
-    drives: tuple[Drive, ...] = Field(strict=False, description="one for each link, at its joint")
+    links: tuple[Link, ...] = Field(
+        strict=False, min_length=1, max_length=2, description="links from the base outwards"
+    )
+    drives: tuple[Drive, ...] = Field(strict=False, description="drives, one per link, at its joint")
 
     @model_validator(mode="after")
     def _one_of_each_per_joint(self) -> Self:
@@ -126,18 +144,18 @@ class Arm(BaseModel):
 
     @property
     def weight(self) -> float:
-        """Gravity along the arm's plane [m/s^2]."""
+        """Component of gravity within the arm's plane [m/s^2]."""
         return self.gravity * math.cos(self.tilt)
 
 
 def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]:
-    """The truth an identification of this arm at `time` [s] should find, by the estimator's names, in its order [SI].
+    """Return the true base parameters of this arm at `time` [s], by the estimator's names and in its order [SI].
 
-    Empty when there is no `Arm`: of another plant nothing is known here. Without a time, that of warm drives.
+    Empty without an `Arm`, since the parameters of another plant are unknown. Without a time, the drives are warm.
 
-    What no base parameter stands for is left out: dry friction above Coulomb (Stribeck rise, load), presliding, the
-    current's lag, saturation, ripple, cogging, a cable's stiffness, backlash, stops. `gravity` values are those of the
-    tilted plane; an offset holds what a cable pulls with at angle 0.
+    Effects that no base parameter represents are left out: dry friction above Coulomb (Stribeck rise, load),
+    presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, stops. The `gravity`
+    values are those of the tilted plane; an offset includes a cable's torque at angle 0.
     """
     if arm is None:
         return {}
@@ -151,7 +169,7 @@ def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]
 
 
 def armature(drive: Drive) -> float:
-    """Inertia of the rotor as the joint feels it [kg m^2]."""
+    """Return the rotor inertia referred to the joint [kg m^2]."""
     return drive.rotor_inertia * drive.gear_ratio**2
 
 

@@ -1,10 +1,11 @@
-"""An arm with play in its gears: each joint is a rotor and an output shaft that touch at the flanks of a gap.
+"""An arm with gear backlash: each joint consists of a rotor and an output shaft, which touch at the flanks of a gap.
 
-The rotor (its inertia times the gear ratio squared) carries the motor's torque, all friction and the hard stops; the
-links hang on the output shafts, where the servos' encoders sit. In the gap nothing passes between the two; at a flank
-the gears are a spring and a damper that can push and never pull.
+The rotor (with its inertia times the gear ratio squared) is subject to the motor's torque, all friction and the hard
+stops. The links are attached to the output shafts, as are the servos' encoders. Within the gap no torque is transmitted
+between the two; at a flank the gears act as a spring and a damper that can push but not pull.
 
-The contact is stiff, so steps are short, and such an arm runs some ten times slower than one without play.
+The contact is stiff, so the time steps are short: such an arm takes about ten times as long to simulate as one without
+backlash.
 """
 
 from collections.abc import Sequence
@@ -13,11 +14,11 @@ from math import ceil, cos, sin
 from hil.fakes.plants.arm import Arm, Drive, Link, armature
 from hil.fakes.plants.motor import Motor
 
-STEP = 50e-6  # s: short against the gears' own vibration
+STEP = 50e-6  # s: short compared with the period of the gears' vibration
 
 
 class GearedArm:
-    """An arm of one or two joints with play; see `hil.fakes.plants.plant.Plant`."""
+    """An arm of one or two joints with backlash; see `hil.fakes.plants.plant.Plant`."""
 
     def __init__(self, arm: Arm) -> None:
         self._rotors = [_Rotor(drive, angle) for drive, angle in zip(arm.drives, arm.start, strict=True)]
@@ -42,11 +43,11 @@ class GearedArm:
 
     @property
     def rotor_angle(self) -> Sequence[float]:
-        """Where the rotors are, as angles of their joints [rad]."""
+        """Rotor angles, referred to the joints [rad]."""
         return [rotor.angle for rotor in self._rotors]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Hold a joint's motor fast, or let it go."""
+        """Block a joint's motor, or release it."""
         self._rotors[joint].motor.jammed = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
@@ -74,7 +75,7 @@ class GearedArm:
 
 
 class _Rotor:
-    """Motor and gears of one joint, as the joint sees them."""
+    """Motor and gears of one joint, referred to the joint."""
 
     def __init__(self, drive: Drive, angle: float) -> None:
         self.motor = Motor(drive)
@@ -86,7 +87,7 @@ class _Rotor:
         self._damping = drive.gear_damping
 
     def contact(self, angle: float, velocity: float) -> float:
-        """The torque that the gears pass to an output shaft at this angle and velocity [N m]."""
+        """Return the torque that the gears transmit to an output shaft at this angle and velocity [N m]."""
         ahead = self.angle - angle
         if abs(ahead) <= self._half_gap:
             return 0.0
@@ -106,7 +107,7 @@ class _Rotor:
 
 
 class _Links:
-    """The links alone, moved by torques at their joints."""
+    """The links alone, moved by the torques at their joints."""
 
     def __init__(self, arm: Arm) -> None:
         self.angle = list(arm.start)

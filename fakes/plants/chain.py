@@ -1,4 +1,4 @@
-"""A spatial arm behind the fake servos; see `hil.fakes.plants.plant.Plant`. Its motion: `chain_kernel`."""
+"""A spatial arm as a plant (see `hil.fakes.plants.plant.Plant`); `chain_kernel` computes its motion."""
 
 from collections.abc import Sequence
 from math import ceil, inf
@@ -10,11 +10,11 @@ from hil.fakes.plants.chain_arm import ChainArm
 from hil.fakes.plants.chain_kernel import DRIVE, equations, run
 from hil.fakes.plants.motor import JAM, STEP_PER_WIDTH
 
-LONGEST_STEP = 0.3e-3  # s: more joints shake each other more; the compiler pays for it
+LONGEST_STEP = 0.3e-3  # s: more joints excite each other more; compiled code makes short steps affordable
 
 
 class SpatialChain:
-    """A serial arm of up to seven joints, at rest in its starting pose at time 0."""
+    """A serial arm of up to seven joints, at rest in its initial pose at time 0."""
 
     def __init__(self, arm: ChainArm) -> None:
         count = len(arm.joints)
@@ -71,13 +71,16 @@ class SpatialChain:
         run(self._chain, self._drive, self._jam, self._state, command, remaining, longest, self._work, self._room)
 
     def equations(self, q: Sequence[float], v: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Mass matrix (joints, joints), rotors not included, and the torque of no acceleration (joints,) at a state."""
+        """Return the mass matrix and the torques for zero acceleration at a state.
+
+        The mass matrix (joints, joints) [kg m^2] excludes the rotors; the torques are (joints,) [N m].
+        """
         equations(self._chain, np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64), self._work)
         return self._work[5].copy(), self._work[6].copy()
 
 
 def _constants(drive: Drive) -> tuple[float, ...]:
-    """In the order of `chain_kernel`."""
+    """Return the constants of a drive in the order of `chain_kernel`."""
     low, high = drive.stops or (-inf, inf)
     return (
         *(drive.torque_constant, drive.current_lag, drive.offset, drive.viscous),

@@ -1,4 +1,4 @@
-"""A spatial arm behind the fake servos, described: a URDF's links, how the real ones differ, and drives."""
+"""Description of a spatial fake arm: a URDF's links, how the true ones differ from them, and the drives."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -19,26 +19,29 @@ PLANAR_ONLY = (
 
 
 class ChainArm(BaseModel):
-    """A serial arm of up to seven joints in space. Its servos' bodies are part of the URDF's links."""
+    """A serial arm of up to seven joints in space. The servos' bodies are part of the URDF's links."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    urdf: str = Field(description="file with the links; a relative path is looked up beside the TOML file")
+    urdf: str = Field(description="file with the links; a relative path is relative to the TOML file")
     joints: tuple[str, ...] = Field(
-        strict=False, min_length=1, max_length=MOST_JOINTS, description="the URDF's names, from the base outwards"
+        strict=False,
+        min_length=1,
+        max_length=MOST_JOINTS,
+        description="joint names in the URDF, from the base outwards",
     )
     start: tuple[Finite, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
-    gravity: NotNegative = Field(9.81, description="[m/s^2]")
+    gravity: NotNegative = Field(9.81, description="acceleration of gravity [m/s^2]")
     base: Annotated[tuple[Finite, Finite, Finite], Field(strict=False)] = Field(
         (0.0, 0.0, 0.0), description="roll, pitch and yaw of the base [rad]"
     )
     mass_scale: tuple[Positive, ...] | None = Field(
-        None, strict=False, description="true over the URDF's mass and inertia, per joint's link"
+        None, strict=False, description="ratio of true mass and inertia to the URDF's, per link"
     )
     centre_shift: tuple[Finite, ...] | None = Field(
-        None, strict=False, description="of each link's centre of mass along its frame's x axis [m]"
+        None, strict=False, description="shift of each link's true centre of mass along its frame's x axis [m]"
     )
-    drives: tuple[Drive, ...] = Field(strict=False, description="one for each joint; their mass is not used")
+    drives: tuple[Drive, ...] = Field(strict=False, description="drives, one per joint; their mass is not used")
 
     @model_validator(mode="after")
     def _one_of_each_per_joint(self) -> Self:
@@ -50,7 +53,7 @@ class ChainArm(BaseModel):
         for name, angle, drive in zip(self.joints, self.start, self.drives, strict=True):
             told = [term for term in PLANAR_ONLY if getattr(drive, term)]
             if told:
-                raise ValueError(f"drives: {told[0]} of {name}: for planar fake arms only; leave it out")
+                raise ValueError(f"drives: {told[0]} of {name}: is only supported by planar fake arms; leave it out")
             if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
                 raise ValueError(f"start: {angle:g} rad for joint {name} is beyond its stops {list(drive.stops)}")
         _ = self.description
@@ -63,7 +66,7 @@ class ChainArm(BaseModel):
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """The links as they really are."""
+        """The true mass properties of the links."""
         count = len(self.joints)
         scales, shifts = self.mass_scale or (1.0,) * count, self.centre_shift or (0.0,) * count
         return tuple(
@@ -77,5 +80,5 @@ class ChainArm(BaseModel):
 
     @property
     def gravity_vector(self) -> np.ndarray:
-        """In the base's frame (3,) [m/s^2]."""
+        """Gravity in the base's frame (3,) [m/s^2]."""
         return np.asarray(rotation_of(*self.base).T @ np.array([0.0, 0.0, -self.gravity]))

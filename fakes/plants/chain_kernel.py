@@ -1,15 +1,15 @@
-"""The compiled motion of a spatial arm from masses, centres and inertias of its links.
+"""Compiled equations of motion of a spatial arm, from the masses, centres of mass and inertias of its links.
 
-Kane's equations with each link's centre of mass: its Jacobians Jv and Jw give mass matrix and forces,
+Kane's equations: the Jacobians Jv and Jw of each link's centre of mass yield mass matrix and bias forces,
 
     M = sum of m Jv'Jv + Jw' I Jw        bias = sum of Jv' m (a - g) + Jw' (I alpha + omega x I omega)
 
-with a and alpha of the joints' velocities alone. The estimator writes the same arm by spatial vectors and a regressor
-of base parameters; a test holds the two together.
+where a and alpha are the accelerations due to the joint velocities alone. The estimator models the same arm
+independently, with spatial vectors and a regressor of base parameters; a test compares the two.
 
-Time is stepped as in `hil.fakes.plants.two_link`: symmetric, of second order, dry friction as an impulse on each joint
-of at most its level times the step and as much of it as brings the joint to rest, a step cut where a velocity changes
-sign.
+Time integration is as in `hil.fakes.plants.two_link`: symmetric and second-order. Dry friction is an impulse on each
+joint, limited to its level times the step and just large enough to bring the joint to rest; a step in which a velocity
+changes sign is split there.
 """
 
 import math
@@ -28,7 +28,7 @@ DRIVE = 16
 
 
 def _frames(rotation: Any, shift: Any, axis: Any, q: Any, turn: Any, at: Any, z: Any) -> None:
-    """Rotation of each link, its joint's place and axis, seen from the base."""
+    """Compute each link's rotation and its joint's position and axis in the base frame, into `turn`, `at` and `z`."""
     for i in range(q.size):
         for r in range(3):
             if i == 0:
@@ -60,7 +60,7 @@ def _frames(rotation: Any, shift: Any, axis: Any, q: Any, turn: Any, at: Any, z:
 
 
 def _equations(chain: Any, q: Any, v: Any, work: Any) -> None:  # noqa: PLR0912
-    """Mass matrix and bias at this state, into `work`."""
+    """Compute mass matrix and bias at this state, into `work`."""
     rotation, shift, axis, gravity, mass, centre, inertia = chain
     turn, at, z, jv, spin, M, bias = work
     n = q.size
@@ -69,7 +69,7 @@ def _equations(chain: Any, q: Any, v: Any, work: Any) -> None:  # noqa: PLR0912
         bias[i] = 0.0
         for j in range(n):
             M[i, j] = 0.0
-    w0 = w1 = w2 = e0 = e1 = e2 = 0.0  # angular velocity and acceleration of the link before
+    w0 = w1 = w2 = e0 = e1 = e2 = 0.0  # angular velocity and acceleration of the previous link
     p0 = p1 = p2 = 0.0  # acceleration of the joint
     for i in range(n):
         if i > 0:
@@ -126,8 +126,11 @@ def _equations(chain: Any, q: Any, v: Any, work: Any) -> None:  # noqa: PLR0912
 
 
 def _push(d: Any, j: int, step: float, command: float, q: float, v: float, amps: Any, out: Any) -> None:
-    """One drive during one step: mean torque without sticking friction, that friction's level, slope of the smooth
-    friction, and the current at the end of the step, into `out`'s rows."""
+    """Compute the effect of drive `j` during one step, into the rows of `out`.
+
+    The rows are: mean torque without stiction, level of dry friction, slope of the smooth friction, and the current at
+    the end of the step.
+    """
     away = amps[j] - command
     left, mean = 0.0, 0.0
     if d[LAG, j] > 0.0:
@@ -152,7 +155,7 @@ def _push(d: Any, j: int, step: float, command: float, q: float, v: float, amps:
 
 
 def _solve(A: Any, b: Any, x: Any) -> None:
-    """x of A x = b, A symmetric positive definite; A keeps its upper triangle."""
+    """Solve A x = b for a symmetric positive definite A, whose strict upper triangle is left unchanged."""
     n = b.size
     for i in range(n):
         for j in range(i + 1):
@@ -173,9 +176,9 @@ def _solve(A: Any, b: Any, x: Any) -> None:
 
 
 def _stick(A: Any, b: Any, dry: Any, x: Any) -> None:
-    """Velocities when each joint's friction may take any impulse up to `dry` [N m s].
+    """Compute the velocities when each joint's friction may take any impulse up to `dry` [N m s], into `x`.
 
-    They minimise x'Ax/2 - b'x + dry'|x|, which is convex: solving for one joint at a time converges.
+    They minimise x'Ax/2 - b'x + dry'|x|, which is convex, so solving for one joint at a time converges.
     """
     n = b.size
     for _ in range(SWEEPS):
@@ -199,8 +202,10 @@ def _stick(A: Any, b: Any, dry: Any, x: Any) -> None:
 def _run_loop(  # noqa: PLR0912
     chain: Any, drive: Any, jam: Any, state: Any, command: Any, remaining: float, longest: float, work: Any, room: Any
 ) -> None:
-    """Take steps of at most `longest` [s] through `remaining` [s]; state (4, joints): angles, velocities, last
-    accelerations, currents."""
+    """Integrate over `remaining` [s] in steps of at most `longest` [s].
+
+    state (4, joints): angles, velocities, previous accelerations, currents; updated in place.
+    """
     q, v, a, amps = state[0], state[1], state[2], state[3]
     M, bias = work[5], work[6]
     A, middle_q, middle_v, b, slid, new, dry, out = room

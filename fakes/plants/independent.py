@@ -1,4 +1,4 @@
-"""Uncoupled joints: each is a separate link on its own drive.
+"""Uncoupled joints: each is a separate link with its own drive.
 
     [fake]
     plant = "hil.fakes.plants.independent:make_plant"
@@ -9,8 +9,8 @@
     links = [{ length = 0.1, mass = 0.05, centre = 0.05, inertia = 1e-4 }]
     drives = [{ mass = 0.02, rotor_inertia = 8e-8, gear_ratio = 288.4, torque_constant = 0.35, viscous = 0.01 }]
 
-Each joint is described as an arm of one joint. Good enough for programs that talk to servos and move an arm; not for
-those that depend on coupling between joints.
+Each joint is described as an arm with one joint. This suffices for programs that communicate with servos and move an
+arm, but not for those that depend on the coupling between joints.
 """
 
 from collections.abc import Sequence
@@ -65,12 +65,12 @@ class Independent:
 
 
 def make_plant(**options: object) -> Independent:
-    """The factory; `joints`: tables of arms with one link and one drive each. Raises PlantError."""
+    """Create the plant from `joints`: tables of arms with one link and one drive each. Raises PlantError."""
     try:
         joints = _Joints.model_validate(options).joints
     except ValidationError as error:
         raise PlantError(describe(error, "plant_options", _Joints)) from error
     for number, arm in enumerate(joints, start=1):
         if len(arm.links) != 1:
-            raise PlantError(f"plant_options: joints[{number}] has {len(arm.links)} links: one each")
+            raise PlantError(f"plant_options: joints[{number}] has {len(arm.links)} links: each must have one")
     return Independent(joints)

@@ -1,25 +1,26 @@
-"""One joint's drive while a plant steps: current lag, torque, friction, stops. Plain floats, called every step.
+"""One joint's drive during a plant's time step: current lag, torque, friction, stops. Plain floats, called every step.
 
-Dry friction that yields before it slides is that of Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions
-on Automatic Control 40 (1995) 419): bristles that bend with the joint and slip the more the further they are bent,
+Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
+(1995) 419): bristles deflect with the joint, and slip more the further they are deflected,
 
-    friction = stiffness bend + damping bend'        bend' = velocity (1 - stiffness bend / +-level)
+    friction = stiffness deflection + damping deflection'
+    deflection' = velocity (1 - stiffness deflection / +-level)
 """
 
 from math import copysign, exp, expm1, sin, sqrt, tanh
 
 from hil.fakes.plants.arm import Drive, armature
 
-LONGEST_STEP = 0.6e-3  # s: short against the arm's own motion
-SHORTEST_STEP = 1e-9  # s: less than this is rounding
-STEP_PER_WIDTH = 0.02  # s per rad/s: short against the time the arm takes to cross a smooth friction step
-STEP_PER_SWING = 0.2  # of the time in which a rotor on its bristles swings through one radian of phase
+LONGEST_STEP = 0.6e-3  # s: short compared with the time scale of the arm's motion
+SHORTEST_STEP = 1e-9  # s: anything shorter is rounding error
+STEP_PER_WIDTH = 0.02  # s per rad/s: short compared with the time in which the arm crosses a smooth friction step
+STEP_PER_SWING = 0.2  # of the time in which a rotor on its bristles oscillates through one radian of phase
 LEAST_GRIP = 5.0  # N m s/rad between a hand and the joint that it moves
-JAM = 1e6  # N m of dry friction: more than anything here can push
+JAM = 1e6  # N m of dry friction: more than any drive here can overcome
 
 
 class Motor:
-    """The laws of one drive. It holds no state of the arm; only its current and its friction's bristles move in it."""
+    """The physics of one drive. Its only state is its current and the deflection of its friction's bristles."""
 
     __slots__ = (
         "_bent",
@@ -50,7 +51,7 @@ class Motor:
         self._shaped = bool(
             drive.ripple or drive.cogging or drive.load or drive.stops or drive.saturation or drive.cable_stiffness
         )
-        # Torque falls behind current like 1 / sqrt(1 + x^2), so that the share is lost at that current.
+        # Torque falls below linear like 1 / sqrt(1 + x^2), scaled so that the given fraction is lost at that current.
         self._bent = (1.0 / (1.0 - drive.saturation) ** 2 - 1.0) / (
             drive.torque_constant * drive.saturation_current
         ) ** 2
@@ -58,13 +59,13 @@ class Motor:
         self._step = self._left = self._mean_left = self._level = 0.0
         self._bristle_damping = drive.presliding_damping
         self.bristle_stiffness = drive.presliding_stiffness
-        """0 for dry friction that sticks [N m/rad]."""
+        """Stiffness of presliding friction [N m/rad]; 0 for rigid stiction."""
         self.bristle_torque = 0.0  # N m
         self._set_friction(0.0)
         self.jammed = False
-        """True: something holds the joint fast."""
+        """Whether the joint is blocked."""
         self.held_at: float | None = None
-        """The velocity of a hand that holds the joint [rad/s]; None where none does."""
+        """Velocity at which a hand moves the joint [rad/s]; None if no hand holds it."""
         self.current = 0.0  # A
         self.longest_step = min(LONGEST_STEP, STEP_PER_WIDTH * self._width) if self._width else LONGEST_STEP
         if self.bristle_stiffness and drive.rotor_inertia:
@@ -72,7 +73,7 @@ class Motor:
             self.longest_step = min(LONGEST_STEP, STEP_PER_SWING * swing)
 
     def warm_up(self, time: float) -> None:
-        """Friction is from here on what it is at `time` [s] since the drive was switched on."""
+        """Set friction to its value at `time` [s] since power-up."""
         if self._warms_up:
             self._set_friction(time)
 
@@ -91,14 +92,14 @@ class Motor:
 
     @property
     def is_plain(self) -> bool:
-        """Whether lag, torque, offset and sticking Stribeck friction are all there is to it."""
+        """Whether the drive has only lag, torque, offset and Stribeck friction with stiction."""
         return not (self._shaped or self._width or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
-        """What the drive does during one step, its angle and velocity given at the step's middle.
+        """Return the effect of the drive during one step, given angle and velocity at the middle of the step.
 
-        Returns the mean torque without dry friction that sticks [N m], the level of that friction [N m], the
-        slope of smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
+        Returns the mean torque without stiction [N m], the level of the dry friction that sticks [N m], the slope of
+        the smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
         """
         torque_constant, offset, level, rise, per_velocity = self.constants
         left, mean_left = self.lag(step)
@@ -120,7 +121,7 @@ class Motor:
             self._level = level
             end = copysign(level, velocity)
             turns = self.bristle_stiffness * abs(velocity) * step / level
-            # Its mean over a step at a constant velocity, exactly.
+            # Exact mean over a step at constant velocity.
             bent = end + (self.bristle_torque - end) * (-expm1(-turns) / turns if turns else 1.0)
             give = 1.0 - copysign(bent, bent * velocity) / level
             stiff = (0.5 * step * self.bristle_stiffness + self._bristle_damping) * give
@@ -130,26 +131,26 @@ class Motor:
         if self.jammed:
             level += JAM
         if self.held_at is not None:
-            # Stiff enough to take a bare rotor along within one step, and not stiffer: the hand's skin.
+            # Just stiff enough to move a bare rotor within one step.
             grip = max(2.0 * armature(self._drive) / step, LEAST_GRIP)
             torque += grip * (self.held_at - velocity)
             slope += grip
         return torque, level, slope, command + away * left
 
     def bend(self, step: float, velocity: float) -> None:
-        """Move the bristles through the step last asked for, its mean velocity [rad/s] now known."""
+        """Advance the bristles through the step passed to `push` last, now that its mean velocity [rad/s] is known."""
         if self.bristle_stiffness:
             self.bristle_torque = self._slipped(step, velocity)
 
     def _slipped(self, step: float, velocity: float) -> float:
-        """The bristles' torque after `step` [s] at a constant velocity, exactly [N m]."""
+        """Return the exact bristle torque after `step` [s] at a constant velocity [N m]."""
         end = copysign(self._level, velocity)
         return end + (self.bristle_torque - end) * exp(-self.bristle_stiffness * abs(velocity) * step / self._level)
 
     def lag(self, step: float) -> tuple[float, float]:
-        """How much of a current's distance from its command is left at the end of a step, and on its average."""
+        """Return the remaining fraction of a current error at the end of a step, and its mean over the step."""
         if self._lag and step != self._step:
-            # A first-order lag under a constant command, exactly.
+            # Exact solution of a first-order lag under a constant command.
             self._step = step
             fallen = -expm1(-step / self._lag)
             self._left = 1.0 - fallen
@@ -159,7 +160,7 @@ class Motor:
     def _shape(
         self, step: float, torque: float, level: float, angle: float, velocity: float
     ) -> tuple[float, float, float]:
-        """Saturation, ripple, cogging, friction from load, a cable and stops, which only some drives have."""
+        """Apply saturation, ripple, cogging, load-dependent friction, cable and stops, which only some drives have."""
         drive = self._drive
         slope = 0.0
         if self._bent:
@@ -169,7 +170,7 @@ class Motor:
         if drive.load:
             level += drive.load * abs(torque)
         if drive.cogging:
-            # Its mean over the step: a joint that turns through whole cycles in a step feels nothing of them.
+            # Mean over the step: a joint that turns through whole cycles within a step experiences no net cogging.
             half = 0.5 * step * drive.cogging_cycles * velocity
             torque += drive.cogging * sin(drive.cogging_cycles * angle) * (sin(half) / half if half else 1.0)
         if drive.cable_stiffness:

@@ -1,11 +1,11 @@
-"""An MJCF model behind the fake servos, simulated by MuJoCo (`pip install hil[mujoco]`).
+"""A MuJoCo model (MJCF) as a plant (`pip install hil[mujoco]`).
 
     [fake]
     plant = "hil.fakes.plants.mujoco_plant:make_plant"
     plant_options = { model = "arm.xml", joints = ["shoulder", "elbow"], torque_constant = [1.8, 1.8] }
 
-The model's own joints carry friction, armature and limits; its actuators are not used. The motor torque, current times
-torque constant, is applied to the joint directly. A joint angle of the model is the joint angle of the servo.
+Friction, armature and limits are those of the model's joints; its actuators are not used. The motor torque, current
+times torque constant, is applied directly to the joint. The servo's joint angle is the joint angle of the model.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ except ImportError as error:
 
 
 class MujocoPlant:
-    """See `hil.fakes.plants.plant.Plant`. Steps of at most the model's own `timestep` [s]."""
+    """A plant simulated by MuJoCo in steps of at most the model's `timestep`; see `hil.fakes.plants.plant.Plant`."""
 
     def __init__(self, model: Any, joints: Sequence[str], torque_constant: Sequence[float], current_lag: float) -> None:
         self._model = model
@@ -70,7 +70,7 @@ class MujocoPlant:
         self._model.opt.timestep = remaining / steps
         for _ in range(steps):
             self._one_step(remaining / steps, np.asarray(current, dtype=float))
-        self._data.time = until  # not the sum of many roundings
+        self._data.time = until  # avoids accumulated rounding errors
 
     def _one_step(self, step: float, command: Any) -> None:
         left = np.exp(-step / self._lag) if self._lag else 0.0
@@ -91,9 +91,13 @@ class MujocoPlant:
 def make_plant(
     model: str, joints: Sequence[str], torque_constant: Sequence[float], current_lag: float = 0.0
 ) -> MujocoPlant:
-    """The factory: model, the MJCF file's path (or its text); joints, hinges by name in the order of the servos.
+    """Create the plant.
 
-    torque_constant [N m/A], one per joint; current_lag [s], first order. Raises PlantError.
+    model: path of the MJCF file, or its text.
+    joints: names of hinge joints in the order of the servos.
+    torque_constant: torque per current of each joint [N m/A].
+    current_lag: time constant of the first-order current loop [s].
+    Raises PlantError.
     """
     is_text = model.lstrip().startswith("<")
     try:

@@ -1,4 +1,4 @@
-"""One link and one joint: the plant of `hil.fakes.plants.two_link` with nothing at its end."""
+"""One link and one joint: the plant of `hil.fakes.plants.two_link` without its second link."""
 
 from collections.abc import Sequence
 from math import ceil, copysign, cos
@@ -8,7 +8,7 @@ from hil.fakes.plants.motor import SHORTEST_STEP, Motor
 
 
 class Pendulum:
-    """A one-joint arm; see `hil.fakes.plants.plant.Plant`. `velocity` [rad/s] is the joint's at time 0."""
+    """A one-joint arm; see `hil.fakes.plants.plant.Plant`. `velocity` is the joint's velocity at time 0 [rad/s]."""
 
     def __init__(self, arm: Arm, velocity: Sequence[float] = (0.0,)) -> None:
         (link,) = arm.links
@@ -59,7 +59,7 @@ class Pendulum:
                 self._step(step - taken, command, False)
 
     def _step(self, step: float, command: float, cut: bool) -> float:
-        """Take one step, or with `cut` its part up to where the velocity changes sign; return its length."""
+        """Take one step, or with `cut` only the part up to a change of sign of the velocity; return its length [s]."""
         half = 0.5 * step
         v = self._v
         middle_v = v + half * self._a if v else 0.0
@@ -74,7 +74,7 @@ class Pendulum:
                 shorter = step * v / (v - new)
                 if SHORTEST_STEP < shorter < step - SHORTEST_STEP:
                     return self._step(shorter, command, False)
-            # Friction takes as much of the impulse as brings the joint to rest, up to its limit.
+            # Friction takes just enough of the impulse to bring the joint to rest, up to its limit.
             new = copysign(max(abs(impulse) - dry, 0.0), impulse) / (self._inertia + damp)
         self._a = (new - v) / step
         self._motor.bend(step, 0.5 * (v + new))

@@ -1,7 +1,7 @@
-"""Plants, the mechanisms behind the fake servos: their interface, and how to load one.
+"""Plants, the mechanisms that the fake servos drive: their interface, and how to load one.
 
-A plant of your own is any object with the members of `Plant`, made by a function that takes the description's
-`plant_options` as keywords:
+A custom plant is any object with the members of `Plant`, created by a function that takes the description's
+`plant_options` as keyword arguments:
 
     [fake]
     plant = "my_package.my_arm:make_plant"
@@ -21,14 +21,14 @@ from hil.fakes.plants.two_link import TwoLink
 
 
 class PlantError(ValueError):
-    """A plant cannot be made, or returned an invalid state. The message says which and what is required."""
+    """A plant cannot be created, or returned an invalid state. The message says which one and what is required."""
 
 
 class Plant(Protocol):
-    """A mechanism with one motor per joint, advanced lazily by the bus in the bus's own time.
+    """A mechanism with one motor per joint, advanced lazily by the bus on the bus's own time.
 
-    Angles and velocities are those of the servos' output shafts: joint 1 from the horizontal, joint 2 relative to
-    link 1 (two-link arm). `current` is what really flows in each motor, after its current loop's lag.
+    Angles and velocities are those of the servos' output shafts: joint 1 is measured from the horizontal, joint 2
+    relative to link 1 (two-link arm). `current` is the actual motor current, after the current loop's lag.
     """
 
     @property
@@ -50,75 +50,78 @@ class Plant(Protocol):
         ...
 
     def advance(self, until: float, current: Sequence[float]) -> None:
-        """Move on to time `until` [s] with the commanded motor currents [A] held constant from the present time on.
+        """Advance to time `until` [s] with constant commanded motor currents [A].
 
-        Returns at once when `until` is not later than the plant's present time.
+        Returns immediately if `until` is not later than the plant's current time.
         """
         ...
 
 
 @runtime_checkable
 class CanJam(Protocol):
-    """A plant that can hold a joint fast, for the fault `stuck_joint`."""
+    """A plant that can block a joint, for the fault `stuck_joint`."""
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Hold joint `joint` (from 0) fast, or let it go."""
+        """Block joint `joint` (counted from 0), or release it."""
         ...
 
 
 @runtime_checkable
 class CanBeHeld(Protocol):
-    """A plant whose joints a hand can take and move, for `hil.fakes.bus.hand`."""
+    """A plant whose joints a hand can grip and move, for `hil.fakes.bus.hand`."""
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Take joint `joint` (from 0) and move it at `velocity` [rad/s] until told otherwise; None lets it go."""
+        """Grip joint `joint` (from 0) and move it at `velocity` [rad/s] until the next call; None releases it."""
         ...
 
 
 def make_plant(arm: Arm) -> Plant:
-    """The plant of this arm, at rest in its starting pose at time 0."""
+    """Return the plant of this planar arm, at rest in its initial pose at time 0."""
     if any(drive.backlash for drive in arm.drives):
         return GearedArm(arm)
     return Pendulum(arm) if len(arm.links) == 1 else TwoLink(arm)
 
 
 def make_chain(arm: ChainArm) -> Plant:
-    """The plant of this spatial arm, at rest in its starting pose at time 0."""
-    from hil.fakes.plants.chain import SpatialChain  # compiled: only who needs it waits for the compiler
+    """Return the plant of this spatial arm, at rest in its initial pose at time 0."""
+    from hil.fakes.plants.chain import SpatialChain  # imported here because it is compiled on first use
 
     return SpatialChain(arm)
 
 
 OWN_PLANTS = frozenset({"hil.fakes.plants.independent:make_plant", "hil.fakes.plants.mujoco_plant:make_plant"})
-"""What a description may call without leave. A whitelist: `getattr` of any module here reaches what it imports."""
+"""Factories that a description may name without permission.
+
+Only these exact names are allowed, since `getattr` on a module of hil also reaches whatever that module imports.
+"""
 
 _leave = {"code": False}
 
 
 def allow_code(allowed: bool = True) -> None:
-    """Let descriptions call any function that can be imported, for the rest of this process; by default they may not.
+    """Permit descriptions to call any importable function for the rest of this process; by default they may not.
 
-    Who opens a file whose `plant` names a function runs that function with the file's arguments.
+    Opening a file whose `plant` names a function runs that function with the file's arguments.
     """
     _leave["code"] = allowed
 
 
 def load_plant(name: str, options: Mapping[str, object]) -> Plant:
-    """The plant that `module:factory` makes from `options`; raises PlantError.
+    """Create a plant with the factory `module:factory` and these options; raises PlantError.
 
-    Outside `OWN_PLANTS` only after `allow_code`.
+    Factories outside `OWN_PLANTS` require `allow_code`.
     """
     if name not in OWN_PLANTS and not _leave["code"]:
         raise PlantError(
-            f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Look at it; '
-            "if you trust the file, say --allow-code, or hil.fakes.allow_code() in Python. Without it a file may name "
-            f"{' and '.join(sorted(OWN_PLANTS))} only"
+            f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Inspect it; '
+            "if you trust the file, use --allow-code, or hil.fakes.allow_code() in Python. Without it only "
+            f"{' and '.join(sorted(OWN_PLANTS))} are allowed"
         )
     module_name, _, factory_name = name.partition(":")
     try:
         factory = getattr(importlib.import_module(module_name), factory_name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise PlantError(f'plant = "{name}": {error}; write "module:factory", importable from here') from error
+        raise PlantError(f'plant = "{name}": {error}; give "module:factory" of an importable module') from error
     try:
         plant = factory(**options)
     except PlantError:
@@ -138,7 +141,7 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
 
 
 class CheckedPlant:
-    """A third-party plant whose state is checked after every step. Raises PlantError."""
+    """A third-party plant whose state is checked after every step; raises PlantError."""
 
     def __init__(self, plant: Plant, name: str) -> None:
         self._plant = plant
@@ -167,19 +170,19 @@ class CheckedPlant:
         self.check()
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Pass it on; PlantError when the plant cannot."""
+        """Block or release a joint; raises PlantError if the plant does not support this."""
         if not isinstance(self._plant, CanJam):
-            raise PlantError(f'plant "{self._name}" has no jam(joint, jammed): a stuck joint needs it')
+            raise PlantError(f'plant "{self._name}" has no jam(joint, jammed): the fault stuck_joint needs it')
         self._plant.jam(joint, jammed)
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Pass it on; PlantError when the plant cannot."""
+        """Grip, move or release a joint; raises PlantError if the plant does not support this."""
         if not isinstance(self._plant, CanBeHeld):
             raise PlantError(f'plant "{self._name}" has no hold(joint, velocity): the hand needs it')
         self._plant.hold(joint, velocity)
 
     def check(self) -> None:
-        """Raise PlantError unless the state is one finite number per joint, three times."""
+        """Raise PlantError unless position, velocity and current each have one finite number per joint."""
         for what in ("position", "velocity", "current"):
             values = getattr(self._plant, what)
             try:

@@ -1,20 +1,20 @@
-"""Two links in a plane, from masses, lengths and gears: what moves behind the fake servos.
+"""A planar two-link arm, simulated from masses, lengths and gear ratios.
 
-Kinetic energy, with w1 = q1' and w2 = q1' + q2' the links' own turning rates and phi1, phi2 their angles:
+Kinetic energy, where w1 = q1' and w2 = q1' + q2' are the links' angular velocities and phi1, phi2 their angles:
 
     link 1      m1 c1^2 w1^2 / 2 + J1 w1^2 / 2
     elbow       m_elbow l1^2 w1^2 / 2
     link 2      m2 (l1^2 w1^2 + c2^2 w2^2 + 2 l1 c2 w1 w2 cos(phi2 - phi1)) / 2 + J2 w2^2 / 2
     rotors      n1^2 Jr1 q1'^2 / 2 + n2^2 Jr2 q2'^2 / 2
 
-Lagrange's equations are taken in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2; added up
-they give the joints' own. The estimator writes the same arm as a regressor in base parameters; a test holds
-the two together.
+Lagrange's equations are derived in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2; their sum and the
+second one are the equations in the joint angles. The estimator models the same arm independently, as a regressor in
+base parameters; a test compares the two.
 
-One step of time is symmetric and of second order: drift half a step, kick with the step's mean motor torque
-and friction at its middle, drift half a step. Dry friction acts as an impulse on each joint, at most its
-level times the step, and as much of it as brings the joint to rest: sticking is exact. A step in which a
-joint's velocity changes sign is cut at the crossing.
+Time integration is symmetric and second-order: drift half a step, kick with the step's mean motor torque and the
+friction at its middle, drift half a step. Dry friction is an impulse on each joint, limited to its level times the step
+and just large enough to bring the joint to rest, so stiction is exact. A step in which a joint's velocity changes sign
+is split there.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from hil.fakes.plants.motor import SHORTEST_STEP, Motor
 
 
 class TwoLink:
-    """A two-joint arm; see `hil.fakes.plants.plant.Plant`. `velocity` [rad/s] is the joints' at time 0."""
+    """A two-joint arm; see `hil.fakes.plants.plant.Plant`. `velocity` is the joint velocities at time 0 [rad/s]."""
 
     def __init__(self, arm: Arm, velocity: Sequence[float] = (0.0, 0.0)) -> None:
         first, second = arm.links
@@ -42,7 +42,7 @@ class TwoLink:
         self._time = 0.0
         self._q1, self._q2 = arm.start
         self._v1, self._v2 = velocity
-        self._a1 = self._a2 = 0.0  # the last step's accelerations, which carry velocities to a middle
+        self._a1 = self._a2 = 0.0  # accelerations of the last step, to extrapolate velocities to the next step's middle
 
     @property
     def joints(self) -> int:
@@ -78,10 +78,11 @@ class TwoLink:
         self._run(remaining, remaining / ceil(remaining / self._longest_step), *current)
 
     def _run(self, remaining: float, longest: float, i1: float, i2: float) -> None:  # noqa: PLR0915
-        """Take steps of at most `longest` [s] through `remaining` [s] under commanded currents [A].
+        """Integrate over `remaining` [s] in steps of at most `longest` [s] with commanded currents [A].
 
-        One long loop on plain local floats, because this is where a fake arm spends its time: as a function per step it
-        takes half as long again. A step in which a joint's velocity changes sign is first taken up to there (`cut`).
+        This is one long loop on local floats because a fake arm spends most of its time here: with a function call per
+        step it takes 1.5 times as long. A step in which a joint's velocity changes sign is first taken up to that point
+        (`cut`).
         """
         motor_1, motor_2 = self._motors
         plain = motor_1.is_plain and motor_2.is_plain
@@ -104,7 +105,7 @@ class TwoLink:
             middle_v2 = v2 + half * a2 if v2 else 0.0
             middle_q1 = q1 + half * v1
             middle_q2 = q2 + half * v2
-            if plain:  # as Motor.push has it
+            if plain:  # same as Motor.push
                 if step != prepared:
                     prepared = step
                     left_1, mean_1 = motor_1.lag(step)
@@ -127,7 +128,7 @@ class TwoLink:
             force_1 = push_1 + turning * (w2 * w2 - middle_v1 * middle_v1) - weight_first * cos(middle_q1) - weight_2
             force_2 = push_2 - turning * middle_v1 * middle_v1 - weight_2
 
-            # Viscous friction at the mean of old and new velocity, smooth friction linearised about the middle:
+            # Viscous friction at the mean of old and new velocity, smooth friction linearised about the middle,
             # (M + D) new = (M - D) v + step (force + slope middle_v) - dry, with D = step / 2 (viscous + slope).
             m12 = inertia_second + across
             m11 = turned_first + across + m12
@@ -139,7 +140,7 @@ class TwoLink:
             m22 = turned_second + damp_2
             dry_1 = step * level_1
             dry_2 = step * level_2
-            # First as if both joints went on sliding the way they do.
+            # First assume that both joints keep sliding in their present direction.
             slid_1 = b1 - dry_1 if v1 > 0.0 else b1 + dry_1
             slid_2 = b2 - dry_2 if v2 > 0.0 else b2 + dry_2
             determinant = m11 * m22 - m12 * m12
@@ -155,7 +156,7 @@ class TwoLink:
                 new_1, new_2 = _sticking((m11, m12, m22), (b1, b2), (dry_1, dry_2), (new_1, new_2))
             a1 = (new_1 - v1) / step
             a2 = (new_2 - v2) / step
-            if jammed:  # an impulse within a tiny step says nothing of the next one's middle
+            if jammed:  # the impulse of a tiny step cannot be extrapolated to the next
                 a1 = a2 = 0.0
             if bristly:
                 motor_1.bend(step, 0.5 * (v1 + new_1))
@@ -179,7 +180,7 @@ def _about_joint(link: Link) -> float:
 
 
 def _until_zero(old: float, new: float) -> float:
-    """Fraction of the step after which the velocity is zero; 1 if it does not reach zero or starts there."""
+    """Return the fraction of the step after which the velocity is zero; 1 if it does not cross zero or starts there."""
     return old / (old - new) if old * new < 0.0 else 1.0
 
 
@@ -189,9 +190,9 @@ def _sticking(
     dry: tuple[float, float],
     guess: tuple[float, float],
 ) -> tuple[float, float]:
-    """New velocities [rad/s] when each joint's friction may take any impulse up to `dry` [N m s].
+    """Return the new velocities [rad/s] when each joint's friction may take any impulse up to `dry` [N m s].
 
-    They minimise v'Mv/2 - impulse'v + dry'|v|, which is convex: solving for one joint at a time converges.
+    They minimise v'Mv/2 - impulse'v + dry'|v|, which is convex, so solving for one joint at a time converges.
     """
     m11, m12, m22 = mass
     v1, v2 = guess
@@ -205,7 +206,7 @@ def _sticking(
 
 
 def _shrunk(impulse: float, limit: float) -> float:
-    """The impulse that remains after friction has absorbed up to `limit` of it."""
+    """Return the impulse that remains after friction has absorbed up to `limit` of it."""
     if impulse > limit:
         return impulse - limit
     if impulse < -limit:

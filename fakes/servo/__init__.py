@@ -1,1 +1,1 @@
-"""One servo's control table as a state machine."""
+"""A simulated servo: its control table and the behaviour behind it."""

@@ -1,7 +1,7 @@
-"""Factory Reset and Control Table Backup: what they do to a control table.
+"""Factory Reset and Control Table Backup: their effect on a control table.
 
-Source: ROBOTIS e-Manual, protocol2. Unsure: what exactly a backup holds. Here it is every register that can be
-written, but for ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
+Source: ROBOTIS e-Manual, protocol2. It is uncertain what exactly a backup contains. Here it is every writable register
+except ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
 """
 
 from hil.drivers.packet import StatusError
@@ -17,7 +17,7 @@ _NOT_BACKED_UP = GOALS | {"ID", "Baud Rate", "Torque Enable", "Bus Watchdog"}
 
 
 def factory_reset(memory: Memory, body: bytes) -> int:
-    """Give the registers their factory values; the error number. The servo has to be rebooted then."""
+    """Reset the registers to their factory values; return the error number. The caller must then reboot the servo."""
     if len(body) != 1:
         return StatusError.DATA_LENGTH
     if body[0] not in (RESET_ALL, KEEP_ID, KEEP_ID_AND_BAUD):
@@ -34,13 +34,13 @@ def factory_reset(memory: Memory, body: bytes) -> int:
 
 
 class Backup:
-    """A copy of the control table in the servo's flash; survives power."""
+    """A copy of the control table in the servo's flash memory, which survives power-off."""
 
     def __init__(self) -> None:
         self._values: dict[str, int] | None = None
 
     def execute(self, memory: Memory, body: bytes) -> int:
-        """The instruction Control Table Backup; the error number."""
+        """Execute the instruction Control Table Backup; return the error number."""
         if len(body) != 1 + len(_SIGNATURE):
             return StatusError.DATA_LENGTH
         if body[1:] != _SIGNATURE or body[0] not in (_BACK_UP, _RESTORE):
@@ -61,7 +61,7 @@ class Backup:
         return StatusError.NONE
 
     def restore(self, memory: Memory, *, eeprom: bool) -> None:
-        """Write the copy back, its EEPROM area too if `eeprom`; nothing when there is none."""
+        """Write the copy back, including its EEPROM area if `eeprom`; do nothing if there is no copy."""
         for name, value in (self._values or {}).items():
             register = memory.registers[name]
             if eeprom or not register.eeprom:
@@ -69,5 +69,5 @@ class Backup:
         memory.follow_indirect_addresses()
 
     def mark(self, memory: Memory) -> None:
-        """Say in the register Backup Ready whether there is a copy."""
+        """Set the register Backup Ready to whether there is a copy."""
         memory.set("Backup Ready", int(self._values is not None))

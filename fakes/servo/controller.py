@@ -1,16 +1,16 @@
 """Motor control in each operating mode: PWM and current from goals, gains and profile.
 
 Source: the block diagrams and gain units of the ROBOTIS e-Manual (pages x/<model>, Velocity PI Gain, Position PID
-Gain): P gains count 1/128, I gains 1/65536, the D gain 1/16, feedforward gains 1/4 and 1/1. The period of the control
-loop (1 ms here), what exactly the D gain multiplies and the filters between are unsure, so a move is realistic but does
-not match the firmware to the tick.
+Gain): the units are 1/128 for P gains, 1/65536 for I gains, 1/16 for the D gain, 1/4 and 1 for the feedforward gains.
+The period of the control loop (1 ms here), the exact signal that the D gain multiplies and the filters in between are
+uncertain, so a move is realistic but does not match the firmware to the tick.
 """
 
 import math
 from dataclasses import dataclass
 
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import VELOCITY_UNIT_RPM, Model
+from hil.fakes.servo.registers import VELOCITY_UNIT_RPM, EmulatedModel
 from hil.fakes.servo.trajectory import ACCELERATION_PER_MS, VELOCITY_TICKS_PER_MS, Trajectory, profile
 
 CURRENT_MODE = 0
@@ -22,14 +22,14 @@ PWM_MODE = 16
 POSITION_MODES = frozenset({POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_POSITION_MODE})
 
 FULL_PWM = 885
-"""Goal PWM at which the motor sees the whole supply voltage."""
+"""Goal PWM at which the whole supply voltage is applied to the motor."""
 
 IN_POSITION_TICKS = 20
-"""Distance from the goal below which Moving Status says in-position. Unsure."""
+"""Distance from the goal below which Moving Status reports in-position. Uncertain."""
 
-_TIME_BASED = 0x04  # of Drive Mode
+_TIME_BASED = 0x04  # bit of Drive Mode
 
-# Moving Status
+# Bits of Moving Status
 _IN_POSITION = 0x01
 _PROFILE_ONGOING = 0x02
 _FOLLOWING_ERROR = 0x08
@@ -40,7 +40,7 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """The registers that the controller works from, in their own units."""
+    """The registers that the controller uses, in their own units."""
 
     mode: int
     pwm: int
@@ -61,7 +61,7 @@ class Goals:
 
     @classmethod
     def read(cls, mode: int, memory: Memory) -> "Goals":
-        """From a control table; 0 where the model has no such register."""
+        """Return the goals of a control table; 0 for registers that the model lacks."""
         value = memory.get
         return cls(
             mode=mode,
@@ -84,29 +84,29 @@ class Goals:
 
 
 class Controller:
-    """The control loop of one servo, run once a millisecond while torque is on."""
+    """The control loop of one servo, run once per millisecond while torque is on."""
 
     def __init__(self) -> None:
         self.goals: Goals | None = None
         self.trajectory = Trajectory()
         self.velocity_trajectory = 0.0
-        """Where velocity control wants to be [0.229 rev/min]."""
+        """Present setpoint of velocity control [0.229 rev/min]."""
         self._integral = 0.0
         self._error_before = 0.0
         self._goal_before: float | None = None
         self._fastest = self._hardest = 0.0
 
     def start(self, position_ticks: float) -> None:
-        """Torque comes on, or the mode changes: begin from a stand at the present position."""
+        """Start from rest at the present position, when torque is switched on or the mode changes."""
         self.trajectory.start(position_ticks)
         self.velocity_trajectory = 0.0
         self._integral = self._error_before = 0.0
         self._goal_before = None
 
-    def motor_current(self, model: Model, supply_v: float, position_ticks: float, velocity: float) -> float:
-        """One millisecond of control: the current that the motor is to carry [A], as far as the supply allows it.
+    def motor_current(self, model: EmulatedModel, supply_v: float, position_ticks: float, velocity: float) -> float:
+        """Run one millisecond of control; return the motor current [A], limited by the supply voltage.
 
-        velocity: of the output shaft [rad/s], positive as the servo counts.
+        velocity: velocity of the output shaft in the servo's sense of rotation [rad/s].
         """
         goals = self.goals
         if goals is None:
@@ -125,7 +125,7 @@ class Controller:
         return max((-most - back) / model.resistance_ohm, min((most - back) / model.resistance_ohm, wanted))
 
     def state(self, position_ticks: float) -> tuple[int, float, float]:
-        """The registers Moving Status, Velocity Trajectory and Position Trajectory, before rounding."""
+        """Return the registers Moving Status, Velocity Trajectory and Position Trajectory, before rounding."""
         velocity = self.trajectory.velocity / VELOCITY_TICKS_PER_MS
         if self.goals is not None and self.goals.mode == VELOCITY_MODE:
             velocity = self.velocity_trajectory
@@ -139,7 +139,7 @@ class Controller:
         return self._position_control(goals, position_ticks, abs(goals.pwm))
 
     def _moving_status(self, position_ticks: float) -> int:
-        """The register Moving Status. When the firmware calls a following error one is unsure."""
+        """Return the register Moving Status. The firmware's threshold for a following error is uncertain."""
         goals = self.goals
         if goals is None or goals.mode not in POSITION_MODES:
             return 0
@@ -175,7 +175,7 @@ class Controller:
         return self._limited(proportional, goals.position_i / 65_536 * error, limit)
 
     def _limited(self, proportional: float, integrated: float, limit: float) -> float:
-        """The sum within the limit; the integral stands still while the limit holds it (anti-windup)."""
+        """Return the sum, limited; the integral is frozen while the limit is active (anti-windup)."""
         wanted = proportional + self._integral + integrated
         if abs(wanted) <= limit or wanted * integrated < 0.0:
             self._integral += integrated

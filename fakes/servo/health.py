@@ -1,7 +1,8 @@
 """Effects of a servo's own current: heating and overload. Both are off unless described.
 
-Source of the errors: ROBOTIS e-Manual, Shutdown and Hardware Error Status. How the firmware decides on an overload is
-not published (unsure): here it is a current held above a threshold for a time, which forgets as fast as it counts.
+Source of the error bits: ROBOTIS e-Manual, Shutdown and Hardware Error Status. The firmware's criterion for an overload
+is not published. Here it is a current above a threshold for some time, with a timer that runs down at the same rate
+while the current is lower.
 """
 
 from typing import Annotated
@@ -10,26 +11,32 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Thermal(BaseModel):
-    """One lump of heat: the motor's I^2 R warms it, the surroundings cool it."""
+    """A single thermal mass, heated by the motor's I^2 R and cooled by the surroundings."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    resistance_k_w: Annotated[float, Field(gt=0, allow_inf_nan=False, description="from motor to surroundings [K/W]")]
+    resistance_k_w: Annotated[
+        float, Field(gt=0, allow_inf_nan=False, description="thermal resistance from motor to surroundings [K/W]")
+    ]
     time_s: Annotated[float, Field(gt=0, allow_inf_nan=False, description="time constant [s]")]
-    ambient_c: Annotated[float, Field(ge=-40, le=100, description="surroundings [C]")] = 25.0
+    ambient_c: Annotated[float, Field(ge=-40, le=100, description="temperature of the surroundings [C]")] = 25.0
 
 
 class Overload(BaseModel):
-    """A current that may not be held for long."""
+    """Shutdown after too long a time at a high current."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    current_a: Annotated[float, Field(gt=0, allow_inf_nan=False, description="motor current above which it counts [A]")]
-    time_s: Annotated[float, Field(gt=0, allow_inf_nan=False, description="how long that may last [s]")]
+    current_a: Annotated[
+        float, Field(gt=0, allow_inf_nan=False, description="motor current above which the timer runs [A]")
+    ]
+    time_s: Annotated[
+        float, Field(gt=0, allow_inf_nan=False, description="longest permitted time above that current [s]")
+    ]
 
 
 class Health:
-    """Temperature and overload of one servo over time."""
+    """Temperature and overload state of one servo."""
 
     def __init__(
         self, resistance_ohm: float, temperature_c: float, thermal: Thermal | None, overload: Overload | None
@@ -42,11 +49,11 @@ class Health:
 
     @property
     def changes(self) -> bool:
-        """Whether time does anything here."""
+        """Whether the state changes with time."""
         return self._thermal is not None or self._overload is not None
 
     def step(self, step_s: float, current_a: float) -> bool:
-        """Let time pass with this motor current; whether the servo is overloaded at its end."""
+        """Advance by `step_s` [s] with this motor current [A]; return whether the servo is then overloaded."""
         thermal = self._thermal
         if thermal is not None:
             end = thermal.ambient_c + thermal.resistance_k_w * self._resistance_ohm * current_a**2
@@ -59,5 +66,5 @@ class Health:
         return self._overloaded_s > overload.time_s
 
     def rest(self) -> None:
-        """Forget the overload, as a reboot does; warmth stays."""
+        """Reset the overload timer, as a reboot does; the temperature stays."""
         self._overloaded_s = 0.0

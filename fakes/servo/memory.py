@@ -1,15 +1,15 @@
-"""The bytes of one control table: reading and writing stretches of it, through indirect addresses too."""
+"""The bytes of one control table: reading and writing ranges of it, also through indirect addresses."""
 
 from collections.abc import Iterator
 
 from hil.drivers.packet import StatusError
-from hil.fakes.servo.registers import Model, Register
+from hil.fakes.servo.registers import EmulatedModel, Register
 
 
 class Memory:
-    """Registers as bytes. What may be written when, and its consequences, are decided in `hil.fakes.servo.servo`."""
+    """Registers as bytes. `hil.fakes.servo.servo` decides what may be written when, and the consequences."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: EmulatedModel) -> None:
         self.registers = model.registers
         self.data = bytearray(max(r.address + r.size for r in model.registers.values()))
         self._starting_at = {register.address: register for register in model.registers.values()}
@@ -17,23 +17,23 @@ class Memory:
         self._readable: set[tuple[int, int]] = set()
         self._blocks = model.indirect
         self._points: dict[int, int] = {}
-        """Indirect data that stand for another address: theirs, and the other."""
+        """Address that each indirect data byte refers to, by the byte's own address."""
 
     def __contains__(self, name: str) -> bool:
         return name in self.registers
 
     def value(self, name: str) -> int:
-        """The register's content; KeyError when the model has no such register."""
+        """Return the register's content; raises KeyError if the model has no such register."""
         register = self.registers[name]
         raw = self.data[register.address : register.address + register.size]
         return int.from_bytes(raw, "little", signed=register.signed)
 
     def get(self, name: str, otherwise: int = 0) -> int:
-        """The register's content, or `otherwise` when the model has no such register."""
+        """Return the register's content, or `otherwise` if the model has no such register."""
         return self.value(name) if name in self.registers else otherwise
 
     def set(self, name: str, value: int) -> None:
-        """Store a value; nothing when the model has no such register."""
+        """Store a value; do nothing if the model has no such register."""
         if name in self.registers:
             self.store(self.registers[name], value)
 
@@ -42,33 +42,33 @@ class Memory:
         self.data[register.address : end] = value.to_bytes(register.size, "little", signed=register.signed)
 
     def read(self, address: int, length: int) -> bytes | None:
-        """A stretch of the table; None when it does not begin and end in registers."""
+        """Return the bytes of an address range; None unless it begins and ends within registers."""
         if (address, length) not in self._readable:
             if not (length > 0 and address in self._defined and address + length - 1 in self._defined):
                 return None
-            self._readable.add((address, length))  # the answer never changes
+            self._readable.add((address, length))  # this never changes
         if self._points and self.is_indirect(address, length):
             data, points = self.data, self._points
             return bytes([data[points.get(at, at)] for at in range(address, address + length)])
         return bytes(self.data[address : address + length])
 
     def is_indirect(self, address: int, length: int) -> bool:
-        """Whether the stretch covers data that stand for another address."""
+        """Return whether the range includes indirect data that refers to another address."""
         return any(at in self._points for at in range(address, address + length))
 
     def follow_indirect_addresses(self) -> None:
-        """Take note of where the indirect addresses point; to be called when one was written."""
+        """Update the targets of the indirect addresses; must be called after one was written."""
         self._points.clear()
         for first_address, first_data, count in self._blocks:
             for index in range(count):
                 at = first_address + 2 * index
                 target = self.data[at] | self.data[at + 1] << 8
-                # One that points at indirect data, its own from the factory, is plain memory.
+                # One that points to indirect data (by default its own) is plain memory.
                 if target != first_data + index and target in self._defined and not self._is_indirect_data(target):
                     self._points[first_data + index] = target
 
     def split(self, address: int, data: bytes) -> tuple[list[tuple[Register, int]], int]:
-        """The registers that a write covers with their values, and the error if it does not fit them."""
+        """Return the registers and values covered by a write, and an error number if it violates their boundaries."""
         if not (self._points and self.is_indirect(address, len(data))):
             return self._split_stretch(address, data)
         writes: list[tuple[Register, int]] = []
@@ -83,7 +83,7 @@ class Memory:
         return any(first <= address < first + count for _, first, count in self._blocks)
 
     def _stretches(self, address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """The stretches of addresses that a write through indirect data actually covers."""
+        """Yield the contiguous address ranges, with their data, that a write through indirect data actually covers."""
         start = end = -1
         stretch = b""
         for offset, byte in enumerate(data):

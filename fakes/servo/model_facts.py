@@ -1,14 +1,15 @@
-"""What the SDK's control tables leave out: access, factory values and ranges of registers, and the motors' electrics.
+"""Facts that the SDK's control tables leave out: access, factory values and ranges of registers, and motor constants.
 
 Source: ROBOTIS e-Manual, pages x/<model> (revisions of 2020 to 2024). Three entries differ from what some revisions
-print: the Min Voltage Limit's range, given there as 110 to 300 around a factory value of 95, is 95 to 160 as on the
-sister models; Protocol Type accepts 2 alone, because a fake servo speaks nothing else; and Drive Mode accepts bit 3
-(Torque On by Goal Update), which the XL430-W250's page has and the others' older revisions do not.
+print. The range of Min Voltage Limit, given there as 110 to 300 around a factory value of 95, is 95 to 160 here as on
+the sister models. Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit
+3 (Torque On by Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others.
 
-Resistance and back-EMF follow from stall current and no-load speed at the nominal voltage: good to some ten percent,
-enough to make a position move look right. The XC330-T288's stall current is unsure.
+Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
+tens of percent, which is enough to make a position move look right. The XC330-T288's stall current is uncertain.
 
-A model without facts of its own is given a sister's, named in `STANDS_FOR`: its factory values and ranges are unsure.
+A model without facts of its own uses those of a sister model, named in `STANDS_FOR`: its factory values and ranges are
+uncertain.
 """
 
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """What the control table does not say about one register. `limits` None: everything its bytes can hold."""
+    """Properties of a register that its control table does not contain. `limits` None: the full range of its bytes."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None
@@ -26,7 +27,14 @@ class RegisterFacts:
 
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
-    """What distinguishes one model. Units: A per tick, V, ohm, V s/rad at the output shaft."""
+    """What distinguishes one model.
+
+    current_unit_a: current per tick of Goal and Present Current [A].
+    fast_read_firmware: first firmware with fast reads and Control Table Backup.
+    resistance_ohm: resistance of the motor [ohm].
+    back_emf_v_s: back-EMF per velocity of the output shaft [V s/rad].
+    differs: registers whose facts differ from those of the X series.
+    """
 
     current_unit_a: float
     fast_read_firmware: int
@@ -36,28 +44,29 @@ class ModelFacts:
     operating_modes: frozenset[int] = frozenset({0, 1, 3, 4, 5, 16})
     nominal_voltage_v: float = 12.0
     senses_supply: bool = False
-    """Whether Present Current is the supply's current and not the motor's (330 series)."""
+    """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: tuple[tuple[int, int, int], ...] = ((168, 224, 28), (578, 634, 28))
-    """Blocks of indirect addressing: first address register, first data register, how many."""
+    """Blocks of indirect addressing: address of the first address register and first data register, and their number.
+    """
     older_indirect: tuple[tuple[int, int, int], ...] | None = None
-    """The same before the firmware `INDIRECT_MOVED_FIRMWARE`, where it was elsewhere."""
+    """The blocks in firmware before `INDIRECT_MOVED_FIRMWARE`, where they differ."""
 
 
 _Facts = RegisterFacts
 _GAIN = (0, 16_383)
 _READ_ONLY = _Facts(writable=False)
 NEVER = 256
-"""A firmware that no servo has."""
+"""A firmware version that no servo has."""
 
 INDIRECT_MOVED_FIRMWARE = 52
-"""From this firmware on the 330 series keeps its indirect data at 208.
+"""First firmware with which the 330 series has its indirect data at 208.
 
 Source: dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have one control table for older
-330 servos, with the data at 224, and a second one named fw52, with the data at 208. The e-Manual knows 208 alone.
+330 servos, with the data at 224, and a second one named fw52, with the data at 208. The e-Manual only mentions 208.
 """
 
 REVERSES_ALL = ("XM540", "XH540", "XD540", "XW540", "XW430")
-"""Series whose Reverse Mode inverts velocity, current and PWM beside positions (e-Manual, Drive Mode, by series)."""
+"""Series whose Reverse Mode inverts velocity, current and PWM as well as position (e-Manual, Drive Mode, by series)."""
 
 X_SERIES: Mapping[str, RegisterFacts] = {
     "Model Number": _READ_ONLY,
@@ -226,7 +235,7 @@ STANDS_FOR: Mapping[str, str] = {
     "XC430-W150": "XL430-W250",
     "XC430-W240": "XL430-W250",
 }
-"""Models without facts of their own, and the sister model whose factory values and ranges they are given: unsure."""
+"""Models without facts of their own, and the sister model whose factory values and ranges they assume."""
 
 _STRENGTH = (0, 1023)
 
@@ -254,4 +263,4 @@ OTHER_SERIES: Mapping[str, Mapping[str, RegisterFacts]] = {
         "Punch": _Facts(32, _STRENGTH),
     }
 }
-"""Registers of models outside the X series' control table, as far as their page of the e-Manual gives them."""
+"""Registers of models outside the X series, as far as their e-Manual pages describe them."""

@@ -5,13 +5,13 @@ from abc import ABC, abstractmethod
 from hil.drivers.packet import HardwareError
 from hil.fakes.servo.health import Health
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import Model
+from hil.fakes.servo.registers import EmulatedModel
 
 
 class Powered(ABC):
-    """A servo's supply and temperature. What its limits say of them stays in Hardware Error Status until a reboot."""
+    """A servo's supply and temperature. Limit violations stay in Hardware Error Status until a reboot."""
 
-    def __init__(self, model: Model, memory: Memory, health: Health, input_voltage_v: float) -> None:
+    def __init__(self, model: EmulatedModel, memory: Memory, health: Health, input_voltage_v: float) -> None:
         self.model = model
         self.memory = memory
         self.health = health
@@ -21,16 +21,16 @@ class Powered(ABC):
 
     @abstractmethod
     def _derive(self) -> None:
-        """Recompute what depends on registers."""
+        """Recompute the values that depend on registers."""
 
     @property
     def supply_v(self) -> float:
-        """The voltage at the servo's plug [V]."""
+        """The voltage at the servo's connector [V]."""
         return max(0.0, self._input_voltage_v - self._sag_v - self._dip_v)
 
     @property
     def input_voltage_v(self) -> float:
-        """The supply's voltage without load [V]."""
+        """The supply's no-load voltage [V]."""
         return self._input_voltage_v
 
     @input_voltage_v.setter
@@ -41,7 +41,7 @@ class Powered(ABC):
 
     @property
     def sag_v(self) -> float:
-        """What the load takes off the supply's voltage [V]."""
+        """The voltage drop due to the load [V]."""
         return self._sag_v
 
     @sag_v.setter
@@ -52,7 +52,7 @@ class Powered(ABC):
             self._derive()
 
     def dip(self, volt: float) -> None:
-        """Take so much off the supply's voltage [V]; 0 ends it."""
+        """Reduce the supply voltage by this much [V]; 0 ends the dip."""
         self._dip_v = volt
         self._check_health()
         self._derive()
@@ -68,13 +68,13 @@ class Powered(ABC):
         self._derive()
 
     def _check_health(self) -> None:
-        """Compare supply and temperature with their limits; what is found stays in Hardware Error Status."""
+        """Compare supply and temperature with their limits; violations stay in Hardware Error Status."""
         memory = self.memory
         decivolt, celsius = max(0, round(10 * self.supply_v)), max(0, min(255, round(self.temperature_c)))
         memory.set("Present Input Voltage", decivolt)
         memory.set("Present Temperature", celsius)
         if not self.model.operating_modes:
-            return  # nothing is known of its limits
+            return  # its limits are unknown
         error = memory.value("Hardware Error Status")
         if not memory.value("Min Voltage Limit") <= decivolt <= memory.value("Max Voltage Limit"):
             error |= HardwareError.INPUT_VOLTAGE

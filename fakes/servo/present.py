@@ -1,4 +1,4 @@
-"""A servo's measurements of its joint, stored in its present registers in ticks."""
+"""A servo's measurements of its joint, stored in ticks in its present registers."""
 
 import math
 from collections.abc import Callable
@@ -9,20 +9,20 @@ from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE
 from hil.fakes.servo.encoder import Reading
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Model
+from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, EmulatedModel
 
 PRESENT_START = 120
 PRESENT_END = 147
-"""Address of the first present register, and the first address after the last."""
+"""Address of the first present register, and the address after the last."""
 
 STATE_START = 126
 STATE_END = 136
-"""The same of Present Current, Velocity and Position, which a control cycle reads."""
+"""Address of the first and the address after the last of Present Current, Velocity and Position."""
 
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 _REALTIME_TICK_WRAP = 32_768
-_REVERSE = 0x01  # of Drive Mode
+_REVERSE = 0x01  # bit of Drive Mode
 _MOST_HOMING_TICKS = 1024
 """A Homing Offset beyond this is ignored in Position Control Mode (e-Manual, Homing Offset)."""
 _CLEAR_TURNS = b"\x01DXL\x22"
@@ -41,7 +41,7 @@ class Present:
     def __init__(
         self,
         memory: Memory,
-        model: Model,
+        model: EmulatedModel,
         zero_ticks: int,
         direction: int,
         clock_rate: float,
@@ -53,11 +53,11 @@ class Present:
         self.zero_ticks = zero_ticks
         self.direction = direction
         self.sign = direction
-        """+1 or -1: the sense of the servo's current, velocity and PWM against the joint's."""
+        """+1 or -1: sign of the servo's current, velocity and PWM relative to the joint's."""
         self.position_sign = direction
-        """The same of its positions, which Reverse Mode inverts on every model."""
+        """+1 or -1: sign of the servo's position relative to the joint's; Reverse Mode inverts it on every model."""
         self.jump_ticks = 0
-        """By how much the encoder is wrong."""
+        """Error of the encoder injected by a fault [ticks]."""
         self._memory = memory
         self._model = model
         self._clock_rate = clock_rate
@@ -78,7 +78,10 @@ class Present:
         self._is_x_series = "Present Position" in registers and registers["Present Position"].address == 132
 
     def derive(self, share: Share) -> None:
-        """Take over what registers say; share: of time in which the bridge is on for a current and a velocity."""
+        """Update the values that depend on registers.
+
+        share: returns the bridge's duty cycle for a current [A] and a velocity [rad/s].
+        """
         self._reversed = bool(self._memory.get("Drive Mode") & _REVERSE)
         self.position_sign = -self.direction if self._reversed else self.direction
         self.sign = self.position_sign if self._model.reverses_all else self.direction
@@ -87,12 +90,15 @@ class Present:
         self._shift_changed()
 
     def power_up(self, now: float, position: float) -> None:
-        """Count time and turns from here."""
+        """Start counting time and turns at `now` [s] and `position` [rad]."""
         self._booted_at = now
         self.forget_turns(position)
 
     def clear(self, body: bytes, moving: bool, position: float) -> int:
-        """The instruction Clear: forget the turns; the error number. Errors but Result Fail are unsure."""
+        """Execute the instruction Clear (reset the turns); return the error number.
+
+        Errors other than Result Fail are uncertain.
+        """
         if len(body) != len(_CLEAR_TURNS):
             return StatusError.DATA_LENGTH
         if body != _CLEAR_TURNS:
@@ -103,27 +109,27 @@ class Present:
         return StatusError.NONE
 
     def ticks(self, position: float) -> float:
-        """Present Position at a joint angle [rad], before rounding and without noise."""
+        """Return Present Position [ticks] for a joint angle [rad], before rounding and without noise."""
         ticks = self._encoder.steady(self.zero_ticks + self.direction * position * _TICKS_PER_RAD)
         return (TICKS_PER_TURN - ticks if self._reversed else ticks) + self._shift
 
     def angle(self, ticks: float) -> float:
-        """The joint angle [rad] at a Present Position."""
+        """Return the joint angle [rad] for a Present Position [ticks]."""
         ticks -= self._shift
         if self._reversed:
             ticks = TICKS_PER_TURN - ticks
         return self.direction * (ticks - self.zero_ticks) / _TICKS_PER_RAD
 
     def velocity_ticks(self, velocity: float) -> float:
-        """Present Velocity at a joint velocity [rad/s], before rounding."""
+        """Return Present Velocity at a joint velocity [rad/s], before rounding."""
         return self.sign * velocity * _TICKS_PER_RAD_S
 
     def moves(self, velocity: float) -> bool:
-        """Whether Moving is 1 at a joint velocity [rad/s]."""
+        """Return whether Moving is 1 at a joint velocity [rad/s]."""
         return abs(round(self.velocity_ticks(velocity))) > self._moving_threshold
 
     def state(self, position: float, velocity: float, current: float) -> bytes:
-        """Registers 126 to 135 of a joint: angle [rad], velocity [rad/s], motor current [A]."""
+        """Return registers 126 to 135 for a joint angle [rad], velocity [rad/s] and motor current [A]."""
         sign = self.sign
         unit = self._unit
         ticks = 0
@@ -140,7 +146,7 @@ class Present:
         return _STATE.pack(ticks, round(sign * velocity * _TICKS_PER_RAD_S), encoder + self._shift + self.jump_ticks)
 
     def measure(self, address: int, end: int, now: float, position: float, velocity: float, current: float) -> None:
-        """Bring the present registers between two addresses up to date with the joint, at `now` [s]."""
+        """Update the present registers in an address range with the joint's state at `now` [s]."""
         if not self._is_x_series:
             self._measure_other(now, position)
             return
@@ -152,13 +158,13 @@ class Present:
             _BEFORE.pack_into(data, PRESENT_START, tick, self.moves(velocity), data[123], pwm)
 
     def tell_trajectory(self, status: int, velocity_ticks: float, position_ticks: float) -> None:
-        """Moving Status and the two trajectory registers."""
+        """Set Moving Status and the two trajectory registers."""
         data = self._memory.data
         data[123] = status
         _TRAJECTORIES.pack_into(data, STATE_END, round(velocity_ticks), round(position_ticks))
 
     def _sensed(self, current: float, velocity: float) -> float:
-        """What the current sensor makes of the motor's current [A]."""
+        """Return the output of the current sensor for a motor current [A] and a velocity [rad/s]."""
         if self._noise is not None:
             current += self._noise.gauss(0.0, self._noise_a)
         if self._senses_supply:
@@ -166,7 +172,7 @@ class Present:
         return current
 
     def _measure_other(self, now: float, position: float) -> None:
-        """A model of another series: its position, in ticks of an X-series encoder, if it has the register."""
+        """Update a model of another series: its position, in ticks of an X-series encoder, if it has the register."""
         register = self._model.registers.get("Present Position")
         if register is not None and register.size == 4:
             self._memory.store(register, round(self.ticks(position)))
@@ -174,7 +180,7 @@ class Present:
         self._memory.set("Realtime Tick", tick)
 
     def forget_turns(self, position: float) -> None:
-        """Reset Present Position to its value within one turn (before Homing Offset), the joint being at `position`."""
+        """Reset Present Position to its value within one turn, before Homing Offset, at a joint angle [rad]."""
         self._turn_ticks = 0
         self._shift_changed()
         raw = round(self.ticks(position)) - self._homing_ticks()

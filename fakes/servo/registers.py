@@ -1,12 +1,12 @@
-"""Control tables of the fake servos: what each register is, where it lies, what may be written to it.
+"""Control tables of the fake servos: address, size, access and range of every register.
 
 Addresses, sizes and signs come from `hil.drivers.control_table`; area, access, factory values and ranges from
 `hil.fakes.servo.model_facts`. Indirect addresses and data, Startup Configuration and Backup Ready, which the SDK's
-tables leave out, are added here from the e-Manual (pages x/<model>). Where the 330 series keeps its indirect data
+tables leave out, are added here from the e-Manual (pages x/<model>). The address of the 330 series' indirect data
 depends on the firmware: see `hil.fakes.servo.model_facts.INDIRECT_MOVED_FIRMWARE`.
 
-A model outside the X series answers with what its table in the SDK says: its registers hold what is written to them,
-within their size, and its motor does not move.
+A model outside the X series behaves as its table in the SDK says: its registers hold what is written to them, within
+their size, and its motor does not move.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,7 +27,7 @@ from hil.fakes.servo.model_facts import (
 )
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
-"""Baud by the value of the register Baud Rate. The 330 models end at 4 M."""
+"""Baud rates by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
 
 TICKS_PER_TURN = 4096
 VELOCITY_UNIT_RPM = 0.229
@@ -38,7 +38,7 @@ _NOT_WRITABLE = ("Present", "Model", "Firmware", "Moving Status", "Hardware Erro
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One register: where it lies, who may write it, and within which range (inclusive, in its own units)."""
+    """One register: its address, access, and range (inclusive, in its own units)."""
 
     name: str
     address: int
@@ -52,51 +52,52 @@ class Register:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
-    """One servo model: its control table by name, and what the table does not say."""
+class EmulatedModel:
+    """One servo model: its control table, and properties that the table does not contain."""
 
     name: str
     number: int
     current_unit_a: float
-    """Ampere per tick of Goal Current and Present Current; 0 where the model senses no current."""
+    """Current per tick of Goal Current and Present Current [A]; 0 if the model has no current sensor."""
     operating_modes: frozenset[int]
-    """Empty where nothing is known of the motor: it then never moves."""
+    """Supported operating modes; empty if the motor is unknown, which then never moves."""
     fast_read_firmware: int
-    """First firmware that knows Fast Sync Read, Fast Bulk Read and Control Table Backup."""
+    """First firmware that supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
     nominal_voltage_v: float
     resistance_ohm: float
     back_emf_v_s: float
     """Voltage per velocity of the output shaft [V s/rad]."""
     senses_supply: bool
     indirect: tuple[tuple[int, int, int], ...]
-    """Blocks of indirect addressing: first address register, first data register, how many."""
+    """Blocks of indirect addressing: address of the first address register and first data register, and their number.
+    """
     reverses_all: bool
-    """Whether Reverse Mode inverts velocity, current and PWM too, not positions alone."""
+    """Whether Reverse Mode inverts velocity, current and PWM as well as position."""
     registers: Mapping[str, Register]
 
 
 MODEL_NAMES = tuple(FACTS)
-"""Servo models whose factory values and ranges are known."""
+"""Servo models with known factory values and ranges."""
 
 
 def all_model_names() -> tuple[str, ...]:
-    """Every model that a fake servo can be: those of `MODEL_NAMES` first, then the others of the SDK's tables."""
+    """Return every model that a fake servo can be: `MODEL_NAMES` first, then the other models of the SDK's tables."""
     return (*MODEL_NAMES, *sorted(name for name in model_names().values() if name not in FACTS))
 
 
 DEFAULT_FIRMWARE = 48
 
 
-def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> Model:
-    """The control table of one model, e.g. "XM430-W350", as this firmware has it.
+def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> EmulatedModel:
+    """Return the control table of one model, e.g. "XM430-W350", with this firmware.
 
-    Raises KeyError when no table describes the model; `all_model_names` lists those that are.
+    Raises KeyError if no table describes the model; see `all_model_names`.
     """
     return _load_model(name, firmware < INDIRECT_MOVED_FIRMWARE)
 
 
 @cache
-def _load_model(name: str, older: bool) -> Model:
+def _load_model(name: str, older: bool) -> EmulatedModel:
     if name not in model_names().values():
         raise KeyError(name)
     facts = FACTS.get(STANDS_FOR.get(name, name))
@@ -105,7 +106,7 @@ def _load_model(name: str, older: bool) -> Model:
     return _x_series(name, facts, (facts.older_indirect or facts.indirect) if older else facts.indirect)
 
 
-def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int], ...]) -> Model:
+def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int], ...]) -> EmulatedModel:
     table = {**X_SERIES, **facts.differs}
     addresses = load_control_table(name)
     registers = [
@@ -116,7 +117,7 @@ def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int]
     known = {register.name for register in registers}
     registers += [_register(*added, False, table[added[0]]) for added in _ADDED if added[0] not in known]
     registers += _indirect_registers(indirect)
-    return Model(
+    return EmulatedModel(
         name=name,
         number=addresses.number,
         current_unit_a=facts.current_unit_a,
@@ -139,13 +140,13 @@ def _indirect_registers(blocks: tuple[tuple[int, int, int], ...]) -> Iterator[Re
         for index in range(count):
             number += 1
             data = first_data + index
-            points = RegisterFacts(data, (64, last))  # at its own data register, until it is set
+            points = RegisterFacts(data, (64, last))  # its own data register by default
             yield _register(f"Indirect Address {number}", first_address + 2 * index, 2, False, points)
             yield _register(f"Indirect Data {number}", data, 1, False, RegisterFacts())
 
 
-def _unknown(name: str) -> Model:
-    """A model of which only addresses and sizes are known."""
+def _unknown(name: str) -> EmulatedModel:
+    """Return a model for which only addresses and sizes are known."""
     addresses = load_control_table(name)
     torque = addresses.registers.get("Torque Enable")
     ram = torque.address if torque is not None else 64
@@ -162,7 +163,7 @@ def _unknown(name: str) -> Model:
             writable=not entry.name.startswith(_NOT_WRITABLE),
         )
         registers[entry.name] = _register(entry.name, entry.address, entry.size, entry.signed, facts, ram)
-    return Model(
+    return EmulatedModel(
         name=name,
         number=addresses.number,
         current_unit_a=0.0,

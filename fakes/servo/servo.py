@@ -1,27 +1,27 @@
-"""One fake servo: a control table as a state machine. It knows neither bus nor plant; `hil.fakes.bus.bus` provides
-both.
+"""One fake servo: a control table as a state machine, independent of bus and plant (see `hil.fakes.bus.bus`).
 
-What it does is written in the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent this
-module decides as follows, choosing what is stricter for a client:
+The behaviour follows the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent, this module
+chooses what is stricter for a client:
 
-- A write that covers several registers asks each of them: those that can be written are, and the status has the error
-  of the first that refused. ROBOTIS' own example indirect_address writes Goal Position and an LED of 255 together and
-  waits until the servo moves.
-- A write must begin and end on register boundaries: in the middle of a register it is a Data Length error, at an
-  undefined address an Access error. A read may begin inside a register; undefined bytes between two registers read 0,
-  and a read that begins or ends at an undefined address is an Access error.
+- A write that covers several registers is applied to each writable one, and the status carries the error of the first
+that refused. ROBOTIS' own example indirect_address writes Goal Position and an LED of 255 together and waits until the
+servo moves.
+- A write must begin and end on register boundaries: inside a register it is a Data Length error, at an undefined
+address an Access error. A read may begin inside a register; undefined bytes between two registers read as 0, and a read
+that begins or ends at an undefined address is an Access error.
 - A goal beyond its limit register is refused with Data Limit (some firmware may clamp instead).
 - When the Bus Watchdog trips, Goal Current, Goal PWM and Goal Velocity become 0, Goal Position becomes Present
-  Position, and torque stays enabled. While tripped, only 0 may be written to it.
-- After a shutdown, a write of 1 to Torque Enable is answered without an error number but leaves torque off.
-- At power-up, as after a change of Operating Mode, Goal Current and Goal PWM are at their limits: a client that enables
-  torque in current mode without writing a goal first gets full current. Goal Velocity is 0.
-- When torque comes on, Goal Position becomes Present Position.
-- Reverse mode (Drive Mode bit 0) mirrors positions about half a turn, on the 540 series and XW430 velocity, current and
-  PWM too.
-- Through the Secondary ID nothing of the EEPROM changes (e-Manual): writes, Factory Reset and Restore are ignored.
+Position, and torque stays enabled. While tripped, only 0 may be written to it.
+- After a shutdown, writing 1 to Torque Enable is answered without an error number but leaves torque off.
+- At power-up, and after a change of Operating Mode, Goal Current and Goal PWM are at their limits: a client that
+enables torque in current mode without first writing a goal gets full current. Goal Velocity is 0.
+- When torque is switched on, Goal Position becomes Present Position.
+- Reverse mode (Drive Mode bit 0) mirrors positions about half a turn; on the 540 series and the XW430 it also inverts
+velocity, current and PWM.
+- Nothing in the EEPROM can be changed through the Secondary ID (e-Manual): writes, Factory Reset and Restore are
+ignored.
 
-A model without a current sensor (XL430-W250) has no current mode and reads a Present Load of 0.
+A model without a current sensor (XL430-W250) has no current mode and reports a Present Load of 0.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,33 +35,36 @@ from hil.fakes.servo.health import Health, Overload, Thermal
 from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.power import Powered
 from hil.fakes.servo.present import Present
-from hil.fakes.servo.registers import BAUD_RATES, Model, Register
+from hil.fakes.servo.registers import BAUD_RATES, EmulatedModel, Register
 from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, WATCHDOG_TRIPPED, refusal
 
 BOOT_S = 0.25
-"""How long a servo is deaf after Reboot [s]. Unsure: the manual gives no figure; clients in use wait 0.3 to 1 s."""
+"""Time after Reboot during which a servo does not respond [s].
+
+Uncertain: the manual gives no figure; clients in use wait 0.3 to 1 s.
+"""
 
 WATCHDOG_UNIT_S = 0.020
 
 _NO_SHADOW_ID = 253
 _GOAL_CURRENT = 102
 
-_TORQUE_ON_BY_GOAL_UPDATE = 0x08  # of Drive Mode
+_TORQUE_ON_BY_GOAL_UPDATE = 0x08  # bit of Drive Mode
 
 # Startup Configuration
 _TORQUE_ON_AT_BOOT = 0x01
 _RESTORE_AT_BOOT = 0x02
 
 
-class Servo(Powered):
-    """A servo on its own: registers, what may be done to them, and what the motor is told to do.
+class EmulatedServo(Powered):
+    """A servo on its own: its registers, the rules for accessing them, and the resulting motor command.
 
-    Times are seconds on the bus's clock; what it is made with is said in `hil.fakes.description.FakeServo`.
+    Times are in seconds on the bus's clock. `hil.fakes.description.FakeServo` documents the arguments.
     """
 
     def __init__(
         self,
-        model: Model,
+        model: EmulatedModel,
         servo_id: int,
         *,
         zero_ticks: int = 0,
@@ -86,13 +89,13 @@ class Servo(Powered):
         super().__init__(model, Memory(model), health, supply_v)
         self.firmware = firmware
         self.has_fast_reads = firmware >= model.fast_read_firmware
-        """Whether it knows Fast Sync Read, Fast Bulk Read and Control Table Backup."""
+        """Whether it supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
         self.connected = True
-        """False: its bus cable is out. It hears nothing and says nothing; its motor does as last told."""
+        """False if its bus cable is disconnected: it neither receives nor replies; its motor keeps its last command."""
         self.heard_at = 0.0
-        """When the last instruction packet reached it [s]; the Bus Watchdog counts from here."""
+        """Time at which it received the last instruction packet [s]; the Bus Watchdog counts from here."""
         self.ready_at = 0.0
-        """When it has booted [s]; deaf before."""
+        """Time at which it has finished booting [s]; it does not respond before."""
         self.present = Present(
             *(self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a),
             Random(f"current {seed} {servo_id}") if current_noise_a else None,
@@ -101,14 +104,14 @@ class Servo(Powered):
         )
         self.controller = Controller()
         self.motor_current_a = 0.0
-        """Current that the motor is told to carry, in the joint's direction [A]."""
+        """Current that the motor is commanded to carry, in the joint's direction [A]."""
         self._voltage_limited = voltage_limited
         self._set_baud = baud
         self._registered: bytes | None = None
         self._backup = Backup()
         self._angle: Callable[[], float] = lambda: 0.0
         self.changed: Callable[[], None] = lambda: None
-        """Called after any change to what the bus has to know of it: ID, baud, need of ticks."""
+        """Called after any change that affects the bus: ID, baud rate, need for ticks."""
         self._after: dict[str, Callable[[], None]] = {
             "Torque Enable": self._torque_enable_written,
             "Operating Mode": self._operating_mode_written,
@@ -129,13 +132,14 @@ class Servo(Powered):
         self._reset_goals()
         self._derive()
 
-    # What the bus does with it
+    # Interface to the bus
 
     def power_up(self, now: float, angle: Callable[[], float], boot_s: float = 0.0) -> None:
-        """Start afresh at time `now` [s]; deaf for `boot_s`. `angle` tells the joint's position [rad] at any time.
+        """Power up at time `now` [s]; the servo does not respond for `boot_s` [s].
 
-        The RAM area takes its initial values (or the backup's, by Startup Configuration), torque is off, errors are
-        gone, and the count of turns is lost: Present Position starts within one turn (before Homing Offset).
+        angle: returns the joint's current position [rad]; called later as well.
+        RAM registers take their initial values (or the backup's, depending on Startup Configuration), torque is off,
+        errors are cleared, and the turn count is lost: Present Position starts within one turn (before Homing Offset).
         """
         memory = self.memory
         for register in memory.registers.values():
@@ -160,15 +164,15 @@ class Servo(Powered):
         self.controller.start(self.present.ticks(angle()))
 
     def reboot(self, now: float, boot_s: float = BOOT_S) -> None:
-        """Switch it off and on again, by instruction or because its supply broke down."""
+        """Switch the servo off and on again, as the Reboot instruction or a dip of its supply does."""
         self.power_up(now, self._angle, boot_s)
 
     def hears(self, now: float, baud: int) -> bool:
-        """Whether a packet at this baud that ends at `now` [s] is understood."""
+        """Return whether a packet at this baud rate that ends at `now` [s] is understood."""
         return self.baud == baud and self.connected and now >= self.ready_at
 
     def trip_watchdog(self) -> None:
-        """The Bus Watchdog's time is over: stop the motor and refuse goals until 0 is written to the register."""
+        """Trip the Bus Watchdog: stop the motor and refuse goals until 0 is written to the register."""
         memory = self.memory
         memory.set("Bus Watchdog", WATCHDOG_TRIPPED)
         for name in ("Goal Current", "Goal PWM", "Goal Velocity", "Profile Velocity", "Profile Acceleration"):
@@ -183,7 +187,10 @@ class Servo(Powered):
         self._derive()
 
     def tick(self, step_s: float, position: float, velocity: float, current: float) -> None:
-        """One period of the servo's own loop ends: warm up, and control the motor. The joint's state in SI units."""
+        """Run one period of the servo's own loop: heating, overload and motor control.
+
+        step_s: period [s]. position, velocity, current: state of the joint [rad, rad/s, A].
+        """
         if self.health.changes:
             if self.health.step(step_s, current) and not self.hardware_error & HardwareError.OVERLOAD:
                 self.fail(HardwareError.OVERLOAD)
@@ -200,10 +207,10 @@ class Servo(Powered):
             )
             self.present.tell_trajectory(*self.controller.state(ticks))
 
-    # What a test asks of it
+    # Queries for tests
 
     def value(self, name: str) -> int:
-        """The register's present content; KeyError when the model has no such register."""
+        """Return the register's current content; raises KeyError if the model has no such register."""
         return self.memory.value(name)
 
     @property
@@ -235,10 +242,10 @@ class Servo(Powered):
     def execute(
         self, instruction: int, body: bytes, now: float, moving: bool, *, shadow: bool = False
     ) -> tuple[int, bytes]:
-        """Act on an instruction addressed to this servo; the error number (Alert bit aside) and the data of its status.
+        """Execute an instruction addressed to this servo; return the error number and the data of the status.
 
-        shadow: it was addressed by its Secondary ID. Read is not among the instructions: the bus answers it with
-        `read`, after measuring.
+        The error number excludes the Alert bit. shadow: the instruction was addressed to the Secondary ID. Read is not
+        among these instructions: the bus handles it with `read`, after updating the measurements.
         """
         if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
             return StatusError.DATA_LENGTH, b""
@@ -272,18 +279,18 @@ class Servo(Powered):
         return error, data
 
     def read(self, address: int, length: int) -> tuple[int, bytes]:
-        """Error number and bytes of a stretch of the control table."""
+        """Return the error number and the bytes of a range of the control table."""
         data = self.memory.read(address, length)
         return (StatusError.NONE, data) if data is not None else (StatusError.ACCESS, b"")
 
     def write(self, address: int, data: bytes) -> int:
-        """Write a stretch of the control table; the error number."""
+        """Write a range of the control table; return the error number."""
         if address == _GOAL_CURRENT and len(data) == 2 and self._takes_goal_current:
             return self._write_goal_current(data)
         return self._write_stretch(address, data, shadow=False)
 
     def write_as_shadow(self, address: int, data: bytes) -> int:
-        """The same, addressed by its Secondary ID."""
+        """Write a range of the control table, addressed by Secondary ID; return the error number."""
         return self._write_stretch(address, data, shadow=True)
 
     def _write_stretch(self, address: int, data: bytes, *, shadow: bool) -> int:
@@ -311,7 +318,7 @@ class Servo(Powered):
             self._shut_down_if_masked()
 
     def _write_goal_current(self, data: bytes) -> int:
-        """The write that a control cycle makes, with the same outcome as the long way round."""
+        """Write Goal Current as a control cycle does: a fast path with the same result as the general one."""
         ticks = int.from_bytes(data, "little", signed=True)
         limit = self._current_limit
         if ticks > limit or ticks < -limit:
@@ -337,7 +344,7 @@ class Servo(Powered):
         self.memory.set("Registered Instruction", 0)
         return self.write(body[0] | body[1] << 8, body[2:])
 
-    # What follows from a write
+    # Consequences of a write
 
     def _torque_enable_written(self) -> None:
         self._shut_down_if_masked()
@@ -347,7 +354,7 @@ class Servo(Powered):
 
     def _operating_mode_written(self) -> None:
         self._forget_turns_in_position_mode()
-        self.present.derive(self.supply_share)  # the mode decides whether Homing Offset counts
+        self.present.derive(self.supply_share)  # the mode determines whether Homing Offset applies
         self._reset_goals()
         for name in GAINS:
             if name in self.memory:
@@ -363,19 +370,19 @@ class Servo(Powered):
         self._hold_position()
 
     def _hold_position(self) -> None:
-        """The goal is where the joint is."""
+        """Set Goal Position to the joint's present position."""
         ticks = self.present.ticks(self._angle())
         if self.model.operating_modes:
             self.memory.set("Goal Position", round(ticks))
         self.controller.start(ticks)
 
     def _derive(self) -> None:
-        """Work out once, after any change, what every packet asks for."""
+        """Recompute, after any change, the values that every packet needs."""
         memory = self.memory
         self.id = memory.get("ID")
         shadow = memory.get("Secondary(Shadow) ID", _NO_SHADOW_ID)
         self.shadow_id = shadow if shadow < _NO_SHADOW_ID else None
-        """A second ID whose instructions it executes and does not answer; None when it has none."""
+        """Secondary ID, whose instructions it executes without replying; None if it has none."""
         baud = memory.get("Baud Rate", BAUD_RATES.index(self._set_baud))
         self.baud = BAUD_RATES[baud] if baud < len(BAUD_RATES) else self._set_baud
         self.return_delay_s = 2e-6 * memory.get("Return Delay Time")
@@ -385,7 +392,7 @@ class Servo(Powered):
         self._torque = self.torque_enabled
         counting = self._torque and watchdog != WATCHDOG_TRIPPED
         self.watchdog_s = watchdog * WATCHDOG_UNIT_S if counting else 0.0
-        """Silence after which the watchdog trips [s]; 0 when it does not count."""
+        """Silence after which the watchdog trips [s]; 0 while it is inactive."""
 
         self.present.derive(self.supply_share)
         self._mode = self.operating_mode if self.model.operating_modes else -1
@@ -393,7 +400,7 @@ class Servo(Powered):
         self._current_per_tick = self.present.sign * self.model.current_unit_a
         moves = self._torque and bool(self.model.operating_modes)
         self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._voltage_limited))
-        """Whether time alone changes what it does, so that the bus must call `tick`."""
+        """Whether the passage of time alone changes its state, so that the bus must call `tick`."""
 
         if self._driven:
             self.motor_current_a = self.goal_current_ticks * self._current_per_tick
@@ -408,6 +415,6 @@ class Servo(Powered):
         self.changed()
 
     def supply_share(self, current: float, velocity: float = 0.0) -> float:
-        """The share of time in which the bridge is on for this current [A] at this velocity [rad/s], signed."""
+        """Return the bridge's duty cycle for this current [A] at this velocity [rad/s], signed, between -1 and 1."""
         volt = self.model.resistance_ohm * current + self.model.back_emf_v_s * velocity
         return max(-1.0, min(1.0, volt / self.supply_v)) if self._torque and self.supply_v > 0.0 else 0.0

@@ -13,9 +13,9 @@ ACCELERATION_PER_MS = 214.577 / 60_000 / 0.229
 
 
 class Trajectory:
-    """A point that travels to a goal within a velocity and an acceleration, one millisecond a step.
+    """A point that travels to a goal within limits of velocity and acceleration, one millisecond per step.
 
-    Units are position ticks and milliseconds. It may be given a new goal at any time: it brakes and turns.
+    Units are position ticks and milliseconds. The goal may change at any time; the point then brakes and turns around.
     """
 
     def __init__(self) -> None:
@@ -24,12 +24,16 @@ class Trajectory:
         self.acceleration = 0.0
 
     def start(self, position: float) -> None:
-        """Stand still at `position`."""
+        """Stop at `position`."""
         self.position = position
         self.velocity = self.acceleration = 0.0
 
     def step(self, goal: float, fastest: float, hardest: float) -> None:
-        """One millisecond towards the goal. fastest 0: at once; hardest 0: at the fastest velocity at once."""
+        """Advance by one millisecond towards the goal.
+
+        fastest: velocity limit, 0 to jump to the goal. hardest: acceleration limit, 0 to reach the velocity limit
+        immediately.
+        """
         away = goal - self.position
         before = self.velocity
         if not fastest or (not away and not before):
@@ -37,7 +41,7 @@ class Trajectory:
             return
         wanted = min(fastest, abs(away))
         if hardest:
-            # Of the velocities from which it can brake to a stand at the goal, the highest.
+            # The highest velocity from which it can brake to a stop at the goal.
             wanted = min(wanted, sqrt(2.0 * hardest * abs(away) + 0.25 * hardest**2) - 0.5 * hardest)
         self.velocity = copysign(wanted, away)
         if hardest:
@@ -50,9 +54,9 @@ class Trajectory:
 
 
 def profile(away: float, velocity: int, acceleration: int, time_based: bool) -> tuple[float, float]:
-    """Fastest velocity [ticks/ms] and hardest acceleration [ticks/ms^2] for a move of `away` ticks.
+    """Return the velocity limit [ticks/ms] and acceleration limit [ticks/ms^2] for a move of `away` ticks.
 
-    velocity, acceleration: the registers Profile Velocity and Profile Acceleration, which on a time-based profile
+    velocity, acceleration: the registers Profile Velocity and Profile Acceleration, which in a time-based profile
     (Drive Mode bit 2) are the durations of the whole move and of its acceleration [ms].
     """
     if not time_based:

@@ -3,7 +3,7 @@
 from hil.drivers.packet import StatusError
 from hil.fakes.servo.controller import POSITION_MODE
 from hil.fakes.servo.memory import Memory
-from hil.fakes.servo.registers import TICKS_PER_TURN, Model, Register
+from hil.fakes.servo.registers import TICKS_PER_TURN, EmulatedModel, Register
 
 GOALS = frozenset({"Goal PWM", "Goal Current", "Goal Velocity", "Goal Position"})
 
@@ -24,10 +24,10 @@ WATCHDOG_TRIPPED = 0xFF
 _MULTI_TURN_LIMIT_TICKS = 256 * TICKS_PER_TURN
 
 
-def refusal(memory: Memory, model: Model, register: Register, value: int, shadow: bool = False) -> int:
-    """Why this value may not be written to this register now; 0 when it may.
+def refusal(memory: Memory, model: EmulatedModel, register: Register, value: int, shadow: bool = False) -> int:
+    """Return the error number with which writing this value to this register is refused; 0 if it is permitted.
 
-    shadow: it came through the Secondary ID, which does not reach the EEPROM.
+    shadow: the write was addressed to the Secondary ID, which cannot write to the EEPROM.
     """
     name = register.name
     if not register.writable or (register.eeprom and (shadow or memory.get("Torque Enable"))):

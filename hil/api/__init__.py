@@ -1,1 +1,1 @@
-"""What `import hil` offers: the commands as functions, and their result types."""
+"""The public functions of hil and their result types."""

@@ -1,4 +1,4 @@
-"""`hil.check`: everything that would stop an experiment, found before one."""
+"""`hil.check`: find everything that would stop an experiment before starting one."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,10 @@ __all__ = ["CheckReport", "Finding", "Level", "check"]
 
 @dataclass(frozen=True, repr=False)
 class CheckReport:
-    """The findings, in order, for the arm described by the file `config`."""
+    """The findings of a check, in the order in which they were made.
+
+    config: the configuration file of the arm, as the caller gave it.
+    """
 
     config: Path
     findings: tuple[Finding, ...]
@@ -26,16 +29,16 @@ class CheckReport:
 
     @property
     def problems(self) -> tuple[Finding, ...]:
-        """What stops it."""
+        """Findings that block an experiment."""
         return tuple(finding for finding in self.findings if finding.level is Level.STOP)
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """Findings that do not block it but are not as they should be."""
+        """Findings that do not block an experiment but should be looked at."""
         return tuple(finding for finding in self.findings if finding.level is Level.WARNING)
 
     def to_json(self) -> dict[str, Any]:
-        """What `hil check --json` prints."""
+        """The object that `hil check --json` prints."""
         findings = [
             {"level": str(each.level), "where": each.where, "what": each.what, "found": each.found, "fix": each.fix}
             for each in self.findings
@@ -54,13 +57,13 @@ class CheckReport:
 
 
 def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckReport:
-    """Look at port, servos, pose and rate, with torque off: `hil check` as a function. Nothing moves.
+    """Check port, servos, pose and sample rate with torque off: `hil check` as a function. Nothing moves.
 
-    A check that cannot be made is a finding, not an exception.
+    A check that cannot be carried out is reported as a finding, not raised as an exception.
 
     Raises:
         ConfigError: the configuration is wrong.
     """
     checked, shown = loaded(config)
-    on_progress(Progress("check", "Looking"))
+    on_progress(Progress("check", "Checking the arm"))
     return CheckReport(shown, tuple(check_arm(checked)))

@@ -1,5 +1,6 @@
-"""`hil.dry_run`: the experiment simulated on arms like the one on the bench. Nothing moves."""
+"""`hil.dry_run`: simulate the experiment on arms like the one on the bench. Nothing moves."""
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from html import escape
 from os import PathLike
@@ -9,10 +10,13 @@ from typing import Any
 from hil.api.experiment import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, ignore
 from hil.config.schema import Config
+from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_json
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.run import ARMS
 from hil.dry_run.run import dry_run as simulate
 from hil.dry_run.summary import DryRun, dry_run_json
+from hil.errors import ConfigError
+from hil.pilot.chain_rehearsal import rehearse
 from hil.results.display import html_table
 
 __all__ = ["Rehearsal", "dry_run"]
@@ -20,38 +24,47 @@ __all__ = ["Rehearsal", "dry_run"]
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Rehearsal:
-    """What a dry run predicts. file: the configuration's, as the caller wrote it. found: everything it computed."""
+    """The outcome of a dry run.
+
+    file: the configuration file, as the caller gave it. found: the complete results of the simulation.
+    """
 
     file: Path
     config: Config
-    found: DryRun
+    found: DryRun | ChainDryRun
 
     @property
     def is_safe(self) -> bool:
-        """Whether the experiment as configured may be run; without a configured torque, the largest safe one is."""
+        """Whether the configured torque is safe; if none is configured, whether a safe torque exists."""
         return self.found.is_safe(self.config)
 
     @property
     def stop_chance(self) -> float:
-        """Chance that the guard would have to stop the arm, from 0 to 1."""
+        """Probability that the guard would have to stop the arm, from 0 to 1."""
         return float(self.prediction.stop_chance)
 
     @property
     def largest_peak_torque(self) -> tuple[float, ...]:
         """The largest safe peak torque of each joint [N m]."""
+        if isinstance(self.found, ChainDryRun):
+            return self.found.peak_torque
         return tuple(float(value) for value in self.found.largest.peak_torque)
 
     @property
     def prediction(self) -> Prediction:
         """The prediction for the configured torque; without one, for the largest safe torque."""
+        if isinstance(self.found, ChainDryRun):
+            return self.found.prediction
         return self.found.largest.prediction if self.found.asked is None else self.found.asked
 
     def to_json(self) -> dict[str, Any]:
-        """What `hil dry-run --json` prints."""
+        """The object that `hil dry-run --json` prints."""
+        if isinstance(self.found, ChainDryRun):
+            return chain_dry_run_json(self.found)
         return dry_run_json(self.config, self.found)
 
     def plot(self) -> Any:
-        """The simulated arms over time against the position limits, as a matplotlib figure. Raises MissingExtra."""
+        """Plot the simulated motions against the position limits as a matplotlib figure. Raises MissingExtra."""
         from hil.dry_run.plot import plot
 
         return plot(self.config, self.prediction)
@@ -85,24 +98,38 @@ def dry_run(
     result: str | PathLike[str] | None = None,
     arms: int = ARMS,
     servos: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Rehearsal:
-    """Simulate the experiment on arms that could be this one: `hil dry-run` as a function.
+    """Simulate the experiment on arms consistent with what is known of this one: `hil dry-run` as a function.
 
     Args:
         config: TOML file of the arm, the name of a bundled one, or a loaded configuration.
         result: run folder or result.json of an earlier identification, used instead of [arm.prior].
-        arms: how many to simulate.
+        arms: number of arms to simulate.
         servos: also read the servos' limits and measure bus timing, with torque off.
+        executor: of concurrent.futures, or `hil.study.engine.executor`; it simulates the arms. The result is the same
+            with and without it.
         on_progress: called with a `Progress` when the simulation begins.
 
     Raises:
         ConfigError: the configuration is wrong.
         ResultError: `result` holds no result.
         NoSafeTorque: no torque keeps all simulated arms within their limits.
-        hil.drivers.errors.DriverError: with `servos`, if they do not answer.
+        hil.drivers.errors.DriverError: `servos` is true and the servos do not answer.
     """
     checked, shown = loaded(config)
     on_progress(Progress("simulation", "Simulating"))
     former = None if result is None else Path(result)
-    return Rehearsal(shown, checked, simulate(checked, former, arms, servos))
+    if checked.is_chain:
+        if former is not None:
+            raise ConfigError(
+                f"{shown}: --result: a dry run of an arm in space draws from its description only so far."
+            )
+
+        def tell(done: int, of: int) -> None:
+            if done % max(1, of // 20) == 0:
+                on_progress(Progress("simulation", f"Simulated {done} of {of} motions"))
+
+        return Rehearsal(shown, checked, rehearse(checked, arms, servos, tell))
+    return Rehearsal(shown, checked, simulate(checked, former, arms, servos, executor))

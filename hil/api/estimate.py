@@ -1,15 +1,22 @@
-"""`hil.estimate`: from a recording to a result, without touching an arm."""
+"""`hil.estimate`: estimate parameters from a recording, without touching an arm."""
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
+from contextlib import ExitStack
+from datetime import datetime
 from os import PathLike
 from pathlib import Path
 
-from hil.api.experiment import write_run_report
+from hil.api.experiment import unused_path, write_run_report
 from hil.api.progress import OnProgress, Progress, ignore
 from hil.api.run import Estimation, Identification, Run, estimation, identification
-from hil.errors import ConfigError, RecordingCutShort
+from hil.errors import RecordingCutShort
 from hil.estimation.settled_estimate import estimate_run
-from hil.estimation.unsettled.estimate import estimate_csv, estimate_unsettled
+from hil.estimation.unsettled.estimate import estimate_unsettled
+from hil.estimation.unsettled.recordings import estimate_recordings
+from hil.recordings.files import is_recording
+from hil.report.recording_page import write_recording_report
+from hil.runs.recording_folder import create, is_recording_folder, load_record
 from hil.runs.run_folder import RunFolder
 
 __all__ = ["estimate"]
@@ -21,27 +28,35 @@ def estimate(
     recording: PathLikeStr | Run | Sequence[PathLikeStr],
     *,
     config: PathLikeStr | None = None,
+    out: PathLikeStr | None = None,
     all_samples: bool = False,
+    executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Identification | Estimation:
     """Estimate an arm's parameters from a recording: `hil estimate` as a function.
 
     Args:
-        recording: a run folder or a `Run`, whose result.json is rewritten; or one or more CSV files of one arm.
-        config: for CSV files, the TOML file whose [columns] table describes them.
+        recording: a run folder or a `Run`, whose result.json is rewritten; or one or more recordings of one arm by
+            other tools: CSV, Parquet or MCAP files, LeRobot datasets, ROS 2 bags.
+        config: for recordings of other tools, a TOML file whose [columns] table describes them; without it their own
+            names must tell.
+        out: for recordings of other tools, the folder of the result, which must be new or empty; runs/TIME-NAME unless
+            given.
         all_samples: of a run, use every sample by multiple shooting; no settled period is needed.
+        executor: of concurrent.futures, or `hil.study.engine.executor`; with `friction = "auto"` it begins fits that
+            may be needed, for shorter waiting and more work in all. The result is the same with and without it.
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:
-        An `Identification` from settled periods; an `Estimation` from CSV files, or with `all_samples`.
+        An `Identification` from settled periods; an `Estimation` from recordings of other tools, or with `all_samples`.
 
     Raises:
         RunFolderError: the folder holds no readable run.
-        CsvError: a CSV file cannot be read as a recording.
-        ConfigError: a CSV file was given without `config`, or `config` is wrong.
+        CsvError: a file cannot be read as a recording.
+        ConfigError: `config` is wrong.
         RecordingCutShort: the run holds no settled period; `all_samples` can do without.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
-        ValueError: run folders and CSV files together, or several run folders.
+        ValueError: run folders and other recordings together, or several run folders.
     """
     if isinstance(recording, Run):
         paths = [recording.path]
@@ -49,18 +64,19 @@ def estimate(
         paths = [Path(recording)]
     else:
         paths = [Path(each) for each in recording]
-    if are_csv(paths):
-        if config is None:
-            raise ConfigError("A CSV file needs --config ARM.toml, whose [columns] table describes the columns.")
+    if are_recordings(paths):
         on_progress(Progress("estimation", "Estimating by multiple shooting"))
-        return estimation(estimate_csv(paths, Path(config)), None)
+        return _from_files(paths, None if config is None else Path(config), out)
+    if is_recording_folder(paths[0]):
+        on_progress(Progress("estimation", "Estimating by multiple shooting"))
+        return _again(paths[0])
     run = RunFolder.open(paths[0])
     if all_samples:
         on_progress(Progress("estimation", "Estimating by multiple shooting"))
         return estimation(estimate_unsettled(run), run.path)
     on_progress(Progress("estimation", "Estimating"))
     try:
-        result = estimate_run(run)
+        result = estimate_run(run, executor)
     except RecordingCutShort as error:
         error.add_note(f"To estimate without a settled period: hil estimate {run.path} --all-samples")
         raise
@@ -68,11 +84,39 @@ def estimate(
     return identification(result, run.path)
 
 
-def are_csv(paths: Sequence[Path]) -> bool:
-    """Whether these are CSV files and not one run folder; raises ValueError for a mixture."""
-    files = [path.suffix.lower() == ".csv" for path in paths]
+def are_recordings(paths: Sequence[Path]) -> bool:
+    """Whether these are recordings of other tools and not one run folder; raises ValueError for a mixture."""
+    files = [is_recording(path) for path in paths]
     if any(files) and not all(files):
-        raise ValueError("give either one run folder or CSV files, not both.")
+        raise ValueError("give either one run folder or recordings (CSV, Parquet, MCAP), not both.")
     if not any(files) and len(paths) != 1:
-        raise ValueError("one run folder at a time; only CSV files can be estimated together.")
+        raise ValueError("one run folder at a time; only recordings of other tools can be estimated together.")
     return all(files)
+
+
+def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None) -> Estimation:
+    name = config.stem if config is not None else paths[0].stem
+    folder = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}") if out is None else Path(out)
+    create(folder)
+    with ExitStack() as unless_done:
+        # A failed start leaves no folder in the way of the next try.
+        unless_done.callback(_discard, folder)
+        found = estimate_recordings(paths, config, folder)
+        write_recording_report(folder)
+        unless_done.pop_all()
+    return estimation(found, folder)
+
+
+def _discard(folder: Path) -> None:
+    if not (folder / "result.json").is_file():
+        for path in folder.iterdir():
+            path.unlink()
+        folder.rmdir()
+
+
+def _again(folder: Path) -> Estimation:
+    """The same files by the configuration in the folder, into the same folder."""
+    record = load_record(folder)
+    found = estimate_recordings([Path(file.path) for file in record.files], folder / "config.toml", folder)
+    write_recording_report(folder)
+    return estimation(found, folder)

@@ -1,4 +1,4 @@
-"""`hil.identify` and `hil.record`: an experiment on the bus, or on a fake one."""
+"""`hil.identify` and `hil.record`: run an experiment on a real or fake arm."""
 
 import logging
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ __all__ = ["identify", "record"]
 log = logging.getLogger(__name__)
 
 ConfigLike = str | PathLike[str] | Config
-"""A TOML file, the bare name of a bundled one, or a configuration that was loaded."""
+"""A TOML file, the name of a bundled configuration, or a loaded configuration."""
 
 
 def identify(
@@ -35,23 +35,24 @@ def identify(
 ) -> Identification:
     """Excite the arm, record a settled period and estimate the arm's parameters: `hil identify` as a function.
 
-    The arm moves. Torque is off when this returns or raises.
+    The arm moves. Torque is off when this function returns or raises.
 
     Args:
         config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
-        out: run folder, which must be new or empty; runs/TIME-ARM unless given.
-        take_over: take over an arm that another program holds, letting it sink slowly; support it by hand.
-        on_progress: called with a `Progress` about 20 times a second while the arm moves, on a real bus by a thread of
-            its own. It cannot disturb the experiment: reports that come too fast are dropped, and if it raises, the
+        out: run folder, which must be new or empty; by default runs/TIME-ARM.
+        take_over: take over an arm whose torque another program left on, and lower it slowly; support it by hand.
+        on_progress: called with a `Progress` about 20 times a second while the arm moves, in a separate thread on a
+            real bus. It cannot disturb the experiment: reports that arrive too fast are dropped, and if it raises, the
             exception is logged and it is not called again.
 
     Returns:
-        The result, with the run folder as `run`; its report is in there too.
+        The result, with the run folder as `run`. The report is in that folder too.
 
     Raises:
         ConfigError: the configuration is wrong.
-        RunFolderError: `out` is taken or cannot be written.
-        ExperimentError: the experiment could not be finished; its subclasses say why, SafetyStop for a limit passed.
+        RunFolderError: `out` is not empty or cannot be written.
+        ExperimentError: the experiment could not be finished; the subclass says why, for example SafetyStop when a
+            limit was exceeded.
         hil.drivers.errors.DriverError: the servos do not answer as they should.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
     """
@@ -89,7 +90,7 @@ def record(
     take_over: bool = False,
     on_progress: OnProgress = ignore,
 ) -> Run:
-    """Play the experiment and keep its recording, to be estimated later: `hil record` as a function.
+    """Run the experiment and store its recording for a later estimate: `hil record` as a function.
 
     The arm moves. Arguments and exceptions are those of `identify`.
     """
@@ -111,7 +112,9 @@ def record(
 
 @contextmanager
 def _discarding(run: RunFolder) -> Iterator[None]:
-    """A start that fails before the first sample leaves no folder in the way of the next try."""
+    """Remove the run folder if the experiment fails before the first sample, so that it does not block the next
+    attempt.
+    """
     try:
         yield
     except BaseException as stopped:
@@ -121,7 +124,7 @@ def _discarding(run: RunFolder) -> Iterator[None]:
 
 
 def loaded(config: ConfigLike) -> tuple[Config, Path]:
-    """The checked configuration, and its path as the caller wrote it. Raises ConfigError."""
+    """Load and check the configuration; also return its path as the caller wrote it. Raises ConfigError."""
     if isinstance(config, Config):
         return config, config.path
     return load_config(Path(config)), Path(config)
@@ -133,12 +136,12 @@ def _taking_over(config: Config) -> Config:
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
     """The folder `out`, or a new one in runs/ named after time and arm. Raises RunFolderError."""
-    path = _unused(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
+    path = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
     log.info("run folder %s", path)
     return RunFolder.create(path, config)
 
 
-def _unused(path: Path) -> Path:
+def unused_path(path: Path) -> Path:
     """`path`, or `path` with a number appended: a program may start two runs within a second."""
     number = 2
     tried = path
@@ -149,5 +152,5 @@ def _unused(path: Path) -> Path:
 
 
 def write_run_report(run: RunFolder) -> None:
-    """The HTML report, into the run folder."""
+    """Write the HTML report into the run folder."""
     write_report(RunData.load(run.path), run.path / FILE_NAME)

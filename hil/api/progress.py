@@ -1,4 +1,4 @@
-"""Progress reports of a long call."""
+"""Progress reports of long calls."""
 
 import logging
 from collections.abc import Callable
@@ -16,10 +16,10 @@ Stage = Literal["experiment", "estimation", "simulation", "check"]
 
 @dataclass(frozen=True)
 class Progress:
-    """One report. Called about 20 times a second while the arm moves, and whenever there is something to say.
+    """One progress report; sent about 20 times a second while the arm moves, and whenever there is a message.
 
-    stage: what the call is doing. message: a sentence for a person; empty while nothing new happened. stream: while the
-    arm moves, the samples taken, the phase, and the latest state of every joint.
+    stage: what the call is doing. message: a sentence for the user; empty if there is nothing new to say. stream: while
+    the arm moves, the number of samples taken, the phase, and the latest state of every joint.
     """
 
     stage: Stage
@@ -28,7 +28,7 @@ class Progress:
 
     @property
     def fraction(self) -> float | None:
-        """Of the samples of this experiment, from 0 to 1; None outside one."""
+        """Fraction of this experiment's samples taken so far, from 0 to 1; None when no experiment is running."""
         if self.stream is None:
             return None
         return self.stream.taken / max(1, self.stream.expected, self.stream.taken)
@@ -38,7 +38,7 @@ OnProgress = Callable[[Progress], None]
 
 
 def forgiving(listener: OnProgress) -> OnProgress:
-    """Wrap a callback: after its first exception, which is logged, it is not called again."""
+    """Wrap a callback so that its first exception is logged and it is not called again."""
     failed = False
 
     def tell(progress: Progress) -> None:
@@ -55,4 +55,4 @@ def forgiving(listener: OnProgress) -> OnProgress:
 
 
 def ignore(_: Progress) -> None:
-    """A callback that does nothing."""
+    """Do nothing with a progress report."""

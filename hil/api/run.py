@@ -1,4 +1,4 @@
-"""A run folder as an object, and results that know the run they came from."""
+"""A run folder as an object, and results linked to the run they came from."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Estimation", "Identification", "Run", "load_run"]
 
-_ON_FILE_ELSEWHERE = {"json": False}  # where the result is, which it need not say of itself
+_NOT_STORED = {"json": False}  # result.json need not contain its own location
 _SHOWN = ("position", "residual")
 
 
@@ -34,23 +34,23 @@ _SHOWN = ("position", "residual")
 class Identification(SettledResult):
     """An identified arm: the contents of its result.json, and its run folder."""
 
-    run: Path = field(metadata=_ON_FILE_ELSEWHERE)
+    run: Path = field(metadata=_NOT_STORED)
 
     @property
     def model(self) -> ArmModel:
-        """The arm as a model to compute torques and motions with."""
+        """The identified arm as a model that computes torques and motions."""
         return model_of(self, self.run)
 
     def plot(self, *names: str) -> Any:
-        """Plots of the report, stacked in one matplotlib figure that a notebook displays.
+        """Draw figures of the report, stacked in one matplotlib figure that a notebook displays.
 
         Args:
-            names: of the pictures, such as "residual_1", "friction_2" or "correlation", or their prefixes; by default,
-                measured and predicted positions and their residuals.
+            names: names of the figures, such as "residual_1", "friction_2" or "correlation", or prefixes of them; by
+                default, measured and predicted positions and their residuals.
 
         Raises:
             MissingExtra: matplotlib is not installed.
-            ValueError: no plot has such a name; the message lists the available ones.
+            ValueError: no figure has such a name; the message lists the available ones.
         """
         from hil.report.pictures import figures
         from hil.report.png import draw_figures
@@ -60,12 +60,12 @@ class Identification(SettledResult):
         wanted = names or _SHOWN
         for name in names:
             if not any(each.startswith(name) for each in found):
-                raise ValueError(f"no picture name starts with {name!r}; there are {', '.join(found)}")
+                raise ValueError(f"no figure name starts with {name!r}; available: {', '.join(found)}")
         chosen = [figure for each, figure in found.items() if each.startswith(wanted)]
         return draw_figures(chosen or list(found.values()))
 
     def report(self, out: str | PathLike[str] | None = None) -> Path:
-        """Write the HTML report, into the run folder unless `out` names a file. Returns its path."""
+        """Write the HTML report into the run folder, or to the file `out`. Return its path."""
         from hil.report.page import FILE_NAME, write_report
         from hil.report.run_data import RunData
 
@@ -91,12 +91,15 @@ class Identification(SettledResult):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Estimation(ShootingResult):
-    """What multiple shooting found in any motion; run: the run folder, None for recordings made elsewhere."""
+    """The result of multiple shooting on an arbitrary motion.
 
-    run: Path | None = field(default=None, metadata=_ON_FILE_ELSEWHERE)
+    run: the run folder; None for recordings made elsewhere.
+    """
+
+    run: Path | None = field(default=None, metadata=_NOT_STORED)
 
     def plot(self) -> Any:
-        """The correlations of the parameters: which of them this motion hardly separates. Raises MissingExtra."""
+        """Plot the correlation matrix of the parameters as a matplotlib figure. Raises MissingExtra."""
         from hil.report.chart import Matrix
         from hil.report.png import draw_figures
         from hil.report.sections.correlation import correlations
@@ -109,10 +112,12 @@ class Estimation(ShootingResult):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Run:
-    """A recorded run. samples: every sample taken (hil.runs.recording.sample_type); result: None before an estimate.
+    """A recorded run.
 
-    config: with the experiment as it was actually played. record: run.json. events: (time on the port's clock [s], what
-    happened). periods: by role, the settled periods as measured and as the model predicts them, after an estimate.
+    config: the configuration, with the experiment as it was actually played. record: the contents of run.json. samples:
+    every sample taken (dtype: hil.runs.recording.sample_type). events: (time on the port's clock [s], what happened).
+    periods: after an estimate, the settled periods by role, as measured and as predicted by the model. result: None
+    before an estimate.
     """
 
     path: Path
@@ -125,18 +130,18 @@ class Run:
 
     @property
     def timing(self) -> StreamTiming:
-        """How the stream kept its deadlines."""
+        """How well the stream kept its deadlines."""
         return timing(self.samples, self.config.experiment.rate)
 
     @property
     def model(self) -> ArmModel:
-        """The identified arm; raises ResultError before an estimate from settled periods."""
+        """The identified arm. Raises ResultError before an estimate from settled periods."""
         if not isinstance(self.result, Identification):
             raise ResultError(f"{self.path} has no estimate from settled periods yet; run hil.estimate first.")
         return self.result.model
 
     def plot(self) -> Any:
-        """Positions and goals of every joint over the whole recording, as a matplotlib figure. Raises MissingExtra."""
+        """Plot position and goal of every joint over the whole recording with matplotlib. Raises MissingExtra."""
         from hil.report.chart import BLUE, ORANGE, Chart, Series, thin
         from hil.report.png import draw_figures
 
@@ -171,11 +176,11 @@ class Run:
 
 
 def load_run(path: str | PathLike[str]) -> Run:
-    """Read a run folder: configuration, samples, events, and its result where there is one.
+    """Read a run folder: configuration, samples, events and, if there is one, the result.
 
     Raises:
         RunFolderError: the folder holds no readable run.
-        ResultError: its result.json is damaged, or from a newer hil.
+        ResultError: its result.json is damaged, or was written by a newer version of hil.
         ConfigError: its copy of the configuration is no longer valid.
     """
     run = RunFolder.open(Path(path))
@@ -192,7 +197,7 @@ def load_run(path: str | PathLike[str]) -> Run:
 
 
 def with_run(result: Result, run: Path) -> Identification | Estimation:
-    """The result, linked to its run."""
+    """Link a result to its run."""
     if isinstance(result, SettledResult):
         return identification(result, run)
     assert isinstance(result, ShootingResult)
@@ -200,12 +205,12 @@ def with_run(result: Result, run: Path) -> Identification | Estimation:
 
 
 def identification(result: SettledResult, run: Path) -> Identification:
-    """A result linked to its run."""
+    """Link a result from settled periods to its run."""
     return Identification(**_fields(result), run=run)
 
 
 def estimation(result: ShootingResult, run: Path | None) -> Estimation:
-    """The same for multiple shooting; no run for recordings made elsewhere."""
+    """Link a result of multiple shooting to its run, which is None for recordings made elsewhere."""
     return Estimation(**_fields(result), run=run)
 
 

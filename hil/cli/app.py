@@ -1,7 +1,7 @@
-"""The `hil` command: its subcommands in the order of its help, and its error handling.
+"""The `hil` command: its subcommands in the order in which the help lists them, and its error handling.
 
-The modules imported here only say what a subcommand takes; those that do the work are imported inside it, so that
-`hil --help` answers at once.
+The modules imported here only define the arguments of the subcommands; the modules that do the work are imported inside
+the commands, so that `hil --help` responds immediately.
 """
 
 import sys
@@ -36,7 +36,7 @@ def _root(
         ),
     ] = False,
 ) -> None:
-    del allow_code  # main has seen to it, wherever it stood
+    del allow_code  # handled in main, wherever it appeared on the command line
     if version:
         print(f"hil {__version__}")
         raise typer.Exit
@@ -64,14 +64,16 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "hand": (fake_command.hand, "/tmp/arm 2:to=0.5 3:ticks=2500,duration=2"),
     "schema": (schema.schema, "--out hil.schema.json"),
 }
-"""Every subcommand by name, with the arguments of its example."""
+"""Every subcommand by name, with the arguments of its usage example."""
 
 ALLOW_CODE = "--allow-code"
 
 
 @contextmanager
 def _code_as_asked() -> Iterator[None]:
-    """Every subcommand takes --allow-code, since every one may open a file whose [fake] table names a function."""
+    """Accept --allow-code anywhere on the command line: any subcommand may open a file whose [fake] table names a
+    function.
+    """
     words = sys.argv[1:]
     end = words.index("--") if "--" in words else len(words)
     asked = ALLOW_CODE in words[:end]
@@ -92,7 +94,7 @@ for _name, (_command, _example) in COMMANDS.items():
 
 
 def main() -> NoReturn:
-    """Run the command line; a foreseen error becomes its message on standard error and its exit code."""
+    """Run the command line; an expected error becomes a message on standard error and an exit code."""
     try:
         with _code_as_asked():
             app()

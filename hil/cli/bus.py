@@ -1,6 +1,6 @@
-"""The subcommands about the servos on the bus: scan, check, setup.
+"""The subcommands that work on the servos of a bus: scan, check, setup.
 
-The modules that do the work are imported inside the commands, so that `hil --help` answers at once.
+The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
 """
 
 import json
@@ -16,7 +16,7 @@ PortOrConfig = Annotated[
     str | None,
     typer.Argument(
         metavar="[PORT]",
-        help="Serial port or pyserial URL, a TOML file, or a bundled name; without it: list the ports.",
+        help="Serial port or pyserial URL, a TOML file, or a bundled name; if omitted, list the ports.",
     ),
 ]
 
@@ -26,7 +26,7 @@ def scan(
     baud: Annotated[list[int] | None, typer.Option("--baud", help="Scan only this baud rate; may be repeated.")] = None,
     json_only: Json = False,
 ) -> None:
-    """Find servos: every baud, every ID, with model, firmware, voltage, temperature and errors."""
+    """Find servos at every baud rate and ID, with model, firmware, voltage, temperature and errors."""
     from hil.cli.terminal import Terminal
     from hil.cli.views.setup_view import print_ports, print_scan, scanned
     from hil.config.schema import port_url
@@ -102,8 +102,8 @@ def pose(
 
 def setup(
     port: PortOrFile,
-    servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's present ID.")],
-    baud: Annotated[int, typer.Option("--baud", help="Its present baud rate.")] = 1_000_000,
+    servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's current ID.")],
+    baud: Annotated[int, typer.Option("--baud", help="Its current baud rate.")] = 1_000_000,
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
     new_baud: Annotated[int | None, typer.Option("--new-baud")] = None,
     return_delay_us: Annotated[
@@ -115,7 +115,7 @@ def setup(
     yes: Annotated[bool, typer.Option("--yes", help="Answer yes to every question.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Set a servo's ID, baud, return delay or Secondary ID: a question before each write, each write read back."""
+    """Set a servo's ID, baud rate, return delay or Secondary ID. Asks before each write and reads each value back."""
     from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
@@ -126,7 +126,7 @@ def setup(
     if new_baud is not None and new_baud not in BAUD_RATES:
         raise typer.BadParameter(f"{new_baud}: servos support {', '.join(map(str, BAUD_RATES))}.")
     if json_only and not yes:
-        raise typer.BadParameter("--json asks no questions: it needs --yes.")
+        raise typer.BadParameter("--json cannot ask for confirmation: add --yes.")
     opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)

@@ -1,4 +1,4 @@
-"""The subcommands that compare recordings: other methods on the same one, one with and one without a known mass.
+"""The subcommands that compare recordings: `hil compare` and `hil calibrate`.
 
 The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
@@ -14,10 +14,10 @@ from hil.cli.options import Json, RunPath
 
 def compare(
     run: RunPath,
-    mujoco: Annotated[bool, typer.Option("--mujoco", help="With mujoco.sysid; needs the extra `peers`.")] = False,
+    mujoco: Annotated[bool, typer.Option("--mujoco", help="Include mujoco.sysid; needs the extra `peers`.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Other methods on the same recording: RLS, EKF, UKF, IDIM-LS, the paper's, mujoco.sysid."""
+    """Apply other methods to the same recording: RLS, EKF, UKF, IDIM-LS, the seed paper's, mujoco.sysid."""
     from hil.cli.terminal import Terminal
     from hil.estimation.compare import compare_run
     from hil.results.json_form import to_json
@@ -35,7 +35,7 @@ def compare(
         error = "-" if worst is None else f"{100 * worst:.3f} % {found.worst_parameter}"
         shown = "-" if found.held_out_rms is None else f"{100 * found.held_out_rms:.2f} %"
         print(f"{name:14s} {found.seconds:8.3f} {error:>20s} {shown:>9s}  {found.settings}")
-    print(f"Parameters and standard errors of each: {folder.path / 'compare.json'}")
+    print(f"Parameters and standard errors of each method: {folder.path / 'compare.json'}")
 
 
 def calibrate(
@@ -45,17 +45,18 @@ def calibrate(
     ],
     mass: Annotated[float, typer.Option("--mass", min=1e-6, metavar="KG", help="Mass bolted to the last link.")],
     distance: Annotated[
-        float, typer.Option("--distance", min=1e-6, metavar="M", help="Distance of its centre from the last joint.")
+        float,
+        typer.Option("--distance", min=1e-6, metavar="M", help="Distance of its centre of mass from the last joint."),
     ],
     length: Annotated[
-        float | None, typer.Option("--length", min=1e-6, metavar="M", help="Length of link 1; default known.length_1.")
+        float | None, typer.Option("--length", min=1e-6, metavar="M", help="Length of link 1; default: known.length_1.")
     ] = None,
     inertia: Annotated[
-        float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia about its own centre.")
+        float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia about its own centre of mass.")
     ] = 0.0,
     json_only: Json = False,
 ) -> None:
-    """Each joint's torque constant, from a second run with a known mass bolted on."""
+    """Determine each joint's torque constant from a second run with a known mass bolted on."""
     from hil.cli.terminal import Terminal
     from hil.estimation.calibrate import calibrate_runs, calibration_lines
     from hil.estimator.calibration import KnownMass

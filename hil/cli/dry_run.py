@@ -1,4 +1,4 @@
-"""The command `hil dry-run`: its options; `hil.dry_run.run` does the work."""
+"""The command `hil dry-run` and its options; `hil.dry_run.run` does the work."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ def dry_run(
         Path | None, typer.Option("--result", metavar="RUN", help="Earlier run whose result replaces the prior.")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="Also plot it: .png or .svg.")
+        Path | None, typer.Option("--picture", metavar="FILE", help="Also save a plot: .png or .svg.")
     ] = None,
     arms: Annotated[int, typer.Option("--arms", min=20, max=5000, help="Number of arms to simulate.")] = 128,
     servos: Annotated[
@@ -23,11 +23,11 @@ def dry_run(
     ] = False,
     json_only: Json = False,
 ) -> None:
-    """Simulate the experiment on arms like yours; exit code 1 if it might touch a limit."""
-    from rich.console import Console
-
+    """Simulate the experiment on arms like yours; exit code 1 if it might exceed a limit."""
     from hil.api.dry_run import dry_run as simulate
+    from hil.cli.printing import result_console
     from hil.cli.terminal import Terminal
+    from hil.dry_run.chain_summary import ChainDryRun, print_chain_dry_run
     from hil.dry_run.plot import draw
     from hil.dry_run.summary import print_dry_run
 
@@ -37,7 +37,9 @@ def dry_run(
         draw(rehearsal.config, rehearsal.prediction, picture)
     if json_only:
         print(strict_json.dumps(rehearsal.to_json()))
+    elif isinstance(rehearsal.found, ChainDryRun):
+        print_chain_dry_run(rehearsal.found, result_console())
     else:
-        print_dry_run(rehearsal.config, rehearsal.found, Console(highlight=False))
+        print_dry_run(rehearsal.config, rehearsal.found, result_console())
     if not rehearsal.is_safe:
         raise typer.Exit(1)

@@ -1,8 +1,8 @@
-"""How errors become one message and an exit code."""
+"""Conversion of exceptions to messages and exit codes."""
 
 
 def exit_code(error: Exception) -> int | None:
-    """The exit code of a foreseen error; None for a bug in the program."""
+    """Exit code of an expected error; None for a bug in the program."""
     from hil.drivers import errors as driver
     from hil.errors import HilError
     from hil.estimator.errors import EstimationError
@@ -15,7 +15,7 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """What happened, which earlier error it followed, and whether torque is off."""
+    """Message with its notes and, if the error occurred while another one was handled, that error's message."""
     lines = [f"hil: {error}", *getattr(error, "__notes__", [])]
     cause = error.__context__
     if cause is not None and error.__cause__ is None and isinstance(cause, Exception) and exit_code(cause) is not None:

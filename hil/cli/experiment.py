@@ -1,6 +1,6 @@
-"""The subcommands from an arm to its parameters: identify, record, estimate.
+"""The subcommands that identify, record and estimate.
 
-The modules that do the work are imported inside the commands, so that `hil --help` answers at once.
+The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,15 @@ TakeOver = Annotated[
     bool, typer.Option("--take-over", help="Take over an arm whose torque is on: support it by hand; it sinks slowly.")
 ]
 Recordings = Annotated[
-    list[Path], typer.Argument(metavar="RUN | FILE.csv ..", help="Run folder, or CSV files of one arm with --config.")
+    list[Path],
+    typer.Argument(
+        metavar="RUN | FILE ..",
+        help="Run folder; or recordings of one arm: CSV, Parquet, MCAP, LeRobot dataset, ROS 2 bag.",
+    ),
 ]
 ArmPath = Annotated[
-    Path | None, typer.Option("--config", metavar="ARM.toml", help="For CSV files: its [columns] table describes them.")
+    Path | None,
+    typer.Option("--config", metavar="ARM.toml", help="For recordings: its [columns] table describes them."),
 ]
 AllSamples = Annotated[
     bool, typer.Option("--all-samples", help="Use every sample, by multiple shooting; no settled period is needed.")
@@ -30,7 +35,7 @@ AllSamples = Annotated[
 
 
 def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
-    """Excite the arm, take one settled period, print its parameters with error bars."""
+    """Excite the arm, record one settled period, and print its parameters with error bars."""
     from hil.api.experiment import identify as identify_arm
     from hil.cli.terminal import Terminal
 
@@ -40,7 +45,7 @@ def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = Fals
 
 
 def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
-    """Play the experiment and keep its recording, for `hil estimate`."""
+    """Play the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
     from hil.cli.terminal import Terminal
     from hil.results.json_form import to_json
@@ -51,24 +56,30 @@ def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False,
         recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
         print(strict_json.dumps(recorded))
         return
-    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nEstimate from it: hil estimate {run.path}")
+    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nTo estimate from it: hil estimate {run.path}")
 
 
 def estimate(
-    recordings: Recordings, config: ArmPath = None, all_samples: AllSamples = False, json_only: Json = False
+    recordings: Recordings,
+    config: ArmPath = None,
+    out: OutPath = None,
+    all_samples: AllSamples = False,
+    json_only: Json = False,
 ) -> None:
-    """Estimate again from a recording; writes its result.json anew. Or from CSV files of any motion."""
-    from hil.api.estimate import are_csv
+    """Estimate again from a run's recording, or from recordings of other tools; writes result.json and the report."""
+    from hil.api.estimate import are_recordings
     from hil.api.estimate import estimate as estimate_arm
     from hil.cli.terminal import Terminal
 
     paths: Sequence[Path] = recordings
     try:
-        are_csv(paths)
+        elsewhere = are_recordings(paths)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
+    if out is not None and not elsewhere:
+        raise typer.BadParameter("--out is for recordings of other tools; a run's result is written into its folder.")
     with Terminal(quiet=json_only).following(config) as follow:
-        result = estimate_arm(paths, config=config, all_samples=all_samples, on_progress=follow)
+        result = estimate_arm(paths, config=config, out=out, all_samples=all_samples, on_progress=follow)
     _show(result, json_only)
 
 
@@ -76,14 +87,13 @@ def _show(result: "Identification | Estimation", json_only: bool) -> None:
     if json_only:
         print(strict_json.dumps(result.to_json()))
         return
-    from rich.console import Console
-
     from hil.api.run import Identification
+    from hil.cli.printing import result_console
     from hil.cli.views.result_table import print_result, print_shooting_result
     from hil.runs.run_folder import RunFolder
 
     if isinstance(result, Identification):
         config = RunFolder.open(result.run).load_config()
-        print_result(result, config, result.run, Console(highlight=False))
+        print_result(result, config, result.run, result_console())
     else:
-        print_shooting_result(result)
+        print_shooting_result(result, result.run)

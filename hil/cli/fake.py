@@ -1,4 +1,4 @@
-"""`hil fake`: a fake arm on a pseudo-terminal until stopped, or a description of a file's fake arm."""
+"""`hil fake`: serve a fake arm on a pseudo-terminal until stopped, or describe a file's fake arm."""
 
 import signal
 import sys
@@ -16,7 +16,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int | None) -> None:
-    """Print what the file's [fake] table describes; raises ConfigError when it is wrong."""
+    """Print what the file's [fake] table describes. Raises ConfigError."""
     fake = _load(config, faults, moves, seed)
     count = max(fake.joints) + 1
     for servo, joint in zip(fake.servos, fake.joints, strict=True):
@@ -29,18 +29,18 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
         end = f"{move.to:g} rad" if move.to is not None else f"{move.ticks} ticks"
         print(f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
     print(f"\nServe it to any program: hil fake {config} --pty")
-    print(f'In Python with pyserial: fakes.register(), then serial_for_url("fake://{config}")')
+    print(f'In Python with pyserial: hil.fakes.register(), then serial_for_url("fake://{config}")')
 
 
 def list_faults() -> None:
-    """Print every kind of fault and what it does."""
+    """Print every kind of fault and its effect."""
     for kind, facts in FAULTS.items():
-        amount = f"; amount: {facts.amount}, {facts.default:g} unless given" if facts.amount else ""
+        amount = f"; amount: {facts.amount}, default {facts.default:g}" if facts.amount else ""
         print(f"{kind:22s} {facts.does}{amount}")
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move limp joints of the fake arm served at `device`, or release them; raises ConfigError."""
+    """Move joints of the fake arm served at `device` whose torque is off, or release them. Raises ConfigError."""
     try:
         for servo in release:
             ask_hand(device, f"release {servo}")
@@ -54,9 +54,9 @@ def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
 def serve_fake(
     config: Path, link: Path | None, faults: list[str], moves: list[str], seed: int | None, quiet: bool
 ) -> None:
-    """Serve the file's fake arm on a pseudo terminal until Ctrl-C, SIGTERM or SIGHUP; raises ConfigError.
+    """Serve the file's fake arm on a pseudo-terminal until Ctrl-C, SIGTERM or SIGHUP. Raises ConfigError.
 
-    The terminal's path is the only thing on standard output; the status line goes to standard error.
+    Only the path of the pseudo-terminal is printed on standard output; the status line goes to standard error.
     """
     fake = _load(config, faults, moves, seed)
     try:
@@ -79,7 +79,7 @@ def serve_fake(
 
 
 class _Status:
-    """One line about the server, written over itself on a terminal."""
+    """One status line about the server, updated in place on a terminal."""
 
     def __init__(self, on_terminal: bool) -> None:
         self._on_terminal = on_terminal

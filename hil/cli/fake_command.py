@@ -1,4 +1,4 @@
-"""Arguments of the subcommands about fake arms. hil.cli.fake does the work and is imported on demand."""
+"""Arguments of the subcommands about fake arms; hil.cli.fake does the work and is imported on demand."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +18,9 @@ def _list_faults(wanted: bool) -> None:
 
 def fake(
     config: Annotated[
-        Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or the name of an arm; see below.")
+        Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or an arm's name (see below).")
     ],
-    pty: Annotated[bool, typer.Option("--pty", help="Serve it on a terminal device until Ctrl-C or SIGTERM.")] = False,
+    pty: Annotated[bool, typer.Option("--pty", help="Serve it on a pseudo-terminal until Ctrl-C or SIGTERM.")] = False,
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="Symbolic link to that device.")] = None,
     fault: Annotated[
         list[str] | None,
@@ -30,7 +30,7 @@ def fake(
         list[str] | None,
         typer.Option(
             metavar="ID:to=RAD[,at=S,duration=S]",
-            help="Let a hand move this servo's joint while its torque is off (or ID:ticks=POSITION); may be repeated.",
+            help="Move this servo's joint by hand while its torque is off (or ID:ticks=POSITION); may be repeated.",
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of noise and faults, overriding the file's.")] = None,
@@ -39,7 +39,7 @@ def fake(
         typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="List the fault kinds and exit."),
     ] = False,
 ) -> None:
-    """Serve a fake arm to any program, in real time; without --pty, describe it.
+    """Serve a fake arm to any program in real time; without --pty, describe it.
 
     Arms by name: koch, viperx_300, open_manipulator_x, fake_two_link and the other fake arms that come with hil.
     """
@@ -52,14 +52,14 @@ def fake(
 
 
 def hand(
-    device: Annotated[Path, typer.Argument(metavar="DEVICE", help="The terminal that `hil fake --pty` serves.")],
+    device: Annotated[Path, typer.Argument(metavar="DEVICE", help="The device that `hil fake --pty` serves.")],
     moves: Annotated[
         list[str] | None,
         typer.Argument(metavar="[ID:to=RAD]...", help="Target: an angle, or ID:ticks=POSITION; also at, duration."),
     ] = None,
     release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Release this servo's joint.")] = None,
 ) -> None:
-    """Move joints of a fake arm whose torque is off, as a person calibrating an arm does."""
+    """Move joints of a fake arm whose torque is off, like a person who calibrates an arm by hand."""
     from hil.cli import fake as work
 
     work.move_by_hand(device, moves or [], release or [])

@@ -1,4 +1,4 @@
-"""`hil init`: from servos on a bus to a TOML file for them."""
+"""`hil init`: create a TOML file for the servos found on a bus."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,9 +14,9 @@ def init(
     baud: Annotated[
         list[int] | None, typer.Option("--baud", help="Scan only at this baud rate; may be repeated.")
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; accept every default.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; accept every default.")] = False,
 ) -> None:
-    """Scan the bus, ask for the rest, write a commented TOML file. Nothing is written to the servos."""
+    """Scan the bus, ask for the rest, and write a commented TOML file. Nothing is written to the servos."""
     from hil.cli.terminal import Terminal
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port
@@ -39,7 +39,7 @@ def init(
     finally:
         opened.close()
     text = arm_toml(answers)
-    parse_config(text, out)  # what is written can be run
+    parse_config(text, out)  # raises if the file would not be valid
     write_text(out, text)
     print(f"Wrote {out}. Read it, then:\n  hil check {out}\n  hil identify {out}")
 

@@ -1,4 +1,4 @@
-"""The subcommands about a finished run: its report, its exports.
+"""The subcommands that work on a finished run: report and export.
 
 The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
@@ -13,7 +13,9 @@ from hil.cli.options import RunPath
 
 def report(
     run: RunPath,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default RUN/report.html.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Output file; default: RUN/report.html.")
+    ] = None,
     png: Annotated[
         Path | None, typer.Option("--png", metavar="DIR", help="Save the figures in this folder as PNG.")
     ] = None,
@@ -21,11 +23,13 @@ def report(
         Path | None, typer.Option("--svg", metavar="DIR", help="Save the figures in this folder as SVG.")
     ] = None,
 ) -> None:
-    """Write a run as one HTML page that needs no network: verdict, parameters, pictures."""
+    """Write a run as one self-contained HTML page: verdict, parameters, figures."""
     from hil.report.pictures import save_pictures
     from hil.report.run_data import RunData
 
     print(write_report(run, out))
+    if png is None and svg is None:
+        return
     data = RunData.load(run)
     for kind, folder in (("png", png), ("svg", svg)):
         if folder is not None:
@@ -51,7 +55,7 @@ def export(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the draws.")] = 1,
 ) -> None:
-    """Write the identified arm or its recording for other tools; says what a format cannot represent."""
+    """Write the identified arm or its recording for other tools, and list what a format cannot represent."""
     if samples is not None:
         from hil.export.posterior import export_samples
 
@@ -71,10 +75,14 @@ def export(
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:
-    """Write the report of a run, by default into its folder. Returns its path."""
+    """Write the report of a run, by default into its folder. Return its path."""
     from hil.report import page
+    from hil.report.recording_page import write_recording_report
     from hil.report.run_data import RunData
+    from hil.runs.recording_folder import is_recording_folder
 
+    if is_recording_folder(run):
+        return write_recording_report(run, out)
     path = out or run / page.FILE_NAME
     page.write_report(RunData.load(run), path)
     return path

@@ -1,4 +1,4 @@
-"""The subcommands about many runs: the list of them, a name and a note for one, the difference of two.
+"""The subcommands that list runs, name and annotate a run, and compare two runs.
 
 The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
@@ -13,13 +13,14 @@ from hil.cli.options import Json, RunPath
 
 if TYPE_CHECKING:
     from hil.estimation.diff import Difference
+    from hil.runs.collection import RunSummary
 
 
 def runs(
     folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder that holds the run folders.")] = Path("runs"),
     json_only: Json = False,
 ) -> None:
-    """List the runs in a folder: arm, when, verdict, residual, name and note."""
+    """List the runs in a folder: arm, date, verdict, residual, name and note."""
     from hil.runs.collection import find_runs
 
     found = find_runs(folder)
@@ -27,23 +28,35 @@ def runs(
         print(strict_json.dumps({"runs": [run.to_json() for run in found]}))
         return
     if not found:
-        print(f"No run in {folder}. `hil identify ARM.toml` makes one.")
+        print(f"No runs in {folder}. `hil identify ARM.toml` creates one.")
         return
-    from rich.console import Console
+    _print_runs(found)
+
+
+def _print_runs(found: "list[RunSummary]") -> None:
+    """A table; where the terminal is too narrow for it, each run's path on a line of its own, to be copied whole."""
     from rich.markup import escape
     from rich.table import Table
 
+    from hil.cli.printing import natural_width, print_table, result_console, say
+
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    for heading in ("run", "arm", "when", "verdict"):
-        table.add_column(heading, overflow="fold")
-    table.add_column("residual", justify="right")
-    table.add_column("name, note", overflow="fold")
+    for heading in ("run", "arm", "when", "verdict", "residual", "name, note"):
+        table.add_column(heading, no_wrap=True, justify="right" if heading == "residual" else "left")
+    rows = []
     for run in found:
         when = f"{run.started:%Y-%m-%d %H:%M}" if run.started else "-"
         residual = "-" if run.residual is None else f"{run.residual:.3f}"
         said = ": ".join(each for each in (run.note.name, run.note.text) if each)
-        table.add_row(*(escape(each) for each in (str(run.path), run.arm, when, run.verdict, residual, said)))
-    Console(highlight=False).print(table)
+        rows.append((str(run.path), run.arm, when, run.verdict, residual, said))
+        table.add_row(*(escape(each) for each in rows[-1]))
+    console = result_console()
+    if not console.is_terminal or natural_width(console, table) <= console.width:
+        print_table(console, table)
+        return
+    for path, arm, when, verdict, residual, said in rows:
+        print(path)
+        say(console, "  " + ", ".join(each for each in (arm, when, verdict, f"residual {residual}", said) if each))
 
 
 def note(
@@ -69,7 +82,7 @@ def diff(
     ] = None,
     json_only: Json = False,
 ) -> None:
-    """What changed on an arm between two runs, and whether the change is significant: is the gearbox wearing?"""
+    """Compare two runs of an arm and test which parameters changed significantly, for example from gearbox wear."""
     from hil.estimation.diff import diff_runs
 
     difference = diff_runs(before, after)
@@ -82,13 +95,14 @@ def diff(
         return
     _print_difference(difference)
     if png is not None:
-        print(f"Drawn in {png}")
+        print(f"Plot: {png}")
 
 
 def _print_difference(difference: "Difference") -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+
+    from hil.cli.printing import print_table, result_console, say
 
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("parameter", no_wrap=True)
@@ -99,14 +113,10 @@ def _print_difference(difference: "Difference") -> None:
         percent = "-" if change.percent is None else f"{change.percent:+.2f}"
         shown = (f"{change.before:.5g}", f"{change.after:.5g}", percent, f"{change.z:+.1f}")
         table.add_row(escape(change.name), *shown, "changed" if change.changed else "")
-    console = Console(highlight=False)
-    console.print(table)
+    console = result_console()
+    print_table(console, table)
     for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):
         if names:
-            console.print(f"Not in the model {lacking}: {', '.join(names)}.", soft_wrap=True, markup=False)
+            say(console, f"Not in the model {lacking}: {', '.join(names)}.")
     found = ", ".join(change.name for change in difference.changed)
-    console.print(
-        f"Significant changes: {found}." if found else "No significant changes.",
-        soft_wrap=True,
-        markup=False,
-    )
+    say(console, f"Significant changes: {found}." if found else "No significant changes.")

@@ -1,4 +1,4 @@
-"""`hil schema`: the JSON Schema of the TOML, for editors."""
+"""`hil schema`: print the JSON Schema of the TOML file, for editors."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,9 @@ def schema(
         Path | None, typer.Option("--out", metavar="FILE", help="Write it to this file instead of standard output.")
     ] = None,
 ) -> None:
-    """Print the JSON Schema of the TOML; with `#:schema FILE` as its first line an editor completes and checks it."""
+    """Print the JSON Schema of the TOML file. Editors use it to complete and check a file that begins with `#:schema
+    FILE`.
+    """
     from hil.config.json_schema import schema_text
     from hil.export.source import write_text
 
@@ -19,4 +21,4 @@ def schema(
         print(schema_text(), end="")
         return
     write_text(out, schema_text())
-    print(f"Wrote {out}. Put this first in a TOML file beside it: #:schema ./{out.name}")
+    print(f"Wrote {out}. Make this the first line of a TOML file in the same folder: #:schema ./{out.name}")

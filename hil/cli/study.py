@@ -1,4 +1,4 @@
-"""The subcommand about studies: many runs on many workers."""
+"""`hil study`: many runs on many workers."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,16 +18,20 @@ if TYPE_CHECKING:
 
 
 def study(
-    study_path: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What to vary, run and keep.")],
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Default studies/NAME.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a study that was stopped.")] = False,
+    study_path: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What to vary, run and record.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Output folder; default: studies/NAME.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a study that was interrupted.")] = False,
     scheduler: Annotated[
         str | None, typer.Option("--scheduler", metavar="ADDRESS", help='"tcp://HOST:8786", or "slurm".')
     ] = None,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes here; default one a core.")] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Local processes; default: one per core.")
+    ] = None,
     json_only: Json = False,
 ) -> None:
-    """Do many runs, on this machine's cores or on a cluster: one row each, figures, a page with pictures."""
+    """Run a study on local cores or a cluster; write one row per run, summary figures and an HTML page."""
     from dataclasses import asdict
 
     from rich.console import Console
@@ -61,7 +65,7 @@ def study(
 
 
 class _shown:  # noqa: N801, a context manager that reads as a verb
-    """A progress bar on standard error; the engine's own page beside it."""
+    """Show a progress bar and the scheduler's dashboard address on standard error."""
 
     def __init__(self, console: "Console") -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

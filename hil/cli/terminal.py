@@ -1,4 +1,4 @@
-"""What the user sees while the arm moves: a progress bar with each joint's position and current. Off with -q."""
+"""Progress shown while the arm moves: a bar and each joint's position and current. Disabled by -q."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -30,7 +30,7 @@ _PHASES = {
 
 
 class Terminal:
-    """Messages on standard error, so that standard output holds results only."""
+    """Messages on standard error; standard output is reserved for results."""
 
     def __init__(self, quiet: bool) -> None:
         self.console = Console(stderr=True, quiet=quiet or is_quiet(), highlight=False)
@@ -40,13 +40,13 @@ class Terminal:
 
     @contextmanager
     def busy(self, text: str) -> Iterator[None]:
-        """A spinner beside `text` while the block runs."""
+        """Show a spinner beside `text` while the block runs."""
         with self.console.status(f"{text} ..."):
             yield
 
     @contextmanager
     def following(self, config: Path | None) -> Iterator[OnProgress]:
-        """Shows the progress of a long call: the arm of `config` while it moves, else a spinner or a line."""
+        """Show the progress of a long call: a live view of the arm while it moves, otherwise a message or a spinner."""
         with ExitStack() as showing:
             watch: Watch | None = None
 
@@ -67,11 +67,11 @@ class Terminal:
 
     @contextmanager
     def scanning(self) -> Iterator[ScanWatch]:
-        """Shows servos as they answer and, on a terminal, the current baud rate and the time remaining."""
+        """Show servos as they answer and, on a terminal, the current baud rate and the remaining time."""
         if self.console.quiet:
             yield lambda _: None
             return
-        with self.console.status("Asking ...") as status:
+        with self.console.status("Scanning ...") as status:
 
             def watch(asking: Asking) -> None:
                 if asking.servo is not None:
@@ -83,7 +83,7 @@ class Terminal:
 
     @contextmanager
     def streaming(self, config: Config) -> Iterator[Watch]:
-        """A live view of the stream; gives the function to call with each progress."""
+        """Show a live view of the stream. Yields the function to call with each progress report."""
         if not self.console.is_terminal or self.console.quiet:
             yield lambda _: None
             return

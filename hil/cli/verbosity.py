@@ -1,7 +1,7 @@
-"""-v and -q on every subcommand: how much of the logger `hil` is shown on standard error.
+"""Adds -v and -q to every subcommand: how much of the logger `hil` is shown on standard error.
 
-Without either, a command says what it is doing and what went wrong. -v adds the log, -vv its details; -q leaves the
-result on standard output and errors on standard error, nothing else.
+Without either, a command reports its progress and its errors. -v adds log messages and -vv debug messages; -q leaves
+only the result on standard output and errors on standard error.
 """
 
 import inspect
@@ -13,8 +13,10 @@ from typing import Annotated, Any
 
 import typer
 
+from hil.cli.output import readable_output
+
 STOPPED = 130
-"""Exit code of a command that Ctrl-C ended while no arm moved, as shells have it."""
+"""Exit code after Ctrl-C when no arm was moving, as is usual in shells."""
 
 _Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Show log messages; -vv for details.")
@@ -23,7 +25,7 @@ _Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only the resul
 
 
 def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:
-    """The subcommand with the two options beside its own."""
+    """Add --verbose and --quiet to a subcommand."""
 
     @wraps(command)
     def run(*args: Any, verbose: int, quiet: bool, **options: Any) -> None:
@@ -31,8 +33,9 @@ def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.BadParameter("give either --verbose or --quiet, not both.")
         _set_up(verbose, quiet)
         try:
-            command(*args, **options)
-        except KeyboardInterrupt as stopped:  # before or after the arm moved; while it moves the stream answers
+            with readable_output():
+                command(*args, **options)
+        except KeyboardInterrupt as stopped:  # before or after the motion; during it, the stream handles Ctrl-C
             print("\n".join(["hil: Stopped by Ctrl-C.", *getattr(stopped, "__notes__", [])]), file=sys.stderr)
             raise typer.Exit(STOPPED) from None
 
@@ -58,7 +61,7 @@ def _set_up(verbose: int, quiet: bool) -> None:
     logger.setLevel(logging.NOTSET)
     shown = _ShownOnTerminal()
     shown.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s", "%H:%M:%S"))
-    shown.setLevel(logging.ERROR)  # warnings are among the results
+    shown.setLevel(logging.ERROR)  # warnings are already part of the result
     if quiet:
         logger.setLevel(logging.ERROR)
     elif verbose:
@@ -68,4 +71,4 @@ def _set_up(verbose: int, quiet: bool) -> None:
 
 
 class _ShownOnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
-    """On standard error, which the next command in the same process replaces."""
+    """Writes to standard error; replaced by the next command that runs in the same process."""

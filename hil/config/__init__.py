@@ -1,1 +1,1 @@
-"""The arm's file: its TOML checked, and the ready ones that come with hil."""
+"""The arm's configuration: the checked TOML file, and the bundled configurations."""

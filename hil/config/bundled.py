@@ -1,4 +1,4 @@
-"""Configurations that come with hil: `hil identify fake_two_link` works without a checkout."""
+"""Configurations that are installed with hil: `hil identify fake_two_link` works without a checkout."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ def bundled_configs() -> dict[str, Path]:
 
 
 def find_config(path: Path) -> Path:
-    """`path` itself or, if it is a bare name and not a file, the bundled file of that name."""
+    """Return `path`, or the bundled file of that name if `path` is a bare name and no such file exists."""
     is_name = path.name == str(path) and path.suffix == ""
     if not is_name or path.exists():
         return path

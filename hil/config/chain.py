@@ -1,4 +1,4 @@
-"""Requirements on the configuration of a spatial arm, and the description from its URDF."""
+"""Requirements on the configuration of a spatial arm, and its description read from a URDF."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -23,7 +23,7 @@ _OPTIONS = ("presliding", "asymmetry", "ripple", "saturation", "cable", "encoder
 
 
 def described_arm(config: "Config") -> ArmDescription:
-    """The arm of `[arm] urdf` with the joints of the configuration; raises ArmFileError."""
+    """Describe the arm of `[arm] urdf` with the joints of the configuration. Raises ArmFileError."""
     assert config.arm.urdf is not None
     return _read(config.arm.urdf, tuple(joint.name for joint in config.joints), _changed(config.arm.urdf))
 
@@ -44,21 +44,21 @@ def describes_planar(config: "Config") -> bool:
 
 
 def only_planar(config: "Config", what: str) -> None:
-    """Raise ConfigError for an arm in space: `what` needs a planar arm."""
+    """Raise ConfigError if the arm is spatial, because `what` needs a planar arm."""
     if config.is_chain:
         raise ConfigError(
-            f"{config.path}: {what} supports only planar arms so far; this one has arm.urdf. `hil identify` works on a "
-            "fake one, `hil estimate`, `hil report` and `hil export` on its runs."
+            f"{config.path}: {what} supports only planar arms so far; this one has arm.urdf. For spatial arms, use "
+            "`hil identify` on a fake arm, and `hil estimate`, `hil report` and `hil export` on its runs."
         )
 
 
 def chain_slips(config: "Config") -> Iterator[str]:
-    """One sentence for each thing that is missing or does not fit; nothing for a planar arm without a URDF."""
+    """Yield one sentence per mistake in the configuration of a spatial arm; nothing for a valid planar arm."""
     if config.arm.urdf is None:
         if len(config.joints) > _PLANAR:
             yield (
-                f"joints: {len(config.joints)} of them need arm.urdf, which gives the geometry; without it an arm "
-                "has one or two joints"
+                f"joints: {len(config.joints)} joints need arm.urdf, which gives the geometry; without it, an "
+                "arm has one or two joints"
             )
         if config.joint_path is not None:
             yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
@@ -76,14 +76,13 @@ def chain_slips(config: "Config") -> Iterator[str]:
             f"arm.urdf and fake.chain.urdf are two files with the same name, {fake.name}, and a run folder holds "
             "both: rename one"
         )
-    if config.stabiliser is None:
-        yield (
-            "stabiliser is missing: a spatial arm does not hang at rest, so a spring and a damper must keep it "
-            "on its path"
-        )
     if config.experiment.pilot:
+        if config.joint_path is not None:
+            yield "joint_path: with experiment.pilot = true the path is found; remove one of the two"
+    elif config.stabiliser is None:
         yield (
-            "experiment.pilot = true: only planar arms support the pilot so far; set it to false and give [joint_path]"
+            "stabiliser is missing: a spatial arm does not hang at rest, so a spring and a damper must hold it "
+            "on its path; or set experiment.pilot = true, which finds both"
         )
     if config.known is not None:
         yield "known: only for planar arms; a URDF gives its own masses"
@@ -96,13 +95,13 @@ def chain_slips(config: "Config") -> Iterator[str]:
 
 
 def _path_slips(config: "Config") -> Iterator[str]:
-    if config.joint_path is None:
-        return
     if config.experiment.band is None:
         yield (
             "experiment.lines: a spatial arm follows a path, whose highest frequency is the upper end of "
             "experiment.band"
         )
+    if config.joint_path is None:
+        return
     parts = zip(config.joints, *config.joint_path.model_dump().values(), strict=False)
     for joint, centre, swing, speed in parts:
         low, high = joint.position_limit
@@ -116,7 +115,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
 
 
 def _changed(path: str) -> float:
-    """The file's modification time, so that a changed file is read again."""
+    """The file's modification time [s], so that a changed file is read again."""
     try:
         return Path(path).stat().st_mtime
     except OSError:

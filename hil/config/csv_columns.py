@@ -1,6 +1,6 @@
-"""What a recording made elsewhere needs beside its numbers: columns, units, and the arm's few facts.
+"""Description of a recording made elsewhere: its columns, their units, and a few facts about the arm.
 
-The same TOML as for an experiment will do, or a shorter one; tables that only the bus needs are ignored.
+The TOML file of an experiment can be used, or a shorter one; tables that only the bus needs are ignored.
 
     [arm]
     gravity = 9.81
@@ -8,7 +8,7 @@ The same TOML as for an experiment will do, or a shorter one; tables that only t
     friction = "stribeck"
     drive = "delay"
     [columns]
-    time = "time"                                     # seconds unless said otherwise
+    time = "time"                                     # in seconds unless time_unit is given
     position = ["pos_meas1", "pos_meas2"]             # one per joint
     torque = ["tau_meas1", "tau_meas2"]               # or current, which needs torque_constant
     position_unit = "rad"                             # rad, deg, turns
@@ -27,10 +27,13 @@ from hil.errors import ConfigError
 from hil.toml_errors import describe
 
 Column = Annotated[str, Field(min_length=1)]
-POSITION_UNITS = {"rad": 1.0, "deg": 0.017453292519943295, "turns": 6.283185307179586}
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3}
+TICKS = "ticks"
+POSITION_UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295, "turns": 6.283185307179586, TICKS: 1.0}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "kgf cm": 0.0980665}
 CURRENT_UNITS = {"A": 1.0, "mA": 1e-3}
+VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3}
+PWM_UNITS = {"1": 1.0, "%": 1e-2}
 
 
 class _Table(BaseModel):
@@ -38,12 +41,16 @@ class _Table(BaseModel):
 
 
 class Columns(_Table):
-    """`[columns]`: the meaning and unit of each column."""
+    """`[columns]`: the meaning and unit of each column. What is left out is taken from the columns' own heads."""
 
-    time: Column = "time"
-    time_unit: Literal["s", "ms", "us"] = "s"
-    position: list[Column] = Field(min_length=1, max_length=2, description="one column per joint")
-    position_unit: Literal["rad", "deg", "turns"] = "rad"
+    time: Column | None = None
+    rate: PositiveFloat | None = Field(None, le=1e5, description="samples per second, where there is no column of time")
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    position: list[Column] | None = Field(
+        None, min_length=1, max_length=2, description="one column per joint, from the base outwards"
+    )
+    position_unit: Literal["rad", "mrad", "deg", "turns", "ticks"] | None = None
+    ticks_per_turn: PositiveFloat | None = Field(None, description="of the encoders, for positions in ticks")
     zero: list[float] | None = Field(
         None, description="rad added to each position, so that joint 1 is measured from the horizontal"
     )
@@ -51,61 +58,107 @@ class Columns(_Table):
         None, description="rad per encoder step; detected from the data if absent"
     )
     torque: list[Column] | None = Field(None, description="one column per joint")
-    torque_unit: Literal["N m", "mN m"] = "N m"
+    torque_unit: Literal["N m", "mN m", "N cm", "kgf cm"] | None = None
     current: list[Column] | None = Field(None, description="one column per joint, in place of torque")
-    current_unit: Literal["A", "mA"] = "A"
-    torque_constant: list[PositiveFloat] | None = Field(None, description="N m/A per joint, with current")
+    current_unit: Literal["A", "mA"] | None = None
+    torque_constant: list[PositiveFloat] | None = Field(
+        None, description="N m/A per joint at the output shaft, with current; with resistance also for voltage"
+    )
+    voltage: list[Column] | None = Field(None, description="motor voltage, one column per joint, in place of torque")
+    voltage_unit: Literal["V", "mV"] | None = None
+    pwm: list[Column] | None = Field(None, description="share of the supply voltage, one column per joint")
+    pwm_unit: Literal["1", "%"] | None = None
+    supply_voltage: PositiveFloat | None = Field(None, le=1000, description="V, with pwm")
+    resistance: list[PositiveFloat] | None = Field(None, description="of the windings, ohm per joint")
+    torque_per_volt: list[PositiveFloat] | None = Field(
+        None, description="N m/V per joint at standstill: stall torque over voltage, or torque_constant / resistance"
+    )
     between: Literal["held", "linear"] = Field("linear", description="held for a command, linear for a measurement")
     segment: PositiveFloat = Field(1.0, le=60, description="s per shooting segment, each with an unknown initial state")
     zeros_unknown: bool = Field(True, description="estimate each encoder's zero offset")
 
+    @property
+    def drive(self) -> Literal["torque", "current", "voltage", "pwm"] | None:
+        """Which of the columns says how the joints were driven."""
+        kinds: tuple[Literal["torque", "current", "voltage", "pwm"], ...] = ("torque", "current", "voltage", "pwm")
+        return next((kind for kind in kinds if getattr(self, kind) is not None), None)
+
+    @property
+    def gains(self) -> list[float] | None:
+        """N m per A or per V of each joint; None for torque."""
+        if self.drive in {"voltage", "pwm"}:
+            if self.torque_per_volt is not None:
+                return list(self.torque_per_volt)
+            assert self.torque_constant is not None and self.resistance is not None  # checked
+            return [gain / ohm for gain, ohm in zip(self.torque_constant, self.resistance, strict=True)]
+        return None if self.torque_constant is None or self.drive != "current" else list(self.torque_constant)
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        count = len(self.position)
-        if (self.torque is None) == (self.current is None):
-            raise ValueError("columns: give either torque or current, one column per joint")
+        drives = [kind for kind in ("torque", "current", "voltage", "pwm") if getattr(self, kind) is not None]
+        if len(drives) > 1:
+            raise ValueError(f"columns: {' and '.join(drives)} are both given: give one of them, one column per joint")
+        if self.time is not None and self.rate is not None:
+            raise ValueError("columns: give either time or rate, not both")
         if self.current is not None and self.torque_constant is None:
             raise ValueError("columns.torque_constant is missing: current needs it, N m/A per joint")
-        for key in ("torque", "current", "torque_constant", "zero"):
-            values = getattr(self, key)
-            if values is not None and len(values) != count:
-                raise ValueError(f"columns.{key} has {len(values)} entries; position has {count}, one per joint")
+        if drives in (["voltage"], ["pwm"]):
+            if self.torque_per_volt is None and (self.torque_constant is None or self.resistance is None):
+                raise ValueError(
+                    f"columns.torque_per_volt is missing: {drives[0]} needs it, N m/V per joint, or torque_constant "
+                    "and resistance"
+                )
+            if self.pwm is not None and self.supply_voltage is None:
+                raise ValueError("columns.supply_voltage is missing: pwm is a share of it, V")
+        if self.position_unit == TICKS and self.ticks_per_turn is None:
+            raise ValueError("columns.ticks_per_turn is missing: positions are in ticks (4096 for X-series servos)")
+        self._one_each()
         return self
+
+    def _one_each(self) -> None:
+        per_joint = ("torque", "current", "voltage", "pwm", "torque_constant", "resistance", "torque_per_volt", "zero")
+        given = {key: len(values) for key in per_joint if (values := getattr(self, key)) is not None}
+        count = len(self.position) if self.position is not None else None
+        for key, size in given.items():
+            if count is not None and size != count:
+                raise ValueError(f"columns.{key} has {size} entries; position has {count}, one per joint")
 
 
 class ArmFacts(BaseModel):
-    """`[arm]`, of which only gravity is used here."""
+    """`[arm]`; only gravity is used here."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
 
 
-class CsvConfig(BaseModel):
-    """The tables of an arm's TOML that a recording made elsewhere needs."""
+class RecordingConfig(BaseModel):
+    """The tables of an arm's TOML that a recording made elsewhere needs; every one may be left out."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
-    columns: Columns
+    columns: Columns = Columns()
     arm: ArmFacts = ArmFacts()
-    model: ModelConfig = ModelConfig(friction="stribeck", drive="delay")
+    model: ModelConfig = ModelConfig(friction="auto", drive="delay")
     known: KnownConfig | None = None
 
 
-def load_csv_config(path: Path) -> CsvConfig:
+def load_recording_config(path: Path) -> RecordingConfig:
     """Read and check; raises ConfigError."""
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}.") from error
+    return parse_recording_config(text, path)
+
+
+def parse_recording_config(text: str, path: Path) -> RecordingConfig:
+    """The same from what stands in `path`; raises ConfigError."""
+    try:
+        values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
-    if "columns" not in values:
-        raise ConfigError(
-            f"{path}: has no [columns] table, which says what each CSV column holds. Example:\n[columns]\n"
-            'time = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
-        )
     try:
-        return CsvConfig.model_validate(values)
+        return RecordingConfig.model_validate(values)
     except ValidationError as error:
-        raise ConfigError(describe(error, path, CsvConfig)) from error
+        raise ConfigError(describe(error, path, RecordingConfig)) from error

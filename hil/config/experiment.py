@@ -1,4 +1,4 @@
-"""`[experiment]`, `[joint_path]` and `[model]`: the excitation, how it is streamed, what may explain the motion."""
+"""`[experiment]`, `[joint_path]` and `[model]`: the excitation, how it is streamed, and the model terms to fit."""
 
 from typing import Literal, Self
 
@@ -8,7 +8,7 @@ from hil.config.table import Range, Table
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
 
 DRIFT = 5.0
-"""Times experiment.settle_within."""
+"""Ratio of the accepted slow drift between periods to experiment.settle_within."""
 
 
 class ExperimentConfig(Table):
@@ -56,17 +56,20 @@ class ExperimentConfig(Table):
 
     @property
     def drift_within(self) -> float:
-        """As settle_within, of a motion that after max_settling_periods only drifts, as while grease warms."""
+        """Limit on the difference between periods for a motion that still drifts slowly after max_settling_periods.
+
+        Relative to the motion's RMS, like settle_within. Warming grease, for example, makes the motion drift.
+        """
         return DRIFT * self.settle_within
 
     @property
     def samples(self) -> int:
-        """Samples in a period."""
+        """Samples per period."""
         return round(self.rate * self.period)
 
 
 class PathConfig(Table):
-    """`[joint_path]`: the path that excites a spatial arm; band's upper end is its highest frequency."""
+    """`[joint_path]`: the path that excites a spatial arm. The upper end of the band is its highest frequency."""
 
     centre: list[float] = Field(description="rad per joint: centre of the path")
     swing: list[PositiveFloat] = Field(description="rad per joint: amplitude around the centre")
@@ -92,7 +95,7 @@ class ModelConfig(Table):
 
     @property
     def fixed_friction(self) -> Friction:
-        """The model for fits without model selection: "stribeck" where the file says "auto"."""
+        """The friction model for fits without model selection: "stribeck" if the file says "auto"."""
         return "stribeck" if self.friction == "auto" else self.friction
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""`[[joints]]`: one joint, its servos, its limits."""
+"""`[[joints]]`: one joint, its servos and its limits."""
 
 from typing import Literal, Self
 
@@ -19,7 +19,7 @@ class JointConfig(Table):
         1, alias="direction", description="-1 where the servo turns opposite to the joint; one entry per servo"
     )
     zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
-    mode: Literal["current", "pwm"] | None = Field(None, description="current where the model has it, unless given")
+    mode: Literal["current", "pwm"] | None = Field(None, description="default: current if the servo model supports it")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
     torque_constant_std: float = Field(0.0, ge=0, description="N m/A")
     torque_per_volt: PositiveFloat | None = Field(None, le=100, description="N m/V at the output shaft, pwm mode only")
@@ -32,7 +32,7 @@ class JointConfig(Table):
     @field_validator("name")
     @classmethod
     def _printable(cls, name: str) -> str:
-        """A name goes into terminals, XML, HTML and CSV: no control character, line break or half of a surrogate."""
+        """Reject control characters, line breaks and surrogates: names appear in terminals, XML, HTML and CSV."""
         if bad := [each for each in name if not each.isprintable()]:
             raise ValueError(f"{name!a}: {bad[0]!a} is not a printable character")
         return name
@@ -56,22 +56,22 @@ class JointConfig(Table):
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """The IDs of its servos, the first one's first."""
+        """The IDs of the joint's servos, the main servo first."""
         return tuple(self.servos) if isinstance(self.servos, list) else (self.servos,)
 
     @property
     def id(self) -> int:
-        """The ID of its servo, the first where it has two."""
+        """The ID of the joint's servo; of the main servo if there are two."""
         return self.ids[0]
 
     @property
     def directions(self) -> tuple[int, ...]:
-        """+1 or -1 for each of its servos."""
+        """Direction of each servo: +1, or -1 if it turns opposite to the joint."""
         return tuple(self.turns) if isinstance(self.turns, list) else (self.turns,) * len(self.ids)
 
     @property
     def direction(self) -> int:
-        """+1 or -1, of the first servo."""
+        """Direction of the main servo: +1 or -1."""
         return self.directions[0]
 
     @model_validator(mode="after")
@@ -98,7 +98,7 @@ class JointConfig(Table):
 
     @property
     def torque_per_goal(self) -> float:
-        """N m per A, or per V in pwm mode."""
+        """Torque per goal at the output shaft: N m/A, or N m/V in pwm mode."""
         value = self.torque_per_volt if self.drive_mode is Mode.PWM else self.torque_constant
         assert value is not None  # checked above
         return value
@@ -109,7 +109,7 @@ class JointConfig(Table):
 
     @property
     def goal_limit(self) -> float:
-        """A, or V in pwm mode."""
+        """Largest allowed goal: A, or V in pwm mode."""
         value = self.voltage_limit if self.drive_mode is Mode.PWM else self.current_limit
         assert value is not None  # checked above
         return value

@@ -1,7 +1,7 @@
-"""The JSON Schema of the TOML, from the models that check it: editors complete and check a file while it is typed.
+"""The JSON Schema of the TOML file, generated from the models that check it. Editors use it for completion and checks.
 
-It says what a single value or table must be like. What values must agree on (a rest pose within the position limits, as
-many entries as joints) is checked only by `load_config`.
+It describes single values and tables. Constraints between values (a rest pose within the position limits, one entry per
+joint) are checked only by `load_config`.
 """
 
 import json
@@ -19,7 +19,9 @@ _REF = "#/$defs/{model}"
 
 
 def toml_schema() -> dict[str, Any]:
-    """The schema of an arm's file. One without [port] describes a recording made elsewhere and needs [columns] only."""
+    """The schema of an arm's file; without [port], the file describes a recording made elsewhere and needs only
+    [columns].
+    """
     _, described = models_json_schema([(Config, "validation"), (Columns, "validation")], ref_template=_REF)
     defs = _without_null(described["$defs"])
     config = defs.pop("Config")
@@ -45,12 +47,12 @@ def toml_schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """The schema as the file configs/hil.schema.json holds it."""
+    """The schema as text, as stored in configs/hil.schema.json."""
     return json.dumps(toml_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 def _without_null(value: Any) -> Any:
-    """TOML has no null: a key that may be None may only be omitted."""
+    """Remove null alternatives: TOML has no null, so an optional key can only be omitted."""
     if isinstance(value, list):
         return [_without_null(each) for each in value]
     if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""`[known]` in the TOML: lengths, masses and rotor inertias measured by the user."""
+"""`[known]` in the TOML file: lengths, masses and rotor inertias measured by the user."""
 
 from typing import Annotated, Self
 
@@ -8,7 +8,7 @@ from hil.estimator.models.physical_parameters import Known
 
 
 class Measured(BaseModel):
-    """A quantity with its standard error."""
+    """A value with its standard error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -52,7 +52,10 @@ class KnownConfig(BaseModel):
         return self
 
     def quantities(self) -> dict[str, Known]:
-        """By the names of hil.estimator.models.physical_parameters; rotor inertia times gear ratio^2 is armature."""
+        """The known quantities by the names of hil.estimator.models.physical_parameters.
+
+        Rotor inertia times gear ratio squared is returned as armature.
+        """
         found: dict[str, Known] = {}
         for name in type(self).model_fields:
             item = getattr(self, name)

@@ -1,4 +1,4 @@
-"""Unit mistakes: degrees for radians, millimetres for metres, mA for A. Such a file is valid, and dangerous.
+"""Detection of unit mistakes, such as degrees for radians, mm for m, or mA for A: such a file is valid but dangerous.
 
 Every physical quantity is compared, with a wide margin, with what a servo of that model could move: external gears,
 light plastic links and heavy test rigs pass; a factor due to a wrong unit does not.
@@ -19,20 +19,20 @@ _LONGEST_M = 3.0
 _SHORTEST_M = 2e-3
 _MOST_INERTIA = 100.0  # kg m^2
 _GEAR = 8.0
-"""How far a torque constant may be from the published one: an external gear, or a very bad guess."""
+"""Largest ratio of a torque constant to the published one: an external gear, or a very bad guess."""
 
 _SPEED = 4.0
-"""How many times the speed at which back-EMF alone uses up the supply."""
+"""Largest ratio of the velocity limit to the no-load speed, at which the back-EMF equals the supply voltage."""
 
 _CURRENT = 2.0
-"""How many times the model's stall current."""
+"""Largest ratio of the current limit to the model's stall current."""
 
 _LEVER_M = 0.05
-"""A mass that this lever makes too heavy for the servo's stall torque is no link's."""
+"""A link mass is implausible if the servo's stall torque could not hold it at this lever arm [m]."""
 
 
 def implausible(config: "Config") -> Iterator[str]:
-    """One sentence for each quantity that looks like a unit mistake; nothing if there is none."""
+    """Yield one sentence for each quantity that looks like a unit mistake."""
     for joint in config.joints:
         yield from _joint(joint)
     yield from _angles("arm.rest_pose", config.arm.rest_pose)
@@ -54,22 +54,22 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
     ratio = joint.torque_per_goal / published
     if not 1 / _GEAR < ratio < _GEAR:
         yield (
-            f"{name} of {where} = {joint.torque_per_goal:g} {unit}: {ratio:.3g} times the published {published:.3g} "
-            f"{unit} of a {joint.model}. It is N m at the output shaft, not mN m, kgf cm or the bare motor's"
+            f"{name} of {where} = {joint.torque_per_goal:g} {unit} is {ratio:.3g} times the published {published:.3g} "
+            f"{unit} of a {joint.model}. Use N m at the output shaft, not mN m, kgf cm or the torque of the bare motor"
         )
     fastest = max(stall.voltage for stall in model.stalls) / model.torque_per_ampere.low
     if joint.velocity_limit > _SPEED * fastest:
         yield (
-            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: a {joint.model} turns at {fastest:.2g} rad/s "
-            f"at most. If it is in degrees/s write {math.radians(joint.velocity_limit):.3g}, if in rpm "
+            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: a {joint.model} cannot exceed {fastest:.2g} "
+            f"rad/s. If it is in degrees/s, write {math.radians(joint.velocity_limit):.3g}; if in rpm, "
             f"{joint.velocity_limit * math.pi / 30:.3g}"
         )
     stall = max(stall.voltage if pwm else stall.current for stall in model.stalls)
     if joint.goal_limit > _CURRENT * stall:
         name, unit, kind = ("voltage_limit", "V", "supply") if pwm else ("current_limit", "A", "stall current")
         yield (
-            f"{name} of {where} = {joint.goal_limit:g} {unit}: a {joint.model}'s {kind} is {stall:g} {unit} at most. "
-            f"If it is in m{unit} write {joint.goal_limit / 1000:.3g}"
+            f"{name} of {where} = {joint.goal_limit:g} {unit}: the {kind} of a {joint.model} is {stall:g} {unit}. "
+            f"If it is in m{unit}, write {joint.goal_limit / 1000:.3g}"
         )
 
 
@@ -78,12 +78,12 @@ def _angles(key: str, values: Sequence[float], most: float = _MOST_TURN_RAD) -> 
         shown = ", ".join(f"{value:g}" for value in values)
         radians = ", ".join(f"{math.radians(value):.4g}" for value in values)
         turns = max(abs(value) for value in values) / (2 * math.pi)
-        yield f"{key} = [{shown}] rad: that is up to {turns:.2g} turns. If it is in degrees write [{radians}]"
+        yield f"{key} = [{shown}] rad: that is up to {turns:.2g} turns. If it is in degrees, write [{radians}]"
 
 
 def _length(key: str, length: float) -> Iterator[str]:
     if length > _LONGEST_M:
-        yield f"{key} = {length:g} m is longer than any servo arm's. If it is in mm write {length / 1000:.4g}"
+        yield f"{key} = {length:g} m is longer than any servo arm. If it is in mm, write {length / 1000:.4g}"
     elif length < _SHORTEST_M:
         yield f"{key} = {length:g} m is shorter than any servo. Give it in metres, from joint to joint"
 
@@ -135,7 +135,7 @@ def _known(config: "Config") -> Iterator[str]:
 
 
 def _stall_torque(joint: "JointConfig") -> float:
-    """The strongest published [N m]; more where the joint's torque constant says that a gear follows."""
+    """The highest published stall torque [N m], scaled up if the joint's torque constant indicates an external gear."""
     model = servo_model(joint.model)
     pwm = joint.drive_mode is Mode.PWM
     published = (model.torque_per_volt if pwm else model.torque_per_ampere).value
@@ -143,13 +143,13 @@ def _stall_torque(joint: "JointConfig") -> float:
 
 
 def _heaviest(stall_torque: float) -> float:
-    """Mass [kg] that the servo could just hold with a very short lever arm."""
+    """Mass [kg] that the servo can just hold at a very short lever arm."""
     return stall_torque / (9.81 * _LEVER_M)
 
 
 def _too_much(key: str, value: float, most: float, unit: str, joint: "JointConfig") -> Iterator[str]:
     if value > most:
         yield (
-            f"{key} = {value:g} {unit}: far more than a {joint.model} can move ({most:.3g} {unit}). All quantities "
-            "are SI: kg, m, N m, rad, s"
+            f"{key} = {value:g} {unit}: far more than a {joint.model} can move ({most:.3g} {unit}). Use SI units "
+            "for all quantities: kg, m, N m, rad, s"
         )

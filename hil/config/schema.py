@@ -1,6 +1,7 @@
-"""One TOML file describes the arm, its limits and its experiment; here it is read and checked.
+"""The TOML file that describes the arm, its limits and its experiment; this module reads and checks it.
 
-`load_config` returns a frozen `Config` or raises ConfigError, which names file, key, value and what is allowed.
+`load_config` returns a frozen `Config` or raises ConfigError, which names the file, the key, the value and what is
+allowed.
 """
 
 import math
@@ -21,6 +22,7 @@ from pydantic import (
 from hil import fakes
 from hil.config.bundled import find_config
 from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
+from hil.config.clearance import ClearanceConfig
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
@@ -36,33 +38,35 @@ from hil.toml_errors import describe
 FAKE_URL = "fake://"
 
 SLOW_INTERVAL_S = 0.25
-"""From one reading of the servos' clocks to the next of voltage and temperature, in turn."""
+"""Interval between slow reads [s], which alternate between the servos' clocks and voltage and temperature."""
 
 
 class PortConfig(Table):
-    """`[port]`: where the servos are."""
+    """`[port]`: the bus to which the servos are connected."""
 
     url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
-    one_write: bool = Field(True, description="send goals and read request in one write; false where hil check says so")
+    one_write: bool = Field(True, description="send goals and read request in one write; false if hil check says so")
     fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")
 
 
 class PriorConfig(Table):
-    """`[arm.prior]`: best guesses before any identification; one value per joint. Missing values are guessed roughly
-    from link lengths and servo models (hil.dry_run.prior), with `rough_spread` in place of `spread`.
+    """`[arm.prior]`: best guesses before any identification, one value per joint.
+
+    Missing values are guessed from link lengths and servo models (hil.dry_run.prior), with `rough_spread` in place of
+    `spread`.
     """
 
     spread: PositiveFloat = Field(0.3, le=1, description="relative standard deviation of each given value")
     rough_spread: PositiveFloat | None = Field(
-        None, le=1, description="of each guessed value; a default per quantity unless given"
+        None, le=1, description="relative standard deviation of each guessed value; default depends on the quantity"
     )
     link_mass: list[PositiveFloat] | None = Field(None, description="kg, links without servos")
-    link_centre: list[PositiveFloat] | None = Field(None, description="m from the link's joint to its centre of mass")
-    link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2 about that centre")
+    link_centre: list[PositiveFloat] | None = Field(None, description="m, from the link's joint to its centre of mass")
+    link_inertia: list[PositiveFloat] | None = Field(None, description="kg m^2, about the link's centre of mass")
     servo_mass: list[PositiveFloat] | None = Field(None, description="kg")
     armature: list[PositiveFloat] | None = Field(None, description="kg m^2: rotor inertia times gear ratio squared")
-    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad; in pwm mode back-EMF included")
+    viscous: list[PositiveFloat] | None = Field(None, description="N m s/rad, including back-EMF in pwm mode")
     coulomb: list[PositiveFloat] | None = Field(None, description="N m")
 
 
@@ -81,7 +85,9 @@ class ArmConfig(Table):
         0.5,
         description="rad of deviation from the rest pose allowed at the start (friction may hold the arm away from it)",
     )
-    link_lengths: list[PositiveFloat] | None = Field(None, description="m, joint to joint and to the tip, for dry runs")
+    link_lengths: list[PositiveFloat] | None = Field(
+        None, description="m, from joint to joint and to the tip, for dry runs"
+    )
     prior: PriorConfig | None = Field(None, description="prior knowledge of masses and friction, for a dry run")
 
 
@@ -95,8 +101,10 @@ class SafetyConfig(Table):
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may fail to reply")
     late_time: PositiveFloat = Field(0.05, le=2, description="s for which deadlines may be missed")
-    max_missing: int | None = Field(None, ge=1, le=1000, description="consecutive replies; instead of missing_time")
-    max_late: int | None = Field(None, ge=1, le=1000, description="consecutive deadlines; instead of late_time")
+    max_missing: int | None = Field(
+        None, ge=1, le=1000, description="consecutive lost replies, instead of missing_time"
+    )
+    max_late: int | None = Field(None, ge=1, le=1000, description="consecutive missed deadlines, instead of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, description="A/s (V/s in PWM mode): maximum rate of change of goals")
@@ -108,10 +116,14 @@ class SafetyConfig(Table):
         0.3, le=1, description="fraction of the planned peak by which it may deviate for longer"
     )
     take_over: bool = Field(
-        False, description="take over an arm whose torque is on, letting it sink slowly; otherwise refuse it"
+        False, description="take over an arm whose torque is on, and lower it slowly; by default such an arm is refused"
     )
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes, where possible, before torque is cut')
-    damp_time: float = Field(0.06, ge=0, le=2, description="s: maximum braking time")
+    damp_time: float = Field(0.06, ge=0, le=2, description="s, maximum braking time")
+    lower_speed: PositiveFloat = Field(
+        0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose"
+    )
+    lower_time: PositiveFloat = Field(10.0, le=60, description="s: longest time for that; a longer way is taken faster")
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
     )
@@ -126,7 +138,7 @@ class SafetyConfig(Table):
 
 
 class StabiliserConfig(Table):
-    """`[stabiliser]`: a spring and a damper in software around arm.rest_pose, for arms that have no stable rest."""
+    """`[stabiliser]`: a software spring and damper around arm.rest_pose, for arms without a stable rest pose."""
 
     stiffness: list[float] = Field(description="N m/rad per joint")
     damping: list[float] = Field(description="N m s/rad per joint")
@@ -141,7 +153,7 @@ class StabiliserConfig(Table):
 
 
 class Config(Table):
-    """The whole file. `path` is the file it was read from."""
+    """The complete configuration. `path` is the file it was read from."""
 
     path: Path = Field(exclude=True)
     port: PortConfig
@@ -152,6 +164,7 @@ class Config(Table):
     model: ModelConfig = ModelConfig()
     safety: SafetyConfig = SafetyConfig()
     stabiliser: StabiliserConfig | None = None
+    clearance: ClearanceConfig = ClearanceConfig()
     known: KnownConfig | None = None
     columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
     fake: FakeArm | None = None
@@ -159,7 +172,7 @@ class Config(Table):
     @model_validator(mode="before")
     @classmethod
     def _usual_voltage(cls, values: Any) -> Any:
-        """Where no min_voltage is given: the lowest of the models' minimum voltages."""
+        """Default of safety.min_voltage: the lowest minimum voltage of the servo models."""
         if not isinstance(values, dict) or not isinstance(values.get("safety", {}), dict):
             return values
         joints = values.get("joints")
@@ -227,12 +240,12 @@ class Config(Table):
 
     @property
     def url(self) -> str:
-        """The port's URL, with "fake://" completed by the file that describes the fake arm."""
+        """The port's URL; "fake://" is completed with the path of the file that describes the fake arm."""
         return f"{FAKE_URL}{self.path.resolve()}" if self.port.url == FAKE_URL else self.port.url
 
     @property
     def bus(self) -> BusConfig:
-        """What the driver needs to know."""
+        """The configuration of the bus driver."""
         return BusConfig(
             self.url,
             self.port.baud,
@@ -251,7 +264,7 @@ class Config(Table):
 
 
 def load_config(path: Path) -> Config:
-    """Read and check a TOML file, or the bundled one of that bare name; raises ConfigError."""
+    """Read and check a TOML file, or the bundled one of that bare name. Raises ConfigError."""
     path = find_config(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -262,7 +275,7 @@ def load_config(path: Path) -> Config:
 
 
 def parse_config(text: str, path: Path) -> Config:
-    """Check the text of a TOML file read from `path`; raises ConfigError."""
+    """Check the text of a TOML file read from `path`. Raises ConfigError."""
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -310,8 +323,10 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
 
 
 def port_url(port: str) -> str:
-    """The URL of a port: as given, or what the configuration says where `port` is a TOML file or the name of a bundled
-    one, or the fake arm of that name; raises ConfigError.
+    """The URL of a port.
+
+    `port` is a URL or device, which is returned unchanged; a TOML file or the name of a bundled one; or the name of a
+    fake arm. Raises ConfigError.
     """
     url = _url_of(port)
     fakes.register_for(url)

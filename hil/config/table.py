@@ -1,4 +1,4 @@
-"""What all tables of the TOML have in common."""
+"""The base class and field types shared by all tables of the TOML file."""
 
 from typing import Annotated, TypeVar
 
@@ -8,7 +8,7 @@ from hil.toml_errors import UNSAID
 
 
 class Table(BaseModel):
-    """Frozen; unknown keys, wrong types, infinity and NaN are errors."""
+    """Base of all tables: frozen; unknown keys, wrong types, infinity and NaN are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -19,5 +19,5 @@ OneOrList = Annotated[
     Annotated[_One, Tag(f"{UNSAID}one")] | Annotated[list[_One], Tag(f"{UNSAID}list")],
     Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
 ]
-"""A value, or a list of such; a wrong one is named as what it looks like."""
+"""A single value or a list; validation errors refer to the form that was given."""
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -1,4 +1,4 @@
-"""A serial arm as a file describes it: joints in space and the rigid bodies between them."""
+"""A serial arm as described by a file: joints in space and the rigid bodies between them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,33 +10,33 @@ Array = NDArray[np.float64]
 
 
 class ArmFileError(ValueError):
-    """A description of an arm cannot be read or does not describe a serial arm. The message names the file, the element
-    and what is
-    required."""
+    """Raised when a file cannot be read or does not describe a serial arm; the message names file and element."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body in the frame of the link that it is part of."""
+    """A rigid body in the frame of the link that it belongs to."""
 
     mass: float
-    """[kg]."""
+    """Mass [kg]."""
     centre: Array
     """Centre of mass (3,) [m]."""
     inertia: Array
-    """About the centre of mass (3, 3) [kg m^2]."""
+    """Inertia about the centre of mass (3, 3) [kg m^2]."""
 
     @classmethod
     def nothing(cls) -> "Body":
-        """A body without mass."""
+        """Return a body without mass."""
         return cls(0.0, np.zeros(3), np.zeros((3, 3)))
 
     def moved(self, rotation: Array, translation: Array) -> "Body":
-        """Expressed in a frame in which its own frame has this rotation and translation."""
+        """Express the body in another frame; rotation (3, 3) and translation (3,) [m] give its own frame's pose in that
+        frame.
+        """
         return Body(self.mass, rotation @ self.centre + translation, rotation @ self.inertia @ rotation.T)
 
     def joined(self, other: "Body") -> "Body":
-        """The two bodies, given in the same frame, as one."""
+        """Merge two bodies given in the same frame."""
         mass = self.mass + other.mass
         if mass == 0.0:
             return Body(0.0, self.centre, self.inertia + other.inertia)
@@ -48,15 +48,19 @@ class Body:
 
     @property
     def parameters(self) -> Array:
-        """Mass, first moment, and inertia about the frame's origin (xx, xy, xz, yy, yz, zz) (10,)."""
+        """Inertial parameters (10,): mass [kg], first moment [kg m], inertia about the frame's origin [kg m^2].
+
+        The inertia is in the order xx, xy, xz, yy, yz, zz.
+        """
         about = self.inertia + self.mass * _steiner(self.centre)
         upper = [about[row, column] for row in range(3) for column in range(row, 3)]
         return np.array([self.mass, *(self.mass * self.centre), *upper])
 
     @property
     def is_physical(self) -> bool:
-        """Whether some distribution of mass has this inertia: positive, and no principal moment above the others'
-        sum."""
+        """Whether some mass distribution has this inertia: no negative moment, and none larger than the sum of the
+        others.
+        """
         if not self.mass > 0.0:
             return False
         moments = np.linalg.eigvalsh(self.inertia)
@@ -69,19 +73,19 @@ class ArmJoint:
 
     name: str
     link: str
-    """Name of the link that it moves."""
+    """Name of the link that the joint moves."""
     rotation: Array
-    """Of the link's frame in that of the moving link before, at angle zero (3, 3)."""
+    """Rotation of the link's frame in the frame of the previous moving link, at angle zero (3, 3)."""
     translation: Array
-    """(3,) [m]."""
+    """Translation of the link's frame in the frame of the previous moving link (3,) [m]."""
     axis: Array
-    """In the link's frame, of length 1 (3,)."""
+    """Unit vector along the joint axis, in the link's frame (3,)."""
     limits: tuple[float, float] | None
-    """[rad]; None for a joint that turns on and on."""
+    """Lower and upper limit [rad]; None for a continuous joint."""
     body: Body
-    """The link merged with everything fixed to it."""
+    """The link merged with everything that is rigidly attached to it."""
     fixed: tuple[str, ...]
-    """Names of the links that are fixed to it, or held."""
+    """Names of the links attached to it by fixed or held joints."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +94,12 @@ class ArmDescription:
 
     path: Path
     base: str
-    """Name of the link that stands still."""
+    """Name of the stationary link."""
     joints: tuple[ArmJoint, ...]
     held: tuple[str, ...]
-    """Movable joints that are not among the arm's, such as a gripper's: taken as held at zero."""
+    """Movable joints outside the arm, such as a gripper's, which are assumed to be held at zero."""
     doubts: tuple[str, ...]
-    """In words: what is implausible about its inertias."""
+    """Warnings about implausible inertias, one sentence each."""
 
     @property
     def parameters(self) -> Array:
@@ -112,6 +116,6 @@ class ArmDescription:
 
 
 def _steiner(offset: Array) -> Array:
-    """What a unit mass at this offset adds to an inertia (3, 3)."""
+    """Inertia (3, 3) [m^2] that a unit mass at this offset (3,) [m] adds (parallel-axis theorem)."""
     shifted: Array = np.dot(offset, offset) * np.eye(3) - np.outer(offset, offset)
     return shifted

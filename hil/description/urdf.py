@@ -1,4 +1,4 @@
-"""URDF files: the branch of the tree formed by the arm's joints, with everything fixed to it merged into its links.
+"""URDF files: the branch formed by the arm's joints, with everything rigidly attached merged into its links.
 
 Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are not opened.
 """
@@ -13,9 +13,9 @@ import numpy as np
 
 from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body
 
-MOST_LENGTH = 3.0  # m from joint to joint: more is millimetres
-MOST_MASS = 100.0  # kg of one link: more is grams
-MOST_GYRATION = 2.0  # m: a radius of gyration that only wrong units make
+MOST_LENGTH = 3.0  # m from joint to joint; a larger value suggests millimetres
+MOST_MASS = 100.0  # kg per link; a larger value suggests grams
+MOST_GYRATION = 2.0  # m, radius of gyration; a larger value suggests wrong units
 TURNING = ("revolute", "continuous")
 MOVABLE = (*TURNING, "prismatic", "planar", "floating")
 
@@ -34,10 +34,11 @@ class _Joint:
 
 
 def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
-    """The arm of these joints, from the base outwards; of all that turn if none are named.
+    """Read the arm formed by these joints, in order from the base; by default, by all rotating joints.
 
-    Raises ArmFileError for anything that is not a URDF of a serial arm: loops, joints that are not there, not in line
-    or slide, mimic joints among them, links without mass, axes that are not of length 1, units that are not SI.
+    Raises ArmFileError for anything that is not a URDF of a serial arm: loops; joints that do not exist, do not form
+    one branch, are prismatic or mimic others; links without mass; axes that are not unit vectors; units that are not
+    SI.
     """
     root = parse_urdf(path)
     bodies, physical = _links(root, path)
@@ -67,7 +68,7 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         rotation, translation = np.eye(3), np.zeros(3)
     check_units(arm, path)
     doubts = tuple(
-        f'link "{each.link}": no mass distribution can have this inertia; the data will decide'
+        f'link "{each.link}": no mass distribution can have this inertia; it is used only as an initial guess'
         for each in arm
         if not physical[each.link] or not each.body.is_physical
     )
@@ -75,7 +76,7 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 
 
 def parse_urdf(path: Path) -> ET.Element:
-    """The root element, comments kept. Raises ArmFileError."""
+    """Parse the file and return its root element, keeping comments. Raises ArmFileError."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -177,7 +178,7 @@ def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> 
 
 
 def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
-    """The rotating joints, if there is only one branch."""
+    """Names of the rotating joints, provided that they form a single branch."""
     names: list[str] = []
     link = base
     while True:
@@ -196,14 +197,14 @@ def _all_turning(tree: dict[str, _Joint], base: str, path: Path) -> list[str]:
 
 
 def _turns(joint: _Joint, tree: dict[str, _Joint]) -> bool:
-    """Whether this joint or one beyond it rotates."""
+    """Whether this joint or any joint beyond it rotates."""
     if joint.kind in TURNING:
         return True
     return any(_turns(other, tree) for other in tree.values() if other.parent == joint.child and other.mimics is None)
 
 
 def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) -> list[_Joint]:
-    """All joints from the base to the last of `names`, which must be among them in this order."""
+    """All joints from the base to the last of `names`, which must be on this branch in the given order."""
     if not names:
         raise ArmFileError(f"{path}: no joint rotates, so there is no arm")
     if len(set(names)) < len(names):
@@ -252,7 +253,7 @@ def _way_to(tree: dict[str, _Joint], base: str, name: str, path: Path) -> list[_
 def _rigid(
     link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str], on_branch: set[str]
 ) -> tuple[Body, list[str], list[str]]:
-    """A link merged with everything fixed to it, the names of the merged links, and of movable joints held fixed."""
+    """Merge a link with everything attached to it; also return the names of merged links and of held joints."""
     body, fixed, held = bodies[link], [], []
     for joint in tree.values():
         if joint.parent != link or joint.name in chosen:
@@ -273,14 +274,14 @@ def check_units(arm: Sequence[ArmJoint], path: Path) -> None:
         if length > MOST_LENGTH:
             raise ArmFileError(
                 f'{path}: joint "{joint.name}" is {length:.4g} m from the previous one: is that in millimetres? URDF '
-                "is in metres and kilograms"
+                "uses metres and kilograms"
             )
         body = joint.body
         gyration = math.sqrt(max(float(np.trace(body.inertia)), 0.0) / body.mass)
         if body.mass > MOST_MASS or gyration > MOST_GYRATION or np.linalg.norm(body.centre) > MOST_LENGTH:
             raise ArmFileError(
-                f'{path}: link "{joint.link}" has {body.mass:.4g} kg, its centre {np.linalg.norm(body.centre):.4g} m '
-                f"away and a radius of gyration of {gyration:.4g} m: are these grams or millimetres? URDF is in "
+                f'{path}: link "{joint.link}" has a mass of {body.mass:.4g} kg at {np.linalg.norm(body.centre):.4g} m '
+                f"from its joint, and a radius of gyration of {gyration:.4g} m: are these grams or mm? URDF uses "
                 "metres, kilograms and kg m^2"
             )
 
@@ -320,7 +321,7 @@ def _origin(element: ET.Element, where: str, path: Path) -> tuple[Array, Array]:
 
 
 def rotation_of(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation matrix (3, 3) of turns [rad] about the fixed x, then y, then z axis."""
+    """Rotation matrix (3, 3) for rotations [rad] about the fixed x, then y, then z axis."""
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     return np.array(
         [

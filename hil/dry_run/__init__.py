@@ -1,6 +1,6 @@
-"""The experiment simulated before anything moves: what to expect, and the largest safe amplitude.
+"""Simulation of the experiment before anything moves: expected peaks, and the largest safe amplitude.
 
-`hil.dry_run("arm.toml")` simulates one: see hil.api.dry_run.
+Call `hil.dry_run("arm.toml")` to simulate an experiment: see hil.api.dry_run.
 """
 
 import sys
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class _CallableModule(ModuleType):
-    """`hil.dry_run` is the front door's function, or this package once a module of it was imported: call either."""
+    """Makes this package callable, because `hil.dry_run` names both the function and the package."""
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         import hil

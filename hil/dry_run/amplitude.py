@@ -1,6 +1,7 @@
-"""The largest torque whose chance of touching a limit is small enough, per joint, by dry runs."""
+"""Search, by dry runs, for the largest torque of each joint at which exceeding a limit is sufficiently unlikely."""
 
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -16,10 +17,10 @@ from hil.plan.plan import Plan, make_plan, scaled
 Array = NDArray[np.float64]
 
 SEARCH_ARMS = 32
-"""Arms during the search; the result is checked on all of them."""
+"""Number of arms simulated during the search; the result is checked on all arms."""
 
 PRIOR_ROOM = 0.9
-"""Of the limits, while nothing was identified: a wide prior's tail is longer than the simulated arms show."""
+"""Fraction of the limits used before any identification: a wide prior has longer tails than the simulated arms show."""
 
 _ROUNDS = 12
 _LAST_ROUNDS = 4
@@ -29,7 +30,7 @@ _CLOSE = 0.94
 _LARGEST_STEP = 2.0
 _BACK_OFF = 0.93
 _TORQUE_SHARE = 0.97
-"""Of current_limit: a clamped wave is no longer the one that was designed."""
+"""Fraction of the current limit that may be used, since clamping would distort the designed wave."""
 
 
 @dataclass(frozen=True)
@@ -48,44 +49,60 @@ def largest_amplitude(
     plan: Plan | None = None,
     pose: Array | None = None,
     cap: Array | None = None,
+    executor: Executor | None = None,
 ) -> Amplitude:
-    """Scale each joint's torque until its peaks reach `share` of the limits, except in a fraction safety.limit_chance
-    of the arms.
+    """Find the largest torque that keeps the arms within `share` of their limits, up to probability
+    safety.limit_chance.
 
-    plan: its waves are scaled; by default low-crest multisines. pose: where the arm starts (joints,) [rad]. cap: the
-    most torque (joints,) [N m], beside what the current limits allow. Raises NoSafeTorque when not even a small torque
-    is safe.
+    Args:
+        config: configuration of the arm.
+        ensemble: arms to simulate.
+        share: fraction of the limits that may be used.
+        plan: plan whose waves are scaled; by default low-crest multisines.
+        pose: where the arm starts (joints,) [rad].
+        cap: largest torque (joints,) [N m], in addition to the current limits.
+
+    Raises:
+        NoSafeTorque: not even a small torque is safe.
     """
     if ensemble.source == "prior":
         share *= PRIOR_ROOM
     base = with_peaks(config, most_torque(config) / 8) if plan is None else plan
     most = most_torque(config) if cap is None else np.minimum(most_torque(config), cap)
-    found = _search(config, base, ensemble.first(SEARCH_ARMS), share, pose, most)
+    found = _search(config, base, ensemble.first(SEARCH_ARMS), share, pose, most, executor)
     for _ in range(_ROUNDS):
         plan = scaled(config, base, found)
-        prediction = predict(config, plan, ensemble, pose=pose)
+        prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
         if _chance(prediction, share) <= config.safety.limit_chance:
             return Amplitude(plan, found, prediction)
         found = found * _BACK_OFF
     raise NoSafeTorque(
-        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, give more "
-        "in [arm.prior], or raise safety.limit_chance."
+        "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, add values "
+        "to [arm.prior], or raise safety.limit_chance."
     )
 
 
 def with_peaks(config: Config, peak_torque: Array) -> Plan:
-    """The configuration's plan with these peaks [N m]."""
+    """Plan the configured experiment with these peak torques (joints,) [N m]."""
     experiment = config.experiment.model_copy(update={"peak_torque": peak_torque.tolist()})
     return make_plan(config.model_copy(update={"experiment": experiment}))
 
 
-def _search(config: Config, base: Plan, ensemble: Ensemble, share: float, pose: Array | None, most: Array) -> Array:
-    """Approach the limits joint by joint; the joints are coupled, so this takes several rounds."""
+def _search(
+    config: Config,
+    base: Plan,
+    ensemble: Ensemble,
+    share: float,
+    pose: Array | None,
+    most: Array,
+    executor: Executor | None,
+) -> Array:
+    """Approach the limits in several rounds, since the joints are coupled; return peak torques (joints,) [N m]."""
     torque = base.segments[0].peak_torque
     first = base.first_segment() if ensemble.source == "prior" else base
 
     def reached_with(tried: Array) -> Array:
-        prediction = predict(config, scaled(config, first, tried), ensemble, pose=pose, briefly=True)
+        prediction = predict(config, scaled(config, first, tried), ensemble, pose=pose, briefly=True, executor=executor)
         return _reached(config, prediction, share)
 
     best, used = 0.25 * torque, 0.0
@@ -104,7 +121,7 @@ def _search(config: Config, base: Plan, ensemble: Ensemble, share: float, pose: 
 
 
 def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array) -> Array:
-    """Raise the joint that uses least of its limits in small steps while all stay within theirs."""
+    """Raise the joint that uses the least of its limits in small steps while all joints stay within their limits."""
     reached = reached_with(torque)
     blocked = np.zeros(torque.size, dtype=bool)
     for _ in range(_LAST_ROUNDS):
@@ -123,7 +140,9 @@ def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array
 
 
 def _reached(config: Config, prediction: Prediction, share: float) -> Array:
-    """How much of `share` of its limits each joint uses (joints,), at the wanted chance and in the worst arm."""
+    """Fraction of the allowed range that each joint uses (joints,): the larger of the worst arm's and the predicted
+    one.
+    """
     deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
     foreseen = prediction.share_at(deviations)[:GUARDED].max(axis=0)
     counted = prediction.shares[:, :GUARDED].max(axis=(0, 1))
@@ -131,12 +150,12 @@ def _reached(config: Config, prediction: Prediction, share: float) -> Array:
 
 
 def _chance(prediction: Prediction, share: float) -> float:
-    """Chance that an arm passes `share` of a limit: counted, and for whole limits also by the tail."""
+    """Probability that an arm exceeds `share` of a limit: the larger of the observed fraction and the tail estimate."""
     counted = float(np.mean((prediction.shares[:, :GUARDED] >= share).any(axis=(1, 2))))
     return max(counted, prediction.stop_chance)
 
 
 def most_torque(config: Config) -> Array:
-    """What the current limits allow (joints,) [N m]."""
+    """Largest torque that the current limits allow (joints,) [N m]."""
     limits = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
     return np.asarray(_TORQUE_SHARE * limits)

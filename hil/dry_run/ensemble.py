@@ -1,4 +1,4 @@
-"""Arms that could be the one on the bench: drawn from a prior, or from an earlier result with its covariance."""
+"""Arms that could be the one on the bench, drawn from a prior or from an earlier result with its covariance."""
 
 from dataclasses import dataclass
 
@@ -15,21 +15,23 @@ from hil.results.result import Result
 Array = NDArray[np.float64]
 
 MODEL_SPREAD = 0.005
-"""Relative, on every parameter of a result: what a model leaves out and its covariance cannot know. Multiplied by how
-many times farther than it was identified the model is to be trusted.
+"""Relative standard deviation added to every identified parameter for model error, which the covariance omits.
+
+It is multiplied by the ratio of the simulated range of motion to the identified one.
 """
 
-_LEAST_SHARE = 0.05  # of its value, below which no draw of a positive parameter may fall
-_LEAST_WIDTH = 0.01  # rad/s of friction's step: narrower ones move the arm alike and take longer to simulate
-_MOST_COUPLING = 0.95  # of sqrt(inertia_1 inertia_2)
+_LEAST_SHARE = 0.05  # smallest allowed fraction of a positive parameter's nominal value
+_LEAST_WIDTH = 0.01  # rad/s, width of the Coulomb step: narrower steps change little and take longer to simulate
+_MOST_COUPLING = 0.95  # relative to sqrt(inertia_1 inertia_2)
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Number of arms to simulate.
+    """An ensemble of possible arms.
 
-    torque_scale: ratio of actual to commanded torque (arms, joints), since the torque constant is a guess too. A
-    result's parameters are in units of the commanded torque, so there it is 1.
+    physics: parameters of each arm. torque_scale: ratio of actual to commanded torque (arms, joints), because the
+    torque constant is uncertain too; 1 for a result, whose parameters are in units of the commanded torque. source:
+    "prior" or "result".
     """
 
     physics: tuple[Physics, ...]
@@ -41,19 +43,19 @@ class Ensemble:
         return len(self.physics)
 
     def first(self, count: int) -> "Ensemble":
-        """A smaller one."""
+        """The first `count` arms as an ensemble."""
         return Ensemble(self.physics[:count], self.torque_scale[:count], self.source)
 
 
 def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
-    """From link lengths and `[arm.prior]`. Raises ConfigError."""
+    """Draw arms from link lengths and `[arm.prior]`. Raises ConfigError."""
     base = base_draws(config, count, seed)
     physics = tuple(Physics.of({name: float(values[arm]) for name, values in base.items()}) for arm in range(count))
     return Ensemble(physics, scale_draws(config, count, seed), "prior")
 
 
 def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
-    """Ratios of true to assumed torque constants (count, joints)."""
+    """Draw ratios of true to assumed torque constants (count, joints)."""
     random = np.random.default_rng((seed, 6))
     spread = np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
     drawn: Array = np.exp(np.sqrt(np.log1p(spread**2)) * random.standard_normal((count, len(config.joints))))
@@ -61,7 +63,7 @@ def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
 
 
 def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
-    """From a result, its covariance widened by the model error that the residual indicates.
+    """Draw arms from a result, whose covariance is widened by the model error that the residual indicates.
 
     farther: ratio of the range of motion to be simulated to the range used for identification.
     """
@@ -71,7 +73,7 @@ def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int 
     value = np.array([known[name] for name in names])
     ticks = max(result.fit.residual_rms_ticks)
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)
-    # A residual beyond rounding is model error, which shifts parameters by more than their covariance says.
+    # A residual above rounding indicates model error, which shifts parameters by more than their covariance suggests.
     widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2
     extra = np.diag((MODEL_SPREAD * max(1.0, farther) * value) ** 2)
     random = np.random.default_rng((seed, 7))
@@ -81,7 +83,7 @@ def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int 
 
 
 def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
-    """Normal draws (count, parameters), in units of each standard deviation: parameters differ by powers of ten."""
+    """Draw from a normal distribution (count, parameters), scaled because parameters differ by orders of magnitude."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     correlation = covariance / np.outer(scale, scale)
     size, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))
@@ -91,12 +93,12 @@ def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: i
 
 
 def nominal(result: Result) -> Physics:
-    """The arm that a result describes."""
+    """The arm described by a result."""
     return Physics.of(result.values)
 
 
 def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, float]:
-    """A draw moved into the physically possible range."""
+    """Move a draw into the physically possible range."""
     for name, value in drawn.items():
         if term_of(name).range in {"positive", "floor"}:
             centre = abs(known[name])
@@ -106,7 +108,7 @@ def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, flo
 
 
 def within_range(parameters: dict[str, float]) -> dict[str, float]:
-    """The same with a coupling that leaves the mass matrix positive."""
+    """Limit the coupling so that the mass matrix stays positive definite."""
     if "coupling" not in parameters:
         return parameters
     most = _MOST_COUPLING * float(np.sqrt(parameters["inertia_1"] * parameters["inertia_2"]))

@@ -1,4 +1,4 @@
-"""The simulated arms over time against the position limits, as a PNG or SVG."""
+"""Plot the simulated motions over time against the position limits, as PNG or SVG."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from hil.errors import RunFolderError
 
 
 def draw(config: Config, prediction: Prediction, path: Path) -> None:
-    """Write the picture; raises MissingExtra without matplotlib, RunFolderError where `path` cannot be written."""
+    """Save the plot to `path`. Raises MissingExtra without matplotlib, RunFolderError if `path` cannot be written."""
     figure = plot(config, prediction)
     try:
         figure.savefig(path, dpi=130)
@@ -21,7 +21,7 @@ def draw(config: Config, prediction: Prediction, path: Path) -> None:
 
 
 def plot(config: Config, prediction: Prediction) -> Any:
-    """The picture as a matplotlib figure; raises MissingExtra."""
+    """Draw the plot as a matplotlib figure. Raises MissingExtra."""
     joints = len(config.joints)
     figure = new_figure(9, 2.6 * joints)
     axes = figure.subplots(joints, 1, sharex=True, squeeze=False)[:, 0]

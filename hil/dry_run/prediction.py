@@ -1,10 +1,12 @@
-"""The experiment simulated on an ensemble of arms: the predicted peaks compared with each limit.
+"""The experiment simulated on an ensemble of arms: predicted peaks compared with each limit.
 
-Every arm of the ensemble gets exactly the goal currents of the plan, rounded to the servos' ticks, ramps included,
-through lag and stabiliser, for as many periods as settling takes. Peaks are expressed as fractions of the distance to
-their limit; an arm with any fraction of 1 or more is one that the guard would have stopped.
+Every arm of the ensemble receives exactly the goal currents of the plan, ramps included, rounded to the servos' ticks
+and subject to lag and stabiliser, for as many periods as settling takes. Peaks are expressed as fractions of the
+distance from rest to the limit; if any fraction of an arm reaches 1, the guard would have stopped that arm.
 """
 
+from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from math import erfc, sqrt
 
@@ -16,7 +18,7 @@ from hil.drivers.servo_model import Mode
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.rollout import commands_of, simulate_experiment
 from hil.estimator.simulation.closed_loop import Feedback
-from hil.estimator.simulation.many_arms import LOWEST, TORQUE, ManyArms, Settling
+from hil.estimator.simulation.many_arms import LOWEST, TORQUE, Commands, ManyArms, SettlingRule
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import feedback_of
 
@@ -25,9 +27,12 @@ Array = NDArray[np.float64]
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""The first so many have a limit at which the guard stops; a current is clamped, torque and power follow."""
+"""Number of leading quantities with a limit at which the guard stops; current is clamped, torque and power follow it.
+"""
 
 QUANTILE = 0.99
+_ARMS_A_TASK = 16
+"""Number of arms that one task of an executor simulates."""
 _LEAST_SPREAD = 2e-3
 
 
@@ -35,10 +40,11 @@ _LEAST_SPREAD = 2e-3
 class Prediction:
     """The prediction of a dry run.
 
-    values: extreme values of every arm (arms, quantities, joints), in QUANTITIES and UNITS. shares: the same as
-    fractions of the distance from rest to the limit. limits: (quantities, joints). settled_after: periods, per arm, 0
-    where it is more than max_settling_periods. shown: positions over time of a few arms (arms, joints, samples) [rad],
-    then NaN.
+    values: extreme values of every arm (arms, quantities, joints), in the order of QUANTITIES and in UNITS. shares: the
+    same as fractions of the distance from rest to the limit. limits: (quantities, joints). settled_after: number of
+    periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time of a
+    few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per second
+    [Hz].
     """
 
     values: Array
@@ -51,15 +57,16 @@ class Prediction:
 
     @property
     def median(self) -> Array:
-        """(quantities, joints)."""
+        """Median peaks over the arms (quantities, joints)."""
         middle: Array = np.median(self.values, axis=0)
         return middle
 
     @property
     def quantile(self) -> Array:
-        """Bounds that all peaks of an arm respect together in 99 of 100 arms (quantities, joints).
+        """Bounds within which all peaks of an arm lie in 99 of 100 arms (quantities, joints).
 
-        One common number of deviations above the medians, so that it moves smoothly with the amplitude.
+        All bounds are the same number of deviations above their medians, so that they change smoothly with the
+        amplitude.
         """
         shares = self.share_at(self._simultaneous())
         toward = self.limits - self.origin
@@ -67,30 +74,32 @@ class Prediction:
 
     @property
     def stop_chance(self) -> float:
-        """Chance that the guard stops the run: the observed or the tail-estimated one, whichever is larger."""
+        """Probability that the guard stops the run: the larger of the observed fraction and the tail estimate."""
         counted = float(np.mean((self.shares[:, :GUARDED] >= 1).any(axis=(1, 2))))
         return max(counted, min(1.0, float(self.limit_chance[:GUARDED].sum())))
 
     @property
     def limit_chance(self) -> Array:
-        """Chance that a quantity passes its limit (quantities, joints): a normal tail above the median."""
+        """Probability that a quantity exceeds its limit (quantities, joints), from a normal tail above the median."""
         middle, spread = self._middle()
         return np.asarray([[0.5 * erfc(z / sqrt(2)) for z in row] for row in ((1 - middle) / spread).tolist()])
 
     def share_at(self, deviations: float) -> Array:
-        """Shares (quantities, joints) at so many deviations above the median."""
+        """Fractions of the limits (quantities, joints) at this number of deviations above the median."""
         middle, spread = self._middle()
         return np.asarray(middle + deviations * spread)
 
     @property
     def origin(self) -> Array:
-        """The points from which distances to the limits are measured (quantities, joints)."""
+        """The values from which distances to the limits are measured (quantities, joints)."""
         origin = np.zeros_like(self.limits)
         origin[0] = origin[1] = self.rest
         return origin
 
     def _middle(self) -> tuple[Array, Array]:
-        """Medians of the shares and the spread above them (quantities, joints): peaks are skewed towards the limit."""
+        """Medians of the shares and their spread above the median (quantities, joints); peaks are skewed towards the
+        limit.
+        """
         middle = np.median(self.shares, axis=0)
         above = np.maximum(self.shares - middle, 0.0)
         return middle, np.maximum(np.sqrt(2 * np.mean(above**2, axis=0)), _LEAST_SPREAD)
@@ -102,7 +111,7 @@ class Prediction:
 
 
 def quantities_of(config: Config) -> tuple[tuple[str, str], ...]:
-    """Names and units of a prediction's rows: goals are volts where the joints are driven by voltage."""
+    """Names and units of a prediction's rows; the goal is a voltage if the joints are driven by PWM."""
     named = tuple(zip(QUANTITIES, UNITS, strict=True))
     if config.joints[0].drive_mode is not Mode.PWM:
         return named
@@ -110,12 +119,25 @@ def quantities_of(config: Config) -> tuple[tuple[str, str], ...]:
 
 
 def predict(
-    config: Config, plan: Plan, ensemble: Ensemble, *, pose: Array | None = None, briefly: bool = False, shown: int = 0
+    config: Config,
+    plan: Plan,
+    ensemble: Ensemble,
+    *,
+    pose: Array | None = None,
+    briefly: bool = False,
+    shown: int = 0,
+    executor: Executor | None = None,
 ) -> Prediction:
     """Simulate `plan` on every arm of the ensemble.
 
-    pose: where the arm starts, at rest (joints,) [rad]; the rest pose unless given. briefly: only one period of
-    each multisine, for a search. shown: number of arms whose motion is kept.
+    Args:
+        config: configuration of the arm.
+        plan: the experiment to simulate.
+        ensemble: the arms.
+        pose: where the arm starts at rest (joints,) [rad]; by default the rest pose.
+        briefly: simulate only one period of each multisine; used during a search.
+        shown: number of arms whose motion is stored.
+        executor: simulates the arms, some at a time; the result is the same with and without it.
     """
     commands = [commands_of(config, segment) for segment in plan.segments]
     start = np.array(config.arm.rest_pose) if pose is None else pose
@@ -123,12 +145,12 @@ def predict(
     feedback = feedback_of(config)
     arms = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback)
     if briefly:
-        each = [arms.peaks([command], plan.rate, Settling(0.0, 0, 1))[0] for command in commands]
+        each = [_peaks(arms, [command], plan.rate, SettlingRule(0.0, 0, 1), executor)[0] for command in commands]
         peaks = _extreme(np.stack(each))
         settled_after = np.zeros(ensemble.size, dtype=np.int64)
     else:
-        settling = Settling(plan.settle_within, plan.max_settling_periods, plan.periods)
-        peaks, settled_after = arms.peaks(commands, plan.rate, settling)
+        settling = SettlingRule(plan.settle_within, plan.max_settling_periods, plan.periods)
+        peaks, settled_after = _peaks(arms, commands, plan.rate, settling, executor)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
     constant = np.array([joint.torque_per_goal for joint in config.joints])
     values = np.insert(peaks, TORQUE, peaks[:, TORQUE] / constant, axis=1)
@@ -141,15 +163,29 @@ def predict(
     )
 
 
+def _peaks(
+    arms: ManyArms, commands: Sequence[Commands], rate: float, settling: SettlingRule, executor: Executor | None
+) -> tuple[Array, NDArray[np.int64]]:
+    """`ManyArms.peaks`, by the executor where there is one: each arm is simulated for itself."""
+    if executor is None:
+        return arms.peaks(commands, rate, settling)
+    parts = [arms.part(first, first + _ARMS_A_TASK) for first in range(0, len(arms.physics), _ARMS_A_TASK)]
+    count = len(parts)
+    found = list(executor.map(ManyArms.peaks, parts, [commands] * count, [rate] * count, [settling] * count))
+    return np.concatenate([peaks for peaks, _ in found]), np.concatenate([settled for _, settled in found])
+
+
 def _extreme(peaks: Array) -> Array:
-    """Of several multisines (multisines, arms, peaks, joints), the maximum of each peak (arms, peaks, joints)."""
+    """Extreme value of each peak over several multisines: from (multisines, arms, peaks, joints) to (arms, peaks,
+    joints).
+    """
     most: Array = peaks.max(axis=0)
     most[:, LOWEST] = peaks[:, :, LOWEST].min(axis=0)
     return most
 
 
 def limits_of(config: Config) -> Array:
-    """(quantities, joints), in QUANTITIES and UNITS."""
+    """Limits (quantities, joints), in the order of QUANTITIES and in UNITS."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     velocity = np.array([joint.velocity_limit for joint in config.joints])
     current = np.array([joint.goal_limit for joint in config.joints])
@@ -159,7 +195,7 @@ def limits_of(config: Config) -> Array:
 
 
 def peaks_of(config: Config, position: Array, velocity: Array, current: Array) -> Array:
-    """Extreme values (quantities, joints) of a motion (joints, samples) [rad, rad/s, A]; NaN are left out."""
+    """Extreme values (quantities, joints) of a motion (joints, samples) [rad, rad/s, A]; NaN is ignored."""
     constant = np.array([joint.torque_per_goal for joint in config.joints])
     torque = current * constant[:, None]
     return np.stack(
@@ -175,12 +211,12 @@ def peaks_of(config: Config, position: Array, velocity: Array, current: Array) -
 
 
 def scaled_feedback(feedback: Feedback, scale: Array) -> Feedback:
-    """The feedback acting on an arm whose torque constants are `scale` (joints,) times the assumed ones."""
+    """The effective feedback on an arm whose torque constants are `scale` (joints,) times the assumed ones."""
     return Feedback(feedback.stiffness * scale, feedback.damping * scale, feedback.pose, feedback.limit * scale)
 
 
 def _side_by_side(positions: list[Array]) -> Array:
-    """Positions (joints, samples) of runs of different lengths, padded with NaN (arms, joints, samples)."""
+    """Stack positions (joints, samples) of different lengths, padded with NaN: (arms, joints, samples) [rad]."""
     if not positions:
         return np.empty((0, 0, 0), dtype=np.float32)
     longest = max(position.shape[1] for position in positions)

@@ -1,7 +1,7 @@
-"""What is known of an arm before anything was identified: masses, lengths and friction, each with its spread.
+"""What is known of an arm before identification: masses, lengths and friction, each with its spread.
 
-`[arm.prior]` gives what its author knows. The rest is guessed from link lengths by rules of thumb (below), based only
-on a few arms, and from the servo models (hil.drivers.servo_prior): both have a wide spread.
+`[arm.prior]` gives what the user knows. The rest is estimated from link lengths by the rules of thumb below, which are
+based on only a few arms, and from the servo models (hil.drivers.servo_prior); both have a wide spread.
 """
 
 from dataclasses import dataclass
@@ -13,26 +13,28 @@ from hil.config.schema import Config, PriorConfig
 from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior, stall_torque
 from hil.errors import ConfigError
+from hil.estimation.model_from_config import voltage_driven
+from hil.estimator.models.terms import term_of
 
 Array = NDArray[np.float64]
 
-_LINK_MASS_PER_LENGTH = 1.1  # kg/m of an arm of XM430 servos: printed or aluminium brackets
-_USUAL_STALL = 4.1  # N m, of the servos of that arm; smaller servos carry slighter links
+_LINK_MASS_PER_LENGTH = 1.1  # kg/m, for XM430 servos with printed or aluminium brackets
+_USUAL_STALL = 4.1  # N m, stall torque of those servos; smaller servos carry lighter links
 _STALL_POWER = 0.4
-_CENTRE_SHARE = 0.6  # of the length; a gripper or a weight pulls it outwards
+_CENTRE_SHARE = 0.6  # of the length; a gripper or weight moves the centre outwards
 _CENTRE_SPREAD = 0.3
 _INERTIA_SHARE = 1 / 12  # of mass times length squared: a rod
 _ROUGH_SPREAD = 0.5
-_OFFSET_PER_COULOMB = 0.1  # standard deviation of a torque of either sign
-_ZERO_STD = 0.03  # rad: how well a zero is set by eye
+_OFFSET_PER_COULOMB = 0.1  # standard deviation of the offset relative to the Coulomb friction
+_ZERO_STD = 0.03  # rad, typical error of a zero set by eye
 _GEAR_EFFICIENCY = 0.6
-_GENERATED_SPREAD = 0.25  # of back-EMF
+_GENERATED_SPREAD = 0.25  # relative standard deviation of the back-EMF
 _COULOMB_WIDTH = 0.01  # rad/s
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One physical quantity of every joint or link (joints,) and its relative standard deviations (joints,)."""
+    """One physical quantity for every joint or link (joints,), with its relative standard deviation (joints,)."""
 
     value: Array
     spread: Array
@@ -45,9 +47,9 @@ class Quantity:
 
 
 def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
-    """Base parameters, friction terms, zeros and lag by the estimator's names, `count` draws each (count,) [SI].
+    """Draw base parameters, friction terms, zeros and lag: `count` values (count,) [SI] by the estimator's names.
 
-    Raises ConfigError without link lengths.
+    Raises ConfigError if the link lengths are missing.
     """
     lengths = config.arm.link_lengths
     if lengths is None:
@@ -62,12 +64,14 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     base = _base(drawn, np.array(lengths), config.arm.gravity)
     for joint in range(offset.shape[1]):
         base |= {f"offset_{joint + 1}": offset[:, joint], f"zero_{joint + 1}": zero[:, joint]}
-    # One loop for all joints: they are alike, and the first one's is as good as another's.
+    for joint in voltage_driven(config):
+        base[f"back_emf_{joint}"] = np.full(count, term_of("back_emf").initial)
+    # The model has one lag for all joints: the servos are similar, so the first joint's is used.
     return base | {"lag": drawn["lag"][:, 0]}
 
 
 def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
-    """What is drawn, by the names of `[arm.prior]`, and the friction's shape and lag beside them."""
+    """The quantities to draw, by the names of `[arm.prior]`, plus the Stribeck terms and the lag."""
     given = config.arm.prior or PriorConfig()
     models = [joint.joint.servo for joint in config.joints]
     priors = [servo_prior(model) for model in models]
@@ -103,7 +107,7 @@ def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
 
 
 def _generated(config: Config) -> Array:
-    """Back-EMF at a given voltage, expressed as viscous friction (joints,) [N m s/rad].
+    """Back-EMF under voltage control, expressed as viscous friction (joints,) [N m s/rad].
 
     The back-EMF constant [V s/rad] equals the torque constant [N m/A] before gear losses. Zero under current control.
     """
@@ -113,7 +117,7 @@ def _generated(config: Config) -> Array:
 
 
 def _base(drawn: dict[str, Array], lengths: Array, gravity: float) -> dict[str, Array]:
-    """From physical quantities to base parameters; the table in docs/model.md."""
+    """Convert physical quantities to base parameters, following the table in docs/model.md."""
     mass, centre, inertia = drawn["link_mass"], drawn["link_centre"], drawn["link_inertia"]
     about = inertia + mass * centre**2
     base = {

@@ -18,8 +18,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Motion:
-    """What the arm did (joints, samples) [rad, rad/s, N m], and the number of periods of the first multisine until
-    it settled: 0 if it never did, which ends the experiment.
+    """The simulated motion (joints, samples) [rad, rad/s, N m].
+
+    settled_after: number of periods of the first multisine until the arm settled; 0 if it never did, in which case the
+    experiment ends there.
     """
 
     position: Array
@@ -44,10 +46,18 @@ def commands_of(config: Config, segment: Segment) -> Commands:
 def simulate_experiment(
     plan: Plan, commands: list[Commands], physics: Physics, scale: Array, feedback: Feedback, pose: Array
 ) -> Motion:
-    """All multisines, from rest in `pose` (joints,) [rad]. scale: ratio of true to assumed torque constants (joints,).
+    """Simulate all multisines, starting at rest in `pose` (joints,) [rad].
 
-    As on the bus, the periods of a multisine repeat until one matches the previous one; an arm that has not settled
-    after plan.max_settling_periods ends there.
+    As on the bus, the periods of a multisine repeat until one matches the previous one; if an arm has not settled after
+    plan.max_settling_periods, the simulation ends there.
+
+    Args:
+        plan: the experiment.
+        commands: commanded torques of each multisine.
+        physics: parameters of the arm.
+        scale: ratio of true to assumed torque constants (joints,).
+        feedback: the stabiliser, as it acts on this arm.
+        pose: initial pose (joints,) [rad].
     """
     arm = _Arm(plan, physics, scale, feedback, pose)
     settled_after = [arm.play_segment(each) for each in commands[:1]]
@@ -70,7 +80,7 @@ class _Arm:
         self.parts: list[Response] = []
 
     def play_segment(self, commands: Commands) -> int:
-        """Play ramps and periods. Returns the number of periods until it settled, 0 if it never did."""
+        """Play ramps and periods. Returns the number of periods until the arm settled, 0 if it never did."""
         self._play(commands.ramp_in)
         settled_after = self._settle(commands.period)
         if settled_after:
@@ -89,7 +99,7 @@ class _Arm:
         return 0
 
     def _play(self, command: Array) -> Array:
-        """Simulate under these torques; the positions (joints, samples) [rad]."""
+        """Simulate the arm under these torques (joints, samples) [N m]. Returns positions (joints, samples) [rad]."""
         part = respond(self._physics, self._state, command * self._scale, self._plan.rate, self._feedback)
         self._state = part.state
         self.parts.append(part)

@@ -1,5 +1,6 @@
-"""What `hil dry-run` does: an ensemble, the experiment on it, the largest safe torque."""
+"""The work of `hil dry-run`: simulate the experiment on an ensemble and find the largest safe torque."""
 
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,26 +17,32 @@ from hil.setup.idle_bus import quiet_stream
 
 ARMS = 128
 SHOWN = 30
-"""Arms whose motion is kept for the picture."""
+"""Number of arms whose motion is stored for the plot."""
 
 
-def dry_run(config: Config, result: Path | None = None, arms: int = ARMS, servos: bool = False) -> DryRun:
-    """Simulate the configured experiment. result: run folder or result.json of an earlier identification.
+def dry_run(
+    config: Config,
+    result: Path | None = None,
+    arms: int = ARMS,
+    servos: bool = False,
+    executor: Executor | None = None,
+) -> DryRun:
+    """Simulate the configured experiment; `result` is a run folder or result.json of an earlier identification.
 
-    Raises ConfigError, ResultError, RunFolderError, ExperimentError; with `servos`, DriverError.
+    Raises ConfigError, ResultError, RunFolderError, ExperimentError and, with `servos`, DriverError.
     """
     only_planar(config, "a dry run")
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
     plan = None if config.experiment.peak_torque is None else make_plan(config)
-    asked = None if plan is None else predict(config, plan, ensemble, shown=SHOWN)
-    largest = largest_amplitude(config, ensemble)
-    shown = predict(config, largest.plan, ensemble, shown=SHOWN) if asked is None else asked
+    asked = None if plan is None else predict(config, plan, ensemble, shown=SHOWN, executor=executor)
+    largest = largest_amplitude(config, ensemble, executor=executor)
+    shown = predict(config, largest.plan, ensemble, shown=SHOWN, executor=executor) if asked is None else asked
     largest = replace(largest, prediction=shown) if asked is None else largest
     stopping = stopping_distance(config, plan or largest.plan, ensemble, shown.quantile[2].clip(max=shown.limits[2]))
     return DryRun(ensemble.source, ensemble.size, asked, largest, stopping, said)
 
 
 def ensemble_of(config: Config, result: Path | None, arms: int) -> Ensemble:
-    """From the prior, or from an earlier result."""
+    """Draw an ensemble from the earlier result, or from the prior if `result` is None."""
     return prior_ensemble(config, arms) if result is None else result_ensemble(read_result(result), arms)

@@ -1,14 +1,15 @@
-"""How far beyond its position limits an arm goes when it is stopped, for each kind of stop.
+"""How far an arm overshoots its position limits when it is stopped, for each kind of stop.
 
-The stop itself is simulated, gravity, friction and the joints' pull at each other included, on arms of an ensemble:
+The stop itself is simulated on the arms of an ensemble, with gravity, friction and coupling between the joints:
 
-planned   something stops the run at any moment of the planned motion: a signal, lost replies, an alert, a lost port,
-          the program killed
-passed    the motion is not the planned one (a joint held fast, turned round or without torque, another arm than
-          described), so the guard stops it where a limit is passed: one joint on its position limit, outwards at its
-          velocity limit, the others anywhere between theirs
+planned   the run is stopped at any moment of the planned motion: by a signal, lost replies, an alert, a lost port, or
+          because the program was killed
+passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or another arm than described), so
+          the guard stops it at a limit: one joint at its position limit moves outwards at its velocity limit, the
+          other is anywhere within its range
 
-It knows what a dry run knows: rigid links, friction, current lag, and that the servos do as their manual says.
+The simulation knows what a dry run knows: rigid links, friction, current lag, and servos that behave as their manual
+says.
 """
 
 import math
@@ -35,23 +36,24 @@ from hil.plan.stabiliser import feedback_of
 Array = NDArray[np.float64]
 
 LONGEST_S = 1.5
-"""For which a stopped arm is watched: a swing and its return."""
+"""Time for which a stopped arm is simulated [s]: long enough for a swing and its return."""
 
 _ARMS = 16
 _THREADS = 2
 _AHEAD_S = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2)
-"""How far a motion is carried on by its velocity in the search for the moments that lead farthest."""
+"""Times over which position is extrapolated by velocity [s], to find the moments that lead to the largest overshoot."""
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _REACTION = 2
-"""Samples: the one that shows it, and the one under way meanwhile."""
+"""Samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
 
 
 class Way(StrEnum):
     """How the arm is stopped.
 
-    CUT: torque off. BRAKED: braked, then off. REVERSED: the brake pushes where it should hold, is given up and torque
-    cut. SILENT: some or all servos hear nothing, their watchdogs act. SILENT_BRAKE: the same as braking begins.
+    CUT: torque off. BRAKED: braked, then torque off. REVERSED: the brake accelerates the joint (reversed sign), is
+    abandoned, and torque is cut. SILENT: some or all servos receive nothing until their watchdogs act. SILENT_BRAKE:
+    the same, starting as braking begins.
     """
 
     CUT = "cut"
@@ -63,7 +65,7 @@ class Way(StrEnum):
 
 @dataclass(frozen=True)
 class Stopping:
-    """Largest overshoot beyond a position limit over arms and initial states, by kind of stop, (joints,) [rad] each."""
+    """Largest overshoot beyond a position limit, by kind of stop (joints,) [rad], over all arms and initial states."""
 
     planned: dict[Way, Array]
     passed: dict[Way, Array]
@@ -71,9 +73,10 @@ class Stopping:
 
 @dataclass(frozen=True)
 class _Start:
-    """state: as `respond` takes it (5 or 6, joints). goal: torque commanded by the previous goals (joints,) [N m].
+    """Initial state of a stop.
 
-    jammed: a joint that is blocked.
+    state: as taken by `respond` (5 or 6, joints). goal: torque commanded by the previous goals (joints,) [N m]. jammed:
+    index of a blocked joint, or None.
     """
 
     state: Array
@@ -82,19 +85,21 @@ class _Start:
 
 
 _Piece = tuple[Array, Feedback, int]
-"""Commanded torque (joints,) [N m], what is added to it, for how many samples."""
+"""Commanded torque (joints,) [N m], feedback added to it, and duration in samples."""
 
 _Commands = Callable[[_Start], Iterator[list[_Piece]]]
-"""The commands of a stop from its start on, one list for each form that it may take."""
+"""Yields the commands of a stop from a given start: one list of pieces for each form that the stop may take."""
 
 
 def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: Array) -> Stopping:
-    """On a few arms of the ensemble; limits are passed at up to `velocity` (joints,) [rad/s]."""
+    """Simulate both kinds of stop on a few arms of the ensemble; limits are crossed at up to `velocity` (joints,)
+    [rad/s].
+    """
     return Stopping(beyond_when_planned(config, plan, ensemble), beyond_when_passed(config, plan, ensemble, velocity))
 
 
 def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[Way, Array]:
-    """Stopped at any moment of the planned motion."""
+    """Overshoot when stopped at any moment of the planned motion."""
     stops = _Stops(config)
     ways = {
         Way.CUT: stops.cut,
@@ -109,9 +114,10 @@ def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[
 def beyond_when_passed(
     config: Config, plan: Plan, ensemble: Ensemble, velocity: Array, pose: Array | None = None
 ) -> dict[Way, Array]:
-    """Stopped because a limit was passed at up to `velocity` (joints,) [rad/s], under the plan's largest torque.
+    """Overshoot when stopped at a limit that was crossed at up to `velocity` (joints,) [rad/s], under the largest
+    torque.
 
-    pose: where the arm was then (joints,) [rad]; unless given, one joint is on a limit and the other anywhere.
+    pose: pose at that moment (joints,) [rad]; by default, one joint is at a limit and the other anywhere in its range.
     """
     stops = _Stops(config)
     peak = np.abs(_planned_goals(config, plan)).max(axis=1)
@@ -127,7 +133,7 @@ def beyond_when_passed(
 def _farthest(
     stops: "_Stops", ways: Mapping[Way, _Commands], ensemble: Ensemble, starts: Callable[[Physics, Array], list[_Start]]
 ) -> dict[Way, Array]:
-    """The largest overshoot over a few arms and their initial states."""
+    """The largest overshoot over a few arms and their initial states, by kind of stop (joints,) [rad]."""
     few = ensemble.first(_ARMS)
 
     def one(arm: int) -> list[Array]:
@@ -135,13 +141,13 @@ def _farthest(
         from_here = starts(physics, scale)
         return [stops.farthest(physics, scale, from_here, commands) for commands in ways.values()]
 
-    with ThreadPoolExecutor(thread_count(_THREADS)) as threads:  # the compiled simulation lets go of the interpreter
+    with ThreadPoolExecutor(thread_count(_THREADS)) as threads:  # the compiled simulation releases the GIL
         worst = np.max(list(threads.map(one, range(few.size))), axis=0)
     return dict(zip(ways, worst, strict=True))
 
 
 def _planned_goals(config: Config, plan: Plan) -> Array:
-    """Commanded torque of the whole plan (joints, samples) [N m]; periods beyond the second add nothing."""
+    """Commanded torque of the whole plan (joints, samples) [N m]; two periods suffice, further ones repeat them."""
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     parts = []
     for segment in plan.segments:
@@ -150,7 +156,7 @@ def _planned_goals(config: Config, plan: Plan) -> Array:
 
 
 def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
-    """Moments of the planned motion, up to a limit: those that lead farthest, and some at even distances."""
+    """States of the planned motion up to a limit: those expected to overshoot most, and evenly spaced ones."""
     rest = resting(np.array(config.arm.rest_pose))
     moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale))
     until = _within_limits(config, moved)
@@ -168,7 +174,7 @@ def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array
 
 
 def _within_limits(config: Config, moved: Response) -> int:
-    """Samples, two at least, before the guard stops the motion because it passes a limit."""
+    """Number of samples, at least two, before the guard stops the motion at a limit."""
     low, high = (np.array(side)[:, None] for side in zip(*(j.position_limit for j in config.joints), strict=True))
     fastest = np.array([joint.velocity_limit for joint in config.joints])[:, None]
     passed = (moved.position < low) | (moved.position > high) | (np.abs(moved.velocity) > fastest)
@@ -185,7 +191,7 @@ def _felt(config: Config, scale: Array) -> Feedback:
 
 
 def _limit_starts(config: Config, physics: Physics, peak: Array, velocity: Array, pose: Array | None) -> list[_Start]:
-    """One joint outwards at its velocity and driven outwards; the other at any speed, or jammed."""
+    """Initial states with one joint driven outwards at its limit while the other moves at any speed or is jammed."""
     starts = []
     joints = range(len(config.joints))
     rest = config.arm.rest_pose
@@ -209,7 +215,7 @@ def _moving(pose: Array, velocity: Array) -> Array:
 
 
 def _handed_on(physics: Physics, pose: Array, joint: int, outward: float, velocity: Array) -> Array:
-    """The velocities after the other joint has jammed: its momentum is transferred to this one instantly."""
+    """Velocities after the other joint has jammed: its momentum is transferred to this joint instantly."""
     p = dict(zip(CONSTANTS, physics.vector.tolist(), strict=True))
     across = p["coupling"] * float(np.cos(pose[1]))
     shared = p["inertia_2"] + across
@@ -220,14 +226,14 @@ def _handed_on(physics: Physics, pose: Array, joint: int, outward: float, veloci
 
 
 def _held(physics: Physics, joint: int) -> Physics:
-    """The arm with a joint that nothing moves: only its rotor gets an infinite inertia."""
+    """The arm with one joint locked, modelled by a very large rotor inertia."""
     vector = physics.vector.copy()
     vector[CONSTANTS.index(("inertia_1", "armature_2")[joint])] += _IMMOVABLE
     return Physics(vector, physics.delay, physics.lag)
 
 
 class _Stops:
-    """The ways of stopping, as commands over time from a start."""
+    """The kinds of stop as commands over time from an initial state."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -274,7 +280,7 @@ class _Stops:
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:
-        """All servos keep their goals until their watchdogs act, or one does, and the others are cut before."""
+        """Servos keep their goals until their watchdogs act: all of them, or one while the others are cut earlier."""
         kept = (start.goal, self._none, self._heard_for)
         yield [kept, self._off]
         for silent in range(start.goal.size if start.goal.size > 1 else 0):

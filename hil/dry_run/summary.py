@@ -1,4 +1,4 @@
-"""A dry run in words and numbers: the verdict, a table, one JSON object."""
+"""The outcome of a dry run as text, as a table and as a JSON object."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,12 @@ from hil.dry_run.stopping_distance import Stopping, Way
 
 @dataclass(frozen=True)
 class DryRun:
-    """asked: for experiment.peak_torque, if given. largest: for the largest safe torque. servos: what was read."""
+    """The outcome of a dry run.
+
+    source: "prior" or "result". arms: number of simulated arms. asked: prediction for the configured
+    experiment.peak_torque, None if not configured. largest: the largest safe torque with its prediction. servos:
+    messages from reading the servos.
+    """
 
     source: str
     arms: int
@@ -27,12 +32,12 @@ class DryRun:
     servos: tuple[str, ...]
 
     def is_safe(self, config: Config) -> bool:
-        """Whether the experiment as configured may be run; without a configured torque, the largest safe one is."""
+        """Whether the configured torque is safe; if none is configured, whether a safe torque exists."""
         return self.asked is None or self.asked.stop_chance <= config.safety.limit_chance
 
 
 def dry_run_json(config: Config, run: DryRun) -> dict[str, Any]:
-    """One object: verdict, largest safe torque, and per joint every predicted quantity."""
+    """One JSON object: verdict, largest safe torque, and every predicted quantity of each joint."""
     return {
         "schema": 1,
         "config": str(config.path),
@@ -56,15 +61,15 @@ def _ways_json(ways: dict[Way, NDArray[np.float64]]) -> dict[str, list[float]]:
 
 
 def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
-    """Table and verdict for a person."""
+    """Print the table and the verdict."""
     shown = run.largest.prediction if run.asked is None else run.asked
     console.print(_table(config, shown, run))
     for line in (*run.servos, *_lines(config, shown, run)):
-        console.print(line, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=not console.is_terminal, markup=False)
 
 
 def settling_text(config: Config, prediction: Prediction) -> str:
-    """When the simulated arms were settled."""
+    """One sentence about how many of the simulated arms settled, and when."""
     settled = prediction.settled_after > 0
     if not settled.any():
         return f"No simulated arm settled within {config.experiment.max_settling_periods} periods."
@@ -118,10 +123,10 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
         settling_text(config, shown),
-        f"If stopped at any moment, they overshoot their limits by up to: {_each(config, stopped)}; if the program is "
-        f"killed or the cable pulled: {_each(config, planned[Way.SILENT])}.",
-        "If something drives them past a limit at these speeds, they continue by up to: "
-        f"{_each(config, passed[Way.BRAKED])} when braked; {_each(config, passed[Way.CUT])} when cut. "
+        f"If stopped at any moment, they overshoot their limits by up to {_each(config, stopped)}; if the program is "
+        f"killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
+        "If something drives them past a limit at these speeds, they overshoot it by up to "
+        f"{_each(config, passed[Way.BRAKED])} when braked and {_each(config, passed[Way.CUT])} when torque is cut. "
         "Keep that much space clear.",
         f"Largest safe torque: peak_torque = [{torque}] N m.",
     ]
@@ -136,7 +141,7 @@ def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
 
 
 def _percent(chance: float) -> str:
-    """A percentage; below a millionth of a percent the tail of a few hundred arms is meaningless."""
+    """A percentage; below a millionth of a percent, the tail of a few hundred arms is meaningless."""
     return "0 %" if chance < 1e-8 else f"{100 * chance:.2g} %"
 
 

@@ -1,4 +1,4 @@
-"""Which waves a full run plays: low-crest ones that use the range well, or optimally designed ones."""
+"""Choice of the waves for a full run: low-crest multisines that use the range well, or optimally designed ones."""
 
 from dataclasses import replace
 from itertools import product
@@ -9,33 +9,42 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.dry_run.amplitude import with_peaks
 from hil.estimator.excitation.multisine import Multisine
-from hil.estimator.excitation.optimal_design import Limits, Problem, design_optimal, smoothed
+from hil.estimator.excitation.optimal_design import DesignProblem, Limits, design_optimal, smoothed
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.many_arms import ManyArms
 from hil.plan.plan import Plan, Segment, period_current
 from hil.plan.stabiliser import feedback_of
 
-_EVERY = 4  # samples looked at
+_EVERY = 4  # evaluate every fourth sample
 
 
 def roomy_plan(config: Config, physics: Physics) -> Plan:
-    """The configuration's plan, each multisine played the way that uses most of the position range on `physics`.
+    """The configured plan, with the variant of each multisine that uses most of the position range on `physics`.
 
-    How evenly an arm swings to both sides depends on the phases. Reversing sign or time gives another wave with
-    the same lines and peaks at no design cost.
+    The phases determine how evenly an arm swings to both sides. Reversing the sign or time of a wave gives another wave
+    with the same lines and peaks at no design cost.
     """
+    return roomy_plans(config, physics, 1)[0]
+
+
+def roomy_plans(config: Config, physics: Physics, count: int) -> list[Plan]:
+    """Return up to `count` plans like `roomy_plan`, best first: with the next best variants of the first multisine."""
     problem = design_problem(config, physics, ())
     plan = with_peaks(config, _torque_limits(config))
-    segments = []
-    for segment in plan.segments:
-        wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
-        best = max(_turned(wave), key=lambda each: _evenness(problem, each))
-        segments.append(_with_wave(config, segment, best))
-    return replace(plan, segments=tuple(segments))
+    first, *others = [_variants(config, problem, segment) for segment in plan.segments]
+    rest = tuple(each[0] for each in others)
+    return [replace(plan, segments=(each, *rest)) for each in first[:count]]
 
 
-def _evenness(problem: Problem, wave: Multisine) -> float:
-    """Range covered over what as much of the way to the nearer limit could cover, the worse joint's; 1 at best."""
+def _variants(config: Config, problem: DesignProblem, segment: Segment) -> list[Segment]:
+    """Return the segment with each variant of its wave, the most even motion first."""
+    wave = problem.scaled(segment.multisine, np.ones(len(config.joints)))
+    ordered = sorted(_turned(wave), key=lambda each: _evenness(problem, each), reverse=True)
+    return [_with_wave(config, segment, each) for each in ordered]
+
+
+def _evenness(problem: DesignProblem, wave: Multisine) -> float:
+    """Covered range relative to the largest one possible within the limits, for the worse joint; 1 is ideal."""
     ones = np.ones((1, wave.joints))
     arms = ManyArms([problem.physics], ones, problem.pose[None], problem.feedback)
     position = arms.positions(np.tile(wave.torque, 2), wave.rate, _EVERY)[0]
@@ -46,7 +55,7 @@ def _evenness(problem: Problem, wave: Multisine) -> float:
 
 
 def _turned(wave: Multisine) -> list[Multisine]:
-    """The wave, with each joint's sign turned round against the first's, with all signs, and all of these backwards."""
+    """The wave in all combinations of the joints' signs, and all of these reversed in time."""
     signs = np.array(list(product((1.0, -1.0), repeat=wave.joints)))
     forward = [_signed(wave, sign) for sign in signs]
     return forward + [_reversed(each) for each in forward]
@@ -61,7 +70,7 @@ def _signed(wave: Multisine, sign: NDArray[np.float64]) -> Multisine:
 
 
 def _reversed(wave: Multisine) -> Multisine:
-    """Played backwards: sample n becomes sample -1 - n, so cos(a n + phase) becomes cos(a n + a - phase)."""
+    """The wave reversed in time: sample n becomes sample -1 - n, so cos(a n + phase) becomes cos(a n + a - phase)."""
     turn = 2 * np.pi / wave.samples
     phases = tuple(
         tuple(float((turn * line - phase) % (2 * np.pi)) for line, phase in zip(lines, each, strict=True))
@@ -71,7 +80,7 @@ def _reversed(wave: Multisine) -> Multisine:
 
 
 def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
-    """The same with the first multisine designed for small standard errors of `names`."""
+    """As `roomy_plan`, with the first multisine designed for small standard errors of the parameters `names`."""
     plan = roomy_plan(config, physics)
     first = plan.segments[0]
     problem = design_problem(config, physics, tuple(names))
@@ -79,13 +88,13 @@ def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
     return replace(plan, segments=(_with_wave(config, first, wave), *plan.segments[1:]))
 
 
-def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> Problem:
-    """Limits and arm as the estimator's design wants them."""
+def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> DesignProblem:
+    """Arm and limits in the form that the estimator's experiment design takes."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     velocity = np.array([joint.velocity_limit for joint in config.joints])
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])
     limits = Limits(low, high, velocity, _torque_limits(config))
-    return Problem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
+    return DesignProblem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
 
 
 def _plain_segment(config: Config, seed: int) -> Segment:

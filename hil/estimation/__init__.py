@@ -1,1 +1,1 @@
-"""From a recording to a result: settled period or any motion, physical quantities, comparison."""
+"""From a recording to a result: settled or arbitrary motion, physical quantities, comparisons."""

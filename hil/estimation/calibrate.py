@@ -8,7 +8,7 @@ import numpy as np
 from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimation.model_from_config import wanted_model
+from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
 from hil.estimator.calibration import Calibration, KnownMass, calibrate
 from hil.estimator.identify import identify
@@ -41,8 +41,10 @@ class Estimated:
 
 @dataclass(frozen=True)
 class CalibrationFit:
-    """residual_rms_ticks: of both runs in encoder steps RMS. misfit: weighted sum of squared residuals per
-    sample; 1 is noise alone. joints: how many.
+    """Quality of the fit.
+
+    residual_rms_ticks: residuals of both runs in encoder steps RMS. misfit: weighted sum of squared residuals per
+    sample; 1 is noise alone. joints: number of joints.
     """
 
     residual_rms_ticks: tuple[PerJoint, ...]
@@ -52,7 +54,9 @@ class CalibrationFit:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """What `hil calibrate` found, per joint by name, and the arm's parameters estimated along with it."""
+    """The result of `hil calibrate`: torque constants by joint name, and the arm's parameters estimated along with
+    them.
+    """
 
     schema: int
     torque_per_goal: Mapping[str, TorqueConstant]
@@ -61,7 +65,7 @@ class CalibrationResult:
 
 
 def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -> CalibrationResult:
-    """The torque constants; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
+    """Estimate the torque constants; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
     config, other = without.load_config(), with_mass.load_config()
     only_planar(config, "a calibration by a known mass")
     _same_arm(config, other)
@@ -71,8 +75,8 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
         settled_period(each, run.load_facts(), load_samples(run.samples_path, len(each.joints)), IDENTIFY)
         for each, run in ((config, without), (other, with_mass))
     ]
-    # The ratio of the torque constants is what the mass tells, and each of them.
-    model = wanted_model(config.model, len(config.joints)).without("torque_scale")
+    # The known mass determines every torque constant, so a torque_scale would be redundant.
+    model = wanted_model(config.model, len(config.joints), voltage_driven(config)).without("torque_scale")
     first = identify(periods[0], model)
     found = calibrate(periods[0], periods[1], first, known, config.arm.gravity)
     return _described(config, found)
@@ -115,17 +119,15 @@ def _described(config: Config, found: Calibration) -> CalibrationResult:
 
 
 def calibration_lines(result: CalibrationResult) -> list[str]:
-    """What was found and what to write into the TOML."""
+    """The torque constants as text, with instructions for the TOML file."""
     lines = []
     for name, found in result.torque_per_goal.items():
         lines.append(
             f"{name}: {found.value:.4f} +- {found.std:.4f} {found.unit} "
-            f"({100 * (found.value / found.supposed - 1):+.1f} % from the {found.supposed:g} supposed)"
+            f"({100 * (found.value / found.supposed - 1):+.1f} % from the assumed {found.supposed:g})"
         )
     worst = float(np.max(result.fit.residual_rms_ticks))
-    lines.append(f"Residual of both runs: {worst:.3f} encoder steps at most; rounding alone gives 0.289.")
-    lines.append(
-        "The standard errors cover noise only: add the relative errors of the mass and of its distance in full."
-    )
-    lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these and estimate again.")
+    lines.append(f"Largest residual of both runs: {worst:.3f} encoder steps RMS; rounding alone gives 0.289.")
+    lines.append("The standard errors cover noise only: add the relative errors of the mass and of its distance.")
+    lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these values and estimate again.")
     return lines

@@ -1,4 +1,4 @@
-"""From the run folder of an arm in space to its result: both stages, and validation on a held-out path."""
+"""From the run folder of a spatial arm to its result: both estimation stages and validation on a held-out path."""
 
 import time
 from pathlib import Path
@@ -15,7 +15,7 @@ from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.prediction import predict
 from hil.fakes.plants.arm import armature
-from hil.plan.chain_plan import KnownChain, known_chain
+from hil.plan.chain_model import KnownChain, known_chain
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.results.parts import ChainFacts, Covariance, Quantity, RunTiming, SettledFit, Validation, Verdict
 from hil.results.result import SettledResult
@@ -24,14 +24,14 @@ from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFacts, RunFolder
 from hil.runs.timing import timing
 
-EXPLAINED = 1.2  # times the encoder's rounding: a residual up to here leaves nothing to explain
-PREDICTED = 0.01  # of the motion: a held-out path foretold this well says that the model is right
-UNMOVED = 0.03  # rad: joints that move less show no friction and no inertia
-WRONG = 0.05  # and beyond this, that it is not
+EXPLAINED = 1.2  # ratio of residual to encoder rounding up to which the model counts as complete
+PREDICTED = 0.01  # held-out prediction error relative to the motion, up to which the model is trusted
+WRONG = 0.05  # the same, beyond which the model is rejected
+UNMOVED = 0.03  # range of motion [rad] below which a joint shows neither friction nor inertia
 
 
 def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> SettledResult:
-    """Estimate from the recording in `run` and write its result.json; raises HilError, EstimationError."""
+    """Estimate from the recording in `run` and write its result.json. Raises HilError, EstimationError."""
     samples = load_samples(run.samples_path, len(config.joints))
     started = time.perf_counter()
     known = known_chain(config)
@@ -49,8 +49,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     linear = len(model.linear_names)
     result = SettledResult(
         method="settled period, least squares on Fourier lines, then maximum likelihood of each position by "
-        "one-step-ahead "
-        f"prediction, the simulated arm tracking the measured path at {estimate.softness:g} Hz; {model.description}",
+        f"one-step-ahead prediction with an observer of {estimate.softness:g} Hz; {model.description}",
         config=facts.config,
         joints=len(config.joints),
         parameters=_quantities(estimate, 0, linear),
@@ -82,13 +81,13 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 
 
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
-    """The model that the configuration asks for."""
+    """The model requested by the configuration."""
     wanted = config.model
     return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale)
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:
-    """What an identification of the fake arm should find, by name [SI]; None on a real arm or another plant."""
+    """True parameters of the fake arm by name [SI]; None for a real arm or another plant."""
     chain = None if config.fake is None else config.fake.chain
     if not config.is_fake or chain is None:
         return None
@@ -136,14 +135,14 @@ def _verdict(
     held_out: NDArray[np.float64] | None,
     still: list[str],
 ) -> Verdict:
-    """Whether to trust it, the least well identified base parameter, and why."""
+    """Decide whether the result can be trusted, name the least well identified base parameter, and give the reasons."""
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
     over = estimate.residual_steps / QUANTISATION_FLOOR_TICKS
     worst = config.joints[int(np.argmax(over))].name
     sentences = [
-        f"The residual is {over.max():.2f} times what the encoder's rounding leaves, at {worst}: "
+        f"The residual of {worst} is the largest: {over.max():.2f} times encoder rounding; "
         + ("nothing remains unexplained." if over.max() <= EXPLAINED else "the model is incomplete.")
     ]
     trust = "yes" if over.max() <= EXPLAINED else "with care"
@@ -164,8 +163,7 @@ def _verdict(
     if estimate.from_prior:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
-            f"The recording says little about {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
-            "wider and "
-            "faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
+            f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
+            "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
     return Verdict(trust, weakest, tuple(sentences))

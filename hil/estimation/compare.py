@@ -1,4 +1,4 @@
-"""`hil compare`: other methods on the recording of a run, beside the result of this one."""
+"""`hil compare`: apply other methods to the recording of a run and compare them with its result."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -9,7 +9,7 @@ import numpy as np
 from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimation.model_from_config import wanted_model
+from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
 from hil.estimation.truth import true_parameters
 from hil.estimator.baselines.compare import Peer, compare_peers
@@ -26,16 +26,17 @@ from hil.runs.run_folder import RunFolder, write_json
 SCHEMA = 1
 OURS = "hil"
 OURS_PLAIN = "hil_coulomb"
-"""This project's estimate with the friction that mujoco.sysid has too: like against like, for the time it takes."""
+"""The estimate of hil with the friction model that mujoco.sysid has too, for a fair comparison of computing times."""
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method's entry of compare.json: parameters and standard errors by name [SI], how long it took [s].
+    """The entry of one method in compare.json: parameters and standard errors by name [SI], computing time [s].
 
-    settings_tried: how many settings were tried, of which the best is reported. worst_relative_error: on a fake arm, of
-    inertias, gravity and friction. held_out_rms: free prediction of the other multisine over its motion, worst joint;
-    None where the simulation under these parameters does not settle, or no other multisine was played.
+    settings_tried: number of settings tried; the best is reported. worst_relative_error: largest relative error of
+    inertias, gravity and friction, on a fake arm only. held_out_rms: open-loop prediction error of the held-out
+    multisine relative to its motion, for the worst joint; None if the simulation does not settle or no such multisine
+    was played.
     """
 
     parameters: Mapping[str, float]
@@ -50,7 +51,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """compare.json: every method on one settled period; truth on a fake arm only."""
+    """The contents of compare.json: every method on one settled period; truth on a fake arm only."""
 
     schema: int
     config: str
@@ -59,7 +60,7 @@ class Comparison:
 
 
 def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
-    """Every method on the settled period of `run`; also written to compare.json there.
+    """Apply every method to the settled period of `run` and write compare.json to its folder.
 
     Raises HilError, EstimationError.
     """
@@ -78,8 +79,8 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
 def all_methods(
     config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
 ) -> Iterator[Peer]:
-    """This project's own estimate first, then its peers."""
-    ours = _ours(period, OURS, wanted_model(config.model, period.joints))
+    """Yield the estimate of hil, then those of the other methods."""
+    ours = _ours(period, OURS, wanted_model(config.model, period.joints, voltage_driven(config)))
     yield ours
     length = link_length(config)
     yield from compare_peers(period, length, config.arm.gravity)
@@ -94,7 +95,7 @@ def all_methods(
 
 
 def link_length(config: Config) -> float | None:
-    """Of link 1 [m]: as the fake arm has it or [known] says; None if unknown."""
+    """Length of link 1 [m] from the fake arm or [known]; None if unknown."""
     if config.known is not None and config.known.length_1 is not None:
         return config.known.quantities()["length_1"].value
     if config.is_fake and config.fake is not None and config.fake.arm is not None:
@@ -103,7 +104,7 @@ def link_length(config: Config) -> float | None:
 
 
 def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> MethodResult:
-    """One method's entry of compare.json."""
+    """Evaluate one method for compare.json."""
     name, worst = (None, None) if truth is None else worst_error(peer.parameters, truth)
     return MethodResult(
         parameters=peer.parameters,
@@ -118,10 +119,10 @@ def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPerio
 
 
 def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Largest relative error of inertias, gravity, viscous and Coulomb friction, and whose it is.
+    """Name and largest relative error among inertias, gravity, viscous and Coulomb friction.
 
-    Offsets are left out: they are near zero and a relative error says nothing. A parameter that the method does
-    not have counts as 0, an error of 1.
+    Offsets are left out: they are near zero, so a relative error is meaningless. A parameter that the method does not
+    estimate counts as 0, a relative error of 1.
     """
     errors = {
         name: abs(parameters.get(name, 0.0) / true - 1.0)

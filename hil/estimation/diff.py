@@ -1,9 +1,9 @@
-"""Two identifications of one arm side by side: which parameters changed by more than their standard errors allow.
+"""Comparison of two identifications of one arm: which parameters changed significantly.
 
 Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), and Holm's step-down correction
-keeps the chance of even one false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of
-Statistics 6 (1979) 65). A change must also be larger than `least_share` of the parameter's scale: standard errors are
-those of the noise, and two runs of an arm with some unmodelled friction differ by a little more.
+keeps the probability of any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of
+Statistics 6 (1979) 65). A change must also be larger than `least_share` of the parameter's scale: standard errors cover
+noise only, and two runs of an arm with some unmodelled friction differ by a little more.
 """
 
 import math
@@ -21,9 +21,9 @@ LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Change:
-    """One parameter: both values and standard errors, their difference in combined standard errors, its p-value.
+    """The change of one parameter: values, standard errors, difference in combined standard errors, and p-value.
 
-    changed: significant after Holm's correction, and larger than the least share of its scale.
+    changed: whether it is significant after Holm's correction and larger than the minimum share of its scale.
     """
 
     name: str
@@ -37,13 +37,16 @@ class Change:
 
     @property
     def percent(self) -> float | None:
-        """Of the value before; None where that is 0."""
+        """Change in percent of the value before; None if that is 0."""
         return 100 * (self.after - self.before) / self.before if self.before else None
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What changed from one run to another. only_before, only_after: terms that one of the two models lacks."""
+    """The changes from one run to another.
+
+    only_before, only_after: terms that only one of the two models has.
+    """
 
     before: str
     after: str
@@ -53,18 +56,18 @@ class Difference:
 
     @property
     def changed(self) -> tuple[Change, ...]:
-        """The significant ones, most significant first."""
+        """The significant changes, most significant first."""
         return tuple(sorted((each for each in self.changes if each.changed), key=lambda change: -abs(change.z)))
 
     def to_json(self) -> dict[str, Any]:
-        """Strict JSON, infinities as None by the writer."""
+        """The changes as plain values; the JSON writer turns infinities into null."""
         return asdict(self) | {"changed": [change.name for change in self.changed]}
 
 
 def diff_runs(
     before: Path, after: Path, false_alarms: float = FALSE_ALARMS, least_share: float = LEAST_SHARE
 ) -> Difference:
-    """Compare two run folders, result.json or exported models of one arm; raises ResultError."""
+    """Compare two run folders, result.json files or exported models of one arm. Raises ResultError."""
     models = read_model(before), read_model(after)
     counts = [len(model.joints) for model in models]
     if counts[0] != counts[1]:
@@ -80,7 +83,7 @@ def diff_models(
     false_alarms: float = FALSE_ALARMS,
     least_share: float = LEAST_SHARE,
 ) -> Difference:
-    """Compare two models of one arm, parameter by parameter, in the order of the first."""
+    """Compare two models of one arm parameter by parameter, in the order of the first."""
     common = [name for name in before.values if name in after.values and not name.startswith("ripple_cycles")]
     z = {name: _z(before, after, name) for name in common}
     p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()}
@@ -116,7 +119,7 @@ def _z(before: ArmModel, after: ArmModel, name: str) -> float:
 
 
 def _holm(p: dict[str, float], level: float) -> set[str]:
-    """The hypotheses of no change that Holm's step-down procedure rejects at family-wise `level`."""
+    """Names of the parameters whose change is significant by Holm's procedure at the family-wise level `level`."""
     rejected: set[str] = set()
     for rank, name in enumerate(sorted(p, key=lambda each: p[each])):
         if p[name] > level / (len(p) - rank):
@@ -126,7 +129,7 @@ def _holm(p: dict[str, float], level: float) -> set[str]:
 
 
 def _scale(before: ArmModel, after: ArmModel, name: str) -> float:
-    """What a parameter is small or large against: itself; for an offset the joint's Coulomb friction."""
+    """Magnitude that a change is compared with: the parameter's own, or the joint's Coulomb friction for an offset."""
     values = [abs(model.values[name]) for model in (before, after)]
     kind, _, joint = name.rpartition("_")
     if kind == "offset":

@@ -1,12 +1,13 @@
-"""A settled period as it would have been on time: the effect of the computer's lateness is corrected.
+"""Correction of a settled period for the computer's lateness.
 
-Every goal leaves a little after its deadline, and the positions that answer it are as late. The estimator's grid is
-that of the deadlines. So each angle is moved by velocity times lateness, and each held torque becomes the mean of what
-really acted between its deadline and the next: the former one until the write, its own from there. What is left is of
-second order: half of acceleration times lateness squared, a hundredth of an encoder step at 0.5 ms and 50 rad/s^2.
+Every goal leaves slightly after its deadline, and the positions read with it are equally late, whereas the estimator
+assumes that both happen at the deadline. Therefore each angle is shifted by velocity times lateness, and each held
+torque is replaced by the mean torque between its deadline and the next: the previous goal until the write, its own
+afterwards. The remaining error is of second order: half the acceleration times lateness squared, a hundredth of an
+encoder step at 0.5 ms and 50 rad/s^2.
 
-Not seen from here, and so not corrected, is what passes between the write call and the wire (the adapter's buffer), and
-between the request's arrival and the servo's own sampling.
+Delays that the host cannot see are not corrected: between the write call and the wire (the adapter's buffer), and
+between the arrival of the request and the servo's own sampling.
 """
 
 import numpy as np
@@ -19,16 +20,17 @@ Values = NDArray[np.float64]
 
 
 def lateness(rows: NDArray[np.void]) -> Values:
-    """s from each row's deadline to its write, shaped as `rows`; 0 where no write was tried."""
+    """Time from each row's deadline to its write [s], in the shape of `rows`; 0 if nothing was written."""
     sent = rows["time_after_read"] > rows["time_before_write"]
     late: Values = np.where(sent, rows["time_before_write"] - rows["deadline"], 0.0)
     return late
 
 
 def acting_torque(goals: Values, late: Values, rate: float) -> Values:
-    """Mean torque between deadlines (joints, samples) of `goals` (joints, samples + 1), the first the one before.
+    """Mean torque between deadlines (joints, samples) [N m].
 
-    `late` (samples,): lateness of all but the first [s].
+    goals: held torques (joints, samples + 1) [N m], starting with the one before the period. late: lateness of all but
+    the first of them (samples,) [s]. rate: samples per second [Hz].
     """
     before = np.clip(late * rate, 0.0, 1.0)
     mean: Values = goals[:, 1:] + (goals[:, :-1] - goals[:, 1:]) * before
@@ -36,6 +38,6 @@ def acting_torque(goals: Values, late: Values, rate: float) -> Values:
 
 
 def velocity_of(period: SettledPeriod) -> Values:
-    """Velocities (joints, samples) [rad/s] by the lines of the motion up to where it meets the noise."""
+    """Velocities (joints, samples) [rad/s] from the Fourier lines of the motion that lie above the noise."""
     lines = lines_of(period.filled())
     return motion_of(lines, cut_off(lines), period.fundamental, period.samples).velocity

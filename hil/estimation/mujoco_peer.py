@@ -1,10 +1,11 @@
 """mujoco.sysid on a settled period: the peer behind the extra `peers`.
 
-The arm is a MuJoCo model of one or two hinges. Unknown are first moment and inertia of each link, armature of joint 2,
-damping, friction loss and a constant torque of each joint, each as a multiple of what it shall find. It gets every
-advantage: a start within 50 % of what it shall find (nothing else finds its way from nothing), link 1's length, the
-state at the first sample from the period's Fourier lines, the delay that our first stage found, mujoco.sysid's own
-optimiser with its rollouts on all cores, and two integration steps a sample, the fewest that leave its answer as it is.
+The arm is a MuJoCo model with one or two hinges. The unknowns are first moment and inertia of each link, armature of
+joint 2, and damping, friction loss and a constant torque of each joint, each scaled by its expected value. The method
+gets every advantage: an initial guess within 50 % of the expected values (farther away, it does not converge), the
+length of link 1, the initial state from the period's Fourier lines, the delay found by our first stage, mujoco.sysid's
+own optimiser with rollouts on all cores, and the smallest number of integration steps per sample (two) that does not
+change its answer.
 """
 
 import importlib
@@ -22,15 +23,15 @@ from hil.estimator.baselines.compare import Peer, joined
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.stage1 import LinearEstimate, fit_lines
 
-STEPS = 2  # integration steps a sample
-WITHIN = 0.5  # of the truth, at the start
-BOUNDS = (0.02, 20.0)  # multiples of the values that `centre` means; offsets of either sign
+STEPS = 2  # integration steps per sample
+WITHIN = 0.5  # relative error of the initial guess
+BOUNDS = (0.02, 20.0)  # relative to `centre`; offsets may have either sign
 
 
 def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float, seed: int) -> Peer:
-    """mujoco.sysid from a start drawn within 50 % of `centre`, base parameters by name [SI].
+    """Fit with mujoco.sysid, starting from values drawn within 50 % of `centre` (base parameters by name [SI]).
 
-    `length` [m] of link 1, `gravity` [m/s^2]. Raises MissingExtra without mujoco[sysid].
+    `length`: of link 1 [m]. `gravity`: [m/s^2]. Raises MissingExtra without mujoco[sysid].
     """
     try:
         mujoco: Any = importlib.import_module("mujoco")
@@ -51,14 +52,14 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
         parameters.add(parameter)
     residual = sysid.build_residual_fn(models_sequences=[_sequences(mujoco, sysid, spec, period, linear)])
     began = time.perf_counter()
-    with redirect_stdout(io.StringIO()):  # it prints its iterations, whatever `verbose` says
+    with redirect_stdout(io.StringIO()):  # it prints its iterations despite `verbose`
         found, result = sysid.optimize(parameters, residual_fn=residual, optimizer="mujoco", verbose=False)
     seconds = time.perf_counter() - began
     left = residual(result.x, found)[0]
     covariance = sysid.calculate_intervals(left, np.asarray(result.jac).reshape(-1, result.x.size))[0]
     values = np.array(list(arm.values.values()))
     base = arm.base(values * result.x)
-    # The base parameters are all but linear in MuJoCo's: differences carry the covariance over.
+    # The base parameters are almost linear in MuJoCo's: finite differences transform the covariance.
     names = list(base)
     slope = np.stack(
         [
@@ -68,7 +69,7 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
         axis=1,
     )
     std = np.sqrt(np.diag(slope @ covariance @ slope.T))
-    settings = f"initial guess within {100 * WITHIN:.0f} %, {values.size} parameters, {STEPS} steps a sample"
+    settings = f"initial guess within {100 * WITHIN:.0f} %, {values.size} parameters, {STEPS} steps per sample"
     return Peer(
         "mujoco_sysid",
         base | {"delay": linear.delay},
@@ -81,11 +82,11 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
 
 @dataclass(frozen=True)
 class _Arm:
-    """The arm in MuJoCo's own quantities; the masses are arbitrary, since only their moments are identifiable."""
+    """The arm in MuJoCo's quantities; the masses are arbitrary, since only the moments are identifiable."""
 
     masses: tuple[float, ...]
     values: dict[str, float]
-    """First moments [kg m], inertias about the centres [kg m^2], armature, friction, in the optimiser's order."""
+    """First moments [kg m], inertias about the centres of mass [kg m^2], armature and friction, in optimiser order."""
     length: float
     gravity: float
 
@@ -109,7 +110,7 @@ class _Arm:
         return cls((mass_1, *masses), values, length, gravity)
 
     def base(self, values: NDArray[np.float64]) -> dict[str, float]:
-        """Base parameters [SI] of these values of MuJoCo's."""
+        """Base parameters [SI] for these values of MuJoCo's quantities."""
         own = dict(zip(self.values, values.tolist(), strict=True))
         base = {name: value for name, value in own.items() if not name.startswith(("moment", "inertia"))}
         moment, inertia = own["moment_1"], own["inertia_1"] + own["moment_1"] ** 2 / self.masses[0]
@@ -123,7 +124,7 @@ class _Arm:
 
 
 def _sequences(mujoco: Any, sysid: Any, spec: Any, period: SettledPeriod, linear: LinearEstimate) -> Any:
-    """The period's commands as MuJoCo's steps see them, and its positions."""
+    """The commands and positions of the period as MuJoCo time series."""
     model = spec.compile()
     steps = STEPS * period.samples
     at = np.arange(steps) * model.opt.timestep
@@ -163,7 +164,7 @@ def _modifier(name: str, unit: float) -> Any:
             spec.actuator(name).gear = [-value, 0, 0, 0, 0, 0]
         else:
             hinge, field = spec.joint(f"joint_{joint}"), _JOINT_FIELDS[term]
-            # Damping has higher orders of velocity too since MuJoCo 4.
+            # Since MuJoCo 4, damping also has terms of higher order in velocity.
             orders = np.size(getattr(hinge, field))
             setattr(hinge, field, value if orders == 1 else [value] + [0.0] * (orders - 1))
 

@@ -1,4 +1,4 @@
-"""Masses, centres and inertias of a result, from its base parameters and what [known] says."""
+"""Masses, centres of mass and inertias of a result, from its base parameters and [known]."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ from hil.results.result import Result
 
 
 def physical_of(result: Result, known: Mapping[str, Known], gravity: float) -> Physical:
-    """Masses, centres and inertias of the arm in `result`. Raises ModelError."""
+    """Masses, centres of mass and inertias of the arm in `result`. Raises ModelError."""
     rigid = [result.covariance.names.index(name) for name in RIGID_BODY[result.joints]]
     covariance = result.covariance.array()[np.ix_(rigid, rigid)]
     base = {name: result.parameters[name].value for name in RIGID_BODY[result.joints]}
@@ -27,12 +27,12 @@ def physical_of(result: Result, known: Mapping[str, Known], gravity: float) -> P
 
 
 def unit_of(name: str) -> str:
-    """SI unit of a quantity by its name."""
+    """SI unit of a quantity, by its name."""
     return QUANTITY_UNITS[name.rsplit("_", 1)[0]]
 
 
 def physical_lines(physical: Physical) -> list[str]:
-    """The same in words, a line each."""
+    """The quantities as text, one per line."""
     lines = ["Masses, centres and inertias, using the known quantities:"]
     for name, found in physical.quantities.items():
         error = "known" if found.known and found.std == 0.0 else f"+- {found.std:.1e}"

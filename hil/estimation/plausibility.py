@@ -1,4 +1,4 @@
-"""Cheap plausibility checks: values that are impossible or contradict the configuration."""
+"""Plausibility checks: identified values that are impossible or contradict the configuration."""
 
 import numpy as np
 
@@ -6,19 +6,19 @@ from hil.config.schema import Config
 from hil.estimator.identify import Estimate
 
 DEVIATIONS = 4.0  # standard errors
-LENGTH_TOLERANCE = 0.05  # of the link's length, which is measured with a ruler
-FLAT = 0.02  # of the largest commanded torque: less gravity than that is none
-RATIO = 0.35  # from 1: torque constants differ by less
+LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
+FLAT = 0.02  # of the largest commanded torque, below which gravity counts as absent
+RATIO = 0.35  # largest plausible deviation of a torque constant ratio from 1
 
 
 def doubts(config: Config, estimate: Estimate, largest_torque: float) -> tuple[str, ...]:
-    """One sentence per contradiction. largest_torque: the largest commanded torque [N m]."""
+    """One sentence per contradiction; `largest_torque` is the largest commanded torque [N m]."""
     found = [*_length(config, estimate), *_weight(config, estimate, largest_torque), *_constants(estimate)]
     return tuple(found)
 
 
 def _length(config: Config, estimate: Estimate) -> list[str]:
-    """coupling gravity / gravity_2 is the length of link 1, which a ruler tells."""
+    """Check coupling * gravity / gravity_2, which should equal the measured length of link 1."""
     length = _link_length(config)
     if length is None or estimate.model.joints != 2 or not config.arm.gravity:
         return []
@@ -39,7 +39,7 @@ def _length(config: Config, estimate: Estimate) -> list[str]:
 
 
 def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[str]:
-    """Gravity's direction and whether there is any."""
+    """Check the sign of gravity and whether gravity acts at all."""
     said = []
     for joint in range(1, estimate.model.joints + 1):
         value = estimate.parameters[f"gravity_{joint}"]
@@ -62,13 +62,13 @@ def _constants(estimate: Estimate) -> list[str]:
     if abs(np.log(max(ratio, 1e-6))) < np.log1p(RATIO):
         return []
     return [
-        f"The second joint's torque appears to be {ratio:.2g} times what its torque constant says: look at model and "
-        "torque_constant of both joints."
+        f"The torque of joint 2 appears to be {ratio:.2g} times what its torque constant implies: check the model "
+        "and the torque_constant of both joints."
     ]
 
 
 def _link_length(config: Config) -> float | None:
-    """Of link 1 [m], where somebody gave it."""
+    """Length of link 1 [m] from [known] or link_lengths; None if neither is given."""
     if config.known is not None and config.known.length_1 is not None:
         return config.known.quantities()["length_1"].value
     return None if config.arm.link_lengths is None else config.arm.link_lengths[0]

@@ -1,4 +1,4 @@
-"""From an estimate on settled periods to its result (hil.results.result)."""
+"""Conversion of an estimate from settled periods to a result (hil.results.result)."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ QUANTISATION_FLOOR_TICKS = 1 / math.sqrt(12)
 
 @dataclass(frozen=True)
 class Checks:
-    """What was found about an estimate, beside its parameters."""
+    """Findings about an estimate, apart from its parameters."""
 
     validation: Validation
     verdict: Verdict
@@ -33,7 +33,7 @@ def make_result(
     timing: RunTiming,
     mean_time: float,
 ) -> SettledResult:
-    """The result of one run. mean_time: of the period's samples, since the bus was opened [s]."""
+    """Build the result of one run; `mean_time` is the mean time of the period's samples on the port's clock [s]."""
     base = len(estimate.model.base_names)
     return SettledResult(
         method=f"settled period, least squares on Fourier lines, then maximum likelihood; "

@@ -1,4 +1,4 @@
-"""The findings of an estimate's checks, as stored in a result."""
+"""Conversion of the findings of an estimate's checks to the form stored in a result."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from hil.results.parts import (
 
 
 def describe_validation(found: validation.Validation, held_out: NDArray[np.float64] | None) -> Validation:
-    """held_out: error of the free prediction of another multisine over the motion's RMS, (joints,)."""
+    """Convert the validation; held_out: relative prediction error of the held-out multisine (joints,), or None."""
     first, second, correlation = found.confounded
     levels, lines = found.levels, found.levels.lines
     return Validation(
@@ -58,12 +58,12 @@ def _group(group: distortion.LineGroup | None) -> LineGroup | None:
 
 
 def describe_verdict(judged: verdict.Verdict) -> Verdict:
-    """The estimator's verdict, as the result keeps it."""
+    """Convert the estimator's verdict."""
     return Verdict(judged.trust, judged.weakest, tuple(judged.sentences))
 
 
 def describe_choice(choice: settled.Choice) -> ModelChoice:
-    """Which friction model was chosen of which, and its gain and cost."""
+    """Convert the choice among friction models, with its gain and cost."""
     return ModelChoice(
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,
@@ -73,7 +73,7 @@ def describe_choice(choice: settled.Choice) -> ModelChoice:
 
 
 def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
-    """The same for unsettled data, judged on held-out segments."""
+    """Convert the choice among models for unsettled data, judged on held-out segments."""
     return ModelChoice(
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,

@@ -1,7 +1,8 @@
-"""From a run folder to its result: settled period, both stages, and validation on a held-out multisine."""
+"""From a run folder to its result: settled period, both estimation stages, and validation on a held-out multisine."""
 
 import logging
 import time
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.estimation.chain_estimate import estimate_chain_run
-from hil.estimation.model_from_config import wanted_model
+from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.plausibility import doubts
 from hil.estimation.result import Checks, make_result
@@ -35,8 +36,12 @@ from hil.runs.timing import timing
 log = logging.getLogger(__name__)
 
 
-def estimate_run(run: RunFolder) -> SettledResult:
-    """Estimate from the recording in `run` and write its result.json; the result. Raises HilError, EstimationError."""
+def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledResult:
+    """Estimate from the recording in `run`, write its result.json and return the result.
+
+    executor: begins fits that `friction = "auto"` may need before it is known that it does.
+    Raises HilError, EstimationError.
+    """
     config, facts = run.load_config(), run.load_facts()
     if config.is_chain:
         return estimate_chain_run(run, config, facts)
@@ -44,7 +49,7 @@ def estimate_run(run: RunFolder) -> SettledResult:
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
-    estimate, choice = _estimate(config, period, other, run.load_starts())
+    estimate, choice = _estimate(config, period, other, run.load_starts(), executor)
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=considered(period, estimate))
     drift = None if other is None else _drift(facts, samples, other, estimate)
@@ -82,24 +87,37 @@ def estimate_run(run: RunFolder) -> SettledResult:
 
 
 def _drift(facts: RunFacts, samples: NDArray[np.void], other: SettledPeriod, estimate: Estimate) -> Drift:
-    """How friction changed from what was fitted to the motion held out."""
+    """Estimate how friction changed between the fitted and the held-out motion."""
     between = _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
     return friction_change(other, estimate, between)
 
 
 def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
-    """When the last periods of a multisine were played, on the port's clock [s]."""
+    """Mean time of the last period of a multisine, on the port's clock [s]."""
     rows = samples[(samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))]
     last = rows["period"] == rows["period"].max()
     return float(rows["deadline"][last].mean())
 
 
 def _estimate(
-    config: Config, period: SettledPeriod, other: SettledPeriod | None, starts: list[dict[str, float]]
+    config: Config,
+    period: SettledPeriod,
+    other: SettledPeriod | None,
+    starts: list[dict[str, float]],
+    executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
-    """The estimate of the model that the configuration asks for, or of the one chosen, with how it was."""
-    wanted = config.model
+    """Fit the configured model, or choose one; the choice is None if the model is fixed."""
+    wanted, by_voltage, lever = config.model, voltage_driven(config), lever_of(config)
     if wanted.friction == "auto":
-        choice = choose([period], other, wanted.drive, torque_scale=wanted.torque_scale, starts=starts)
+        choice = choose(
+            [period],
+            other,
+            wanted.drive,
+            torque_scale=wanted.torque_scale,
+            by_voltage=by_voltage,
+            lever=lever,
+            starts=starts,
+            executor=executor,
+        )
         return choice.estimate, choice
-    return identify(period, wanted_model(wanted, len(config.joints)), starts=starts), None
+    return identify(period, wanted_model(wanted, len(config.joints), by_voltage, lever), starts=starts), None

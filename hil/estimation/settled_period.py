@@ -1,4 +1,4 @@
-"""From a recording to what the estimator takes: the settled periods of one multisine."""
+"""Extraction of the settled periods of one multisine from a recording."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from hil.runs.run_folder import RunFacts
 
 
 def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], role: str) -> SettledPeriod:
-    """The settled periods of the multisine played for `role`; raises RecordingCutShort."""
+    """Extract the settled periods of the multisine played for `role`. Raises RecordingCutShort."""
     experiment = config.experiment
     count = experiment.samples
     chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))
@@ -39,7 +39,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
             f"{experiment.periods} settled ones; {wanted * count} samples are required. Record again."
         )
     begin, end = first * count, (first + experiment.periods) * count
-    # With the row before: its goal holds until the first write.
+    # Includes the row before, whose goal is in effect until the first write.
     goals = rows["goal_current"][begin - 1 : end].T * _torque_constants(config)[:, None]
     late = lateness(rows[begin:end])
     torque = acting_torque(goals, late, experiment.rate)
@@ -58,14 +58,14 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
 
 
 def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean (joints, samples) over those of the periods (periods, joints, samples) that have the sample, or NaN."""
+    """Mean over the periods that have the sample: (periods, joints, samples) to (joints, samples); NaN if none has."""
     count = np.isfinite(position).sum(axis=0)
     mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
     return mean
 
 
 def _by_period(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """(joints, samples) of several periods of `count` samples as (periods, joints, count)."""
+    """Split (joints, samples) into periods of `count` samples: (periods, joints, count)."""
     return np.moveaxis(values.reshape(len(values), -1, count), 1, 0)
 
 
@@ -74,7 +74,7 @@ def _torque_constants(config: Config) -> NDArray[np.float64]:
 
 
 def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float64], first: int) -> Stabilised:
-    """What the stabiliser gave of the `torque` (joints, samples) from row `first` on, from the samples it acted on."""
+    """Separate the stabiliser's part of `torque` (joints, samples) [N m], which starts at row `first`."""
     with_former = rows[first - 1 : first + torque.shape[1]]
     given = np.nan_to_num(feedback_torque(config, with_former)).T
     excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)
@@ -84,7 +84,9 @@ def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float
 
 
 def _scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Standard deviation of the mean over periods, (periods, joints, samples) [rad], per joint; None for one period."""
+    """Standard deviation of each joint's mean over periods, (periods, joints, samples) to (joints,) [rad]; None for
+    one.
+    """
     count = len(position)
     if count < 2:
         return None
@@ -93,7 +95,9 @@ def _scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
-    """The first period that is like the one before it, as the stream decided."""
+    """Index of the first period that matches the one before it, by the same criterion as the stream; None if there is
+    none.
+    """
     for period in range(1, len(position)):
         if settling_difference(position[period - 1], position[period]) <= within:
             return period
@@ -101,5 +105,5 @@ def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
 
 
 def _drifting(position: NDArray[np.float64], within: float, wanted: int) -> int | None:
-    """The first of the last `wanted` periods, where only slow drift remains."""
+    """Index of the first of the last `wanted` periods if only slow drift remains; otherwise None."""
     return len(position) - wanted if settling_difference(position[-2], position[-1]) <= within else None

@@ -1,4 +1,4 @@
-"""Warnings about a recording that do not stop the estimation, each with the joint and the remedy."""
+"""Warnings about a recording that do not prevent the estimation, each with the joint and a remedy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +9,11 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
-LARGE = 0.5  # of the largest goal: smaller ones say little about clipping
-SHORT = 0.85  # measured over commanded current below which a motor did not get what it was told
-OFTEN = 0.05  # of the large samples
+LARGE = 0.5  # of the largest goal; smaller goals say little about clipping
+SHORT = 0.85  # ratio of measured to commanded current below which the current was clipped
+OFTEN = 0.05  # fraction of the samples with large goals
 LEAST_SWING = 30.0  # encoder steps
-LOST = 0.01  # of the samples
+LOST = 0.01  # fraction of the samples
 
 
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
@@ -24,7 +24,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         steps = swing / facts.position_step[index]
         if steps < LEAST_SWING:
             found.append(
-                f"{joint.name} moved by {steps:.0f} encoder steps only: rounding dominates its parameters; raise its "
+                f"{joint.name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; raise its "
                 "peak_torque."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
@@ -37,7 +37,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
 
 
 def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
-    """Joints that got less current than commanded."""
+    """Warn about joints that received less current than commanded."""
     return [
         said
         for index, joint in enumerate(config.joints)
@@ -47,8 +47,8 @@ def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
 
 
 def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]) -> list[str]:
-    """Where a motor gets less current than commanded: its supply sags, or its own current limit is lower."""
-    # A lagging current loop is behind where the goal moves, not where it stays.
+    """Detect a motor that receives less current than commanded, from a sagging supply or its own current limit."""
+    # Large goals change slowly near their peak, so a lagging current loop does not count as clipping.
     large = (np.abs(goal) > LARGE * np.abs(goal).max()) & np.isfinite(measured)
     if not large.any():
         return []
@@ -57,7 +57,7 @@ def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]
     if part <= OFTEN:
         return []
     return [
-        f"{name} got less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the high-torque "
-        "samples: the servo's own current limit or, at speed, the supply voltage clips it; lower peak_torque "
-        "or raise the supply voltage."
+        f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
+        "high-torque samples: the servo's own current limit or, at speed, the supply voltage clips it; lower "
+        "peak_torque or raise the supply voltage."
     ]

@@ -1,4 +1,4 @@
-"""The uncertainty that the torque constants leave in a result, in sentences for terminal and report."""
+"""Sentences about the uncertainty that the torque constants cause in a result, for terminal and report."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -11,23 +11,24 @@ RATIO = "torque_scale_2"
 
 
 class Driven(Protocol):
-    """A joint as the configuration or a model describes it."""
+    """A joint as described by the configuration or by a model."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def torque_per_goal(self) -> float:
-        """N m per A, or per V in pwm mode."""
+        """Torque per goal at the output shaft: N m/A, or N m/V in pwm mode."""
 
     @property
     def torque_per_goal_std(self) -> float: ...
 
 
 def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity]) -> str:
-    """Which torque constants the values scale with, and how well they are known; empty where they are exact.
+    """A sentence on how the values depend on the torque constants and how well these are known; empty if exactly.
 
-    extra: the result's terms beside the base parameters; with their ratio found, only the first constant is left open.
+    extra: the result's terms besides the base parameters. If they include the ratio of the torque constants, only the
+    first constant remains uncertain.
     """
     unsure = [
         f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.2g} %"
@@ -44,7 +45,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
     ratio = extra[RATIO]
     found = (
         f"Relative to {first.name}, {second.name} gives {ratio.value:.5g} +- {ratio.std:.1g} times the torque that "
-        f"its torque constant implies. Every value scales with {first.name}'s alone"
+        f"its torque constant implies. Every value scales only with the torque constant of {first.name}"
     )
     if not first.torque_per_goal_std:
         return f"{found}."
@@ -52,7 +53,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
 
 
 def by_voltage_said(joints: Sequence[JointConfig]) -> str:
-    """What viscous friction includes for joints driven by voltage; empty otherwise."""
+    """A sentence on what viscous friction includes for voltage-driven joints; empty for others."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
     return "Driven by voltage: the viscous friction includes the motor's back-EMF."

@@ -1,4 +1,4 @@
-"""What an identification of the fake arm should find."""
+"""The true parameters of a fake arm."""
 
 import math
 
@@ -9,10 +9,10 @@ from hil.fakes.servo.registers import load_model
 
 
 def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] | None:
-    """The base parameters by name [SI]; None on a real arm, empty for a plant that does not state them.
+    """The base parameters by name [SI]; None for a real arm, empty for a plant that does not state them.
 
-    time: since the arm was switched on [s], for drives whose friction changes as they warm up. A joint driven by
-    voltage is braked by its back-EMF, which counts as viscous friction.
+    time: time since the arm was switched on [s], for drives whose friction changes as they warm up. The back-EMF of a
+    voltage-driven joint counts as viscous friction.
     """
     fake = config.fake
     if not config.is_fake or fake is None:

@@ -1,29 +1,36 @@
-"""Whether a joint's position and velocity agree, on every sample.
+"""Check on every sample that a joint's position and velocity agree.
 
-An encoder whose value freezes still answers, and a velocity that stays at zero is within every limit. But the two are
-measured together: what the velocity adds up to must be how far the position went. The difference of the two,
+A frozen encoder still answers, and a velocity that stays at zero is within every limit. But the integral of the
+velocity must equal the change in position. The difference,
 
     position - integral of velocity,
 
-is kept with the last `MEMORY_S` weighing most. Rounding and an encoder's scatter do not add up in it, and a velocity
-that lags by tau, since a real servo filters it, makes it tau times the change of velocity and no more. What a lag of
-`LAG_S`, a scale that is `SCALE` off and the samples' distance leave open is forgiven.
+is tracked with an exponential memory of `MEMORY_S`. Rounding and encoder noise do not accumulate in it, and a velocity
+that lags by tau, because the servo filters it, contributes at most tau times the change of velocity. The tolerance
+allows for a lag of `LAG_S`, a scale error of `SCALE` and the interval between samples. Once the joint has moved fast
+for `LEARNT_S`, it allows for twice the lag seen so far and `MORE_LAG_S`, if that is less: a lag does not grow.
 """
 
 MEMORY_S = 0.3
 LAG_S = 0.03
+LEARNT_S = 1.5
+MORE_LAG_S = 0.008
+_FAST_RAD_S = 2.0
+"""Range of velocities within the memory from which on it shows how large the lag is."""
+
 SCALE = 0.06
 UNSURE_RAD = 0.02
-"""Rounding of both, an encoder's scatter, and the velocity's bias of half a tick over MEMORY_S."""
+"""Allowance [rad] for rounding, encoder noise, and a velocity bias of half a tick over MEMORY_S."""
 
 CURVED = 0.25
-"""Of the change of velocity, times its time: what a velocity known at the samples alone leaves open in between. A wave
-of four samples a period, the fastest that is played, is 21 % off.
+"""Allowance for the velocity between samples, as a fraction of its change times the interval.
+
+A wave with four samples per period, the fastest that is played, deviates by 21 %.
 """
 
 
 class Consistency:
-    """One joint's position [rad] against its velocity [rad/s]."""
+    """Compares one joint's position [rad] with its velocity [rad/s]."""
 
     def __init__(self) -> None:
         self._position: float | None = None
@@ -31,9 +38,15 @@ class Consistency:
         self._apart = 0.0
         self._open = 0.0
         self._highest = self._lowest = 0.0
+        self._lag_seen = 0.0
+        self._learnt_for = 0.0
+        self._lag = LAG_S
 
-    def look(self, position: float, velocity: float, seconds: float) -> bool:
-        """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent."""
+    def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
+        """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
+
+        unsure: excess duration of its exchange [s], in which the time of the measurement is not known.
+        """
         former, self._position = self._position, position
         before, self._velocity = self._velocity, velocity
         if former is None:
@@ -45,13 +58,24 @@ class Consistency:
         change = velocity - before
         self._apart = kept * self._apart + moved - felt
         self._open = kept * self._open + SCALE * abs(moved)
-        self._open += CURVED * seconds * abs(change)
+        self._open += CURVED * seconds * abs(change) + unsure * abs(velocity)
         highest, lowest = kept * self._highest + (1 - kept) * velocity, kept * self._lowest + (1 - kept) * velocity
         self._highest = highest = velocity if velocity > highest else highest
         self._lowest = lowest = velocity if velocity < lowest else lowest
-        allowed = UNSURE_RAD + LAG_S * (highest - lowest) + self._open
-        return not -allowed <= self._apart <= allowed
+        span = highest - lowest
+        allowed = UNSURE_RAD + self._lag * span + self._open
+        if not -allowed <= self._apart <= allowed:
+            return True
+        if span > _FAST_RAD_S and not unsure > seconds:
+            self._learn_lag(abs(self._apart) / span, seconds)
+        return False
+
+    def _learn_lag(self, lag: float, seconds: float) -> None:
+        self._lag_seen = max(self._lag_seen, lag)
+        self._learnt_for += seconds
+        if self._learnt_for >= LEARNT_S:
+            self._lag = min(LAG_S, 2.0 * self._lag_seen + MORE_LAG_S)
 
     def lost(self) -> None:
-        """A reply is missing: restart with the next one."""
+        """Restart with the next reply, because one is missing."""
         self._position = None

@@ -1,8 +1,8 @@
-"""Whether a motor carries the commanded current: judged by the current (or voltage) that each reply holds.
+"""Check that a motor carries the commanded current, by the current (or voltage) reported in each reply.
 
-A servo may have lost its torque in the middle of a run: rebooted, stopped by its watchdog, switched off by another
-program. Then its current is zero, whatever is commanded. How much current that takes from it depends on what is
-played, not on how much the servo could carry, so everything here is measured against the planned peak.
+A servo may lose its torque in the middle of a run: it rebooted, was stopped by its watchdog, or was switched off by
+another program. Its current is then zero, whatever is commanded. How much current is missing depends on the plan,
+not on what the servo could carry, so all thresholds are relative to the planned peak.
 
 Two hypotheses are compared on every sample, sequentially (E. S. Page, "Continuous inspection schemes", Biometrika 41
 (1954) 100): the current is the one commanded, or it is zero. Their log likelihood ratio, for errors of standard
@@ -10,9 +10,9 @@ deviation sigma, grows by
 
     (distance from the commanded current)^2 - (distance from zero)^2, over 2 sigma^2
 
-a sample, bounded both ways so that no single reply decides, and is not let below zero. Time counts, not samples: a
-sample weighs as much as the time that it stands for. The commanded current is anything between the last two goals,
-since a reply may be measured before or after the motor has followed the latest one.
+per sample. The step is bounded so that no single reply decides, and the sum is kept at or above zero. Each sample is
+weighted by the time that it represents. The commanded current is any value between the last two goals,
+because a reply may be measured before or after the motor follows the latest goal.
 """
 
 from typing import NamedTuple
@@ -20,23 +20,23 @@ from typing import NamedTuple
 from hil.config.joint import JointConfig
 
 SIGMA_SHARE = 0.1
-"""Of the planned peak: errors of sensor and current loop that are nothing out of the ordinary."""
+"""Standard deviation of ordinary sensor and current-loop errors, relative to the planned peak."""
 
 SIGMA_TICKS = 4.0
-"""The same in ticks of the register, where the planned peak is small."""
+"""The same in register ticks; applies if the planned peak is small."""
 
 LOST_AFTER_S = 0.03
-"""For how long a current must look like zero, at full weight, to be taken for it."""
+"""Time for which a current must look like zero, at full weight, before it is taken for zero [s]."""
 
 _FULL_WEIGHT = 2.0
-"""The log likelihood ratio of a sample that weighs most: a current of two sigma commanded, and none there."""
+"""Largest log likelihood ratio of one sample: a commanded current of two sigma, and a measured one of zero."""
 
 _FEWEST = 2
-"""Samples that it takes at least, however slow the rate."""
+"""Minimum number of samples, however low the rate."""
 
 
 class Unfollowed(NamedTuple):
-    """A motor that does not carry the commanded value [A or V], for how long [s]."""
+    """A motor that does not carry the commanded value: goal and measured value [A or V], and duration [s]."""
 
     goal: float
     carried: float
@@ -44,7 +44,7 @@ class Unfollowed(NamedTuple):
 
 
 class Following:
-    """One joint's current against its goals. planned: largest goal of the plan [A, or V under PWM]."""
+    """Compares one joint's current with its goals. planned: largest goal of the plan [A, or V under PWM]."""
 
     def __init__(self, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
         tick = abs(joint.joint.drive_unit(12.0))
@@ -60,7 +60,11 @@ class Following:
         self._differs = 0
 
     def look(self, goal: float, carried: float, seconds: float) -> Unfollowed | None:
-        """The latest goal, what the reply says is carried [A or V], and the time since the last reply."""
+        """Process a reply; return the deviation once it has lasted too long.
+
+        goal: latest goal [A or V]. carried: measured value in the reply [A or V]. seconds: time since the last reply
+        [s].
+        """
         former, self._former_goal = self._former_goal, goal
         low, high = (goal, former) if goal < former else (former, goal)
         off = low - carried if carried < low else carried - high if carried > high else 0.0
@@ -78,7 +82,7 @@ class Following:
         else:
             self._evidence = 0.0
             self._count = 0
-        # A stabiliser may ask for more than was planned.
+        # A stabiliser may command more than was planned.
         if off <= self._allowed or off <= self._share * abs(goal):
             self._differs_for, self._differs = 0.0, 0
             return None

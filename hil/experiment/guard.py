@@ -1,7 +1,7 @@
-"""Checks every sample and stops the arm when a limit is passed or a reply is inconsistent.
+"""Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
-Two joints cost a few us a sample: plain floats, one pass over the joints, everything known beforehand computed once.
-What needs more than one sample is kept by modules of their own: `following` (does the motor carry the commanded
+The checks take a few us per sample for two joints: plain floats, one pass over the joints, constants precomputed.
+Checks that need more than one sample are in separate modules: `following` (does the motor carry the commanded
 current), `consistency` (do position and velocity agree), `status_check` (slow status
 registers), `silence` (time without replies or commands).
 """
@@ -12,7 +12,7 @@ from typing import NamedTuple, NoReturn
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
-from hil.drivers.packet import ALERT
+from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
@@ -22,36 +22,41 @@ from hil.experiment.status_check import StatusCheck
 from hil.plan.silence import is_missing_too_long, late_limit, missing_limit
 
 JUMP_FACTOR = 1.5
-"""How much farther than its velocity limit allows a joint may seem to move from one sample to the next."""
+"""Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
 
 JUMP_ALLOWANCE_RAD = 0.01
-"""Rounding and a worn encoder's scatter."""
+"""Allowance for rounding and the noise of a worn encoder [rad]."""
 
 EARLY_MOTION_RAD = 0.05
-"""How far a joint may creep in the rest before the start."""
+"""Largest motion allowed while resting before the start [rad]."""
+
+FARTHER_OUT_RAD = 0.01
+"""How much farther out a joint may move that a run before this one left beyond its limit."""
+
+MOST_OUTSIDE_RAD = 0.15
+"""How far beyond its limit a joint may be found that a run before this one left there [rad]."""
 
 LONG_GAP = 3.0
-"""Intervals between two samples from which on what lies between them is not known well enough to be added up."""
+"""Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
 LATE_SHARE = 0.2
-"""Of the deadlines that may be missed for long."""
+"""Fraction of deadlines that may be missed permanently."""
 
 _OFTEN_LATE = 5.0
-_OF_ONE_STALL = 2  # deadlines that count, of those that one stall makes late
+_OF_ONE_STALL = 2  # number of deadlines counted per stall
 
 WORK_TOLERANCE_RAD = 0.03
-"""Work that a joint may seem to give out before its sign is called wrong: this angle at its largest torque."""
+"""Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest torque."""
 
 
 _WHY_LATE = (
     "This program was stopped (Ctrl-Z, SIGSTOP, a debugger), the computer was suspended, or other programs kept it "
-    "busy: "
-    "close those programs, or lower experiment.rate."
+    "busy: close those programs, or lower experiment.rate."
 )
 
 
 class _Limits(NamedTuple):
-    """One joint's limits, in the order of use."""
+    """One joint's limits, in order of use."""
 
     low: float
     high: float
@@ -65,13 +70,16 @@ class _Limits(NamedTuple):
 class Guard:
     """Compares each sample with the limits of the configuration. `look` raises SafetyStop.
 
-    planned: largest goal that the plan has for each joint [A, or V under PWM]; from the configuration where not given.
+    planned: largest planned goal of each joint [A, or V under PWM]; by default, from the configuration.
 
-    passive: whether the arm cannot return more work than was put in; True for an arm that starts at stable rest
-    without a stabiliser. Motors that continually take work out of it then turn the wrong way.
+    left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
+    have come to rest a little beyond it: a joint found there may move back in, and no farther out.
+
+    The work of the motors is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot
+    return more work than was put in, so a motor that continually takes work out of it turns the wrong way.
     """
 
-    def __init__(self, config: Config, planned: Sequence[float] | None = None) -> None:
+    def __init__(self, config: Config, planned: Sequence[float] | None = None, *, left_by_a_run: bool = False) -> None:
         rate = config.experiment.rate
         safety = config.safety
         self._names = [str(joint.joint) for joint in config.joints]
@@ -82,7 +90,7 @@ class Guard:
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit,
                 joint.goal_limit,
-                joint.torque_per_goal / rate,
+                joint.torque_per_goal,
                 -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
             for joint in config.joints
@@ -105,12 +113,19 @@ class Guard:
         self._seen_at = [0.0] * count
         self._missing = [0] * count
         self._work = [0.0] * count
+        self._held_goal = [0.0] * count
         self._late = 0
         self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
+        self._may_start_outside = left_by_a_run
+        self._found_outside: dict[int, float] = {}
+        self._shortest = float("inf")
+        self._unsure = 0.0
 
     def clamp(self, goal_current: Sequence[float]) -> list[float]:
-        """Goals within each joint's current limit and slew [A]; NaN becomes a SafetyStop, never a command."""
+        """Clamp goals to each joint's current limit and slew rate [A or V]. Raises SafetyStop for a goal that is not
+        finite.
+        """
         slew = self._slew
         clamped = []
         for index, (goal, former, limits) in enumerate(zip(goal_current, self._former_goal, self._limits, strict=True)):
@@ -125,8 +140,12 @@ class Guard:
         self._former_goal = clamped
         return clamped
 
+    def holding(self, goal: Sequence[float]) -> None:
+        """The goals that the servos have now [A]: `clamp` goes on from there."""
+        self._former_goal = list(goal)
+
     def late(self, seconds: float = 0.0) -> None:
-        """A deadline passed unused, `seconds` after the last command. Raises SafetyStop after too long a time."""
+        """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._late += 1
         if self._late <= _OF_ONE_STALL:
             self._often_late += 1.0
@@ -142,7 +161,7 @@ class Guard:
         )
 
     def _judge_rate(self) -> None:
-        """Stop if more than a certain share of deadlines is missed; a single stall does not count."""
+        """Stop if too large a share of the deadlines is missed; a single stall does not count."""
         self._often_late = max(0.0, self._often_late - LATE_SHARE)
         if self._often_late >= max(_OFTEN_LATE, 0.5 * self._late_limit.seconds / self._interval):
             raise SafetyStop(
@@ -153,9 +172,9 @@ class Guard:
             )
 
     def look(self, state: State, watchdog_gap: float = 0.0) -> None:
-        """Raise SafetyStop when a limit is passed or a reply is inconsistent.
+        """Check one sample. Raises SafetyStop when a limit is exceeded or a reply is inconsistent.
 
-        watchdog_gap: s since the exchange before this one.
+        watchdog_gap: time since the previous exchange [s].
         """
         now = state.time_before_write
         gap = max(watchdog_gap, state.time_after_read - now)
@@ -164,6 +183,9 @@ class Guard:
                 f"This program stalled: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
                 Cause.LATE,
             )
+        took = state.time_after_read - now
+        self._shortest = shortest = min(self._shortest, took)
+        self._unsure = took - shortest
         self._late = 0
         if self._often_late > 0.0:
             self._judge_rate()
@@ -182,12 +204,18 @@ class Guard:
         if state.status is not None:
             self._look_status(state.status, state)
 
+    @property
+    def wants_status(self) -> bool:
+        """Whether the servos' status should be read again in the next exchange."""
+        return self._status.is_in_doubt
+
     def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
         low, high, fastest, farthest, _, work_scale, work_least = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
         interval = self._interval
-        # A sample on time after a late one stands for a whole interval all the same.
-        seconds = max(now - self._seen_at[index], interval * (1 + self._missing[index]))
+        elapsed = now - self._seen_at[index]
+        # A punctual sample after a late one still represents a whole interval.
+        seconds = max(elapsed, interval * (1 + self._missing[index]))
         former = self._position[index]
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
@@ -199,21 +227,26 @@ class Guard:
             self._too_fast(index, velocity)
         self._position[index] = position
         self._seen_at[index] = now
+        missed = self._missing[index]
         self._missing[index] = 0
         following = self._following[index]
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
             self._not_followed(index, off)
         consistency = self._consistency[index]
-        if seconds > LONG_GAP * interval:
+        if elapsed > LONG_GAP * interval:
             consistency.lost()
-        if consistency.look(position, velocity, seconds):
+        if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
-        work = self._work[index] = self._work[index] + work_scale * goal * velocity
+        held, self._held_goal[index] = self._held_goal[index], goal
+        # What the goal before has done until now; where it was another one meanwhile, nothing is known.
+        work = self._work[index]
+        if former is not None and elapsed < LONG_GAP * interval and not missed:
+            work = self._work[index] = work + work_scale * held * (position - former)
         if work < work_least and self._passive:
             self._judge_work(index)
 
     def look_at_rest(self, state: State) -> None:
-        """Raise SafetyStop when a joint moves although nothing has been commanded yet."""
+        """Raise SafetyStop when a joint moves before anything has been commanded."""
         if self._resting is None:
             if not any(state.missing):
                 self._resting = state.position
@@ -224,7 +257,7 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    "is allowed. Let the arm hang still; check for a draught, a dragging cable or a hand.",
+                    "is allowed. Let the arm come to rest; check for a draught, a dragging cable or a hand.",
                 )
 
     def _count_missing(self, index: int, error: int, now: float) -> None:
@@ -234,7 +267,10 @@ class Guard:
         seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
         self._consistency[index].lost()
         allowed, said = self._missing_limit
-        if is_missing_too_long(self._missing[index], seconds, self._missing_limit):
+        # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
+        # was damaged.
+        refused = bool(error) and error != StatusError.CRC
+        if is_missing_too_long(self._missing[index] + refused, seconds, self._missing_limit):
             if error:
                 self._stop(
                     index,
@@ -246,8 +282,7 @@ class Guard:
                 index,
                 Cause.MISSING,
                 f"missed {self._missing[index]} replies in a row; its last reply was {1e3 * seconds:.0f} ms ago; "
-                f"{said} "
-                f"allows {1e3 * allowed:.0f} ms. Check its cable and its supply.",
+                f"{said} allows {1e3 * allowed:.0f} ms. Check its cable and its supply.",
             )
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
@@ -258,8 +293,18 @@ class Guard:
             f"{most:.3f}. Check the encoder, its magnet and the supply.",
         )
 
-    def _outside(self, index: int, position: float) -> NoReturn:
+    def _outside(self, index: int, position: float) -> None:
         low, high = self._limits[index][:2]
+        former = self._position[index]
+        beyond = max(low - position, position - high)
+        if former is None and self._may_start_outside and beyond <= MOST_OUTSIDE_RAD:
+            self._found_outside[index] = position
+        found = self._found_outside.get(index)
+        was_inside = former is not None and low <= former <= high
+        if found is not None and not was_inside:
+            farthest = min(low, found - FARTHER_OUT_RAD), max(high, found + FARTHER_OUT_RAD)
+            if farthest[0] <= position <= farthest[1]:
+                return
         self._stop(
             index,
             Cause.POSITION,
@@ -281,8 +326,7 @@ class Guard:
             Cause.NOT_FOLLOWING,
             f"carries {off.carried:.3f} where {off.goal:.3f} is commanded, for {1e3 * off.seconds:.0f} ms. Its torque "
             "is off, it was rebooted, its watchdog acted, or it cannot deliver this much at its speed and supply "
-            "voltage "
-            "(safety.follow_share).",
+            "voltage (safety.follow_share).",
         )
 
     def _disagree(self, index: int, position: float, velocity: float) -> NoReturn:
@@ -307,7 +351,7 @@ class Guard:
                 self._stop(index, *wrong)
 
     def _judge_work(self, index: int) -> None:
-        """Friction takes energy: a joint whose motor has only ever taken energy out turns against its command."""
+        """Stop a joint whose motor has taken out more energy than friction allows: it moves against its command."""
         others = sum(work for other, work in enumerate(self._work) if other != index and work > 0)
         if self._work[index] < self._limits[index].work_least - 0.5 * others:
             self._stop(
@@ -336,7 +380,7 @@ class Guard:
                 )
 
     def _acted(self, seconds: float) -> str:
-        """What the servos' watchdogs did meanwhile."""
+        """What the servos' watchdogs did during the gap."""
         watchdog = self._safety.watchdog
         if seconds < watchdog:
             return ""
@@ -352,12 +396,12 @@ def _told(seconds: float) -> str:
 
 
 def _measures_supply(joint: JointConfig) -> bool:
-    """Whether the measured current is the supply's, not the motor's: then judge only motion and status."""
+    """Whether the reported current is the supply's instead of the motor's; then only motion and status are checked."""
     return joint.drive_mode is Mode.CURRENT and joint.joint.servo.senses_supply
 
 
 def _planned(config: Config) -> list[float]:
-    """Largest goals that the configuration asks for [A or V]; where it leaves them open, the current limits."""
+    """Largest configured goals [A or V]; the current limits if no torque is configured."""
     peaks = config.experiment.peak_torque
     if peaks is None:
         return [joint.goal_limit for joint in config.joints]

@@ -1,9 +1,8 @@
-"""The dry run's model beside the experiment: is the motion consistent with any arm in the ensemble?
+"""Check during the experiment that the motion is consistent with some arm of the dry run's ensemble.
 
-Prior knowledge is that of the dry run: an ensemble of arms, from `[arm.prior]` or from an earlier
-result. Its mean and widened covariance are where `hil.estimator.models.momentum_observer` begins. Without
-link lengths (a dry run is then impossible too) only the required torque is known: the first
-motion trains the model, and only later motion is judged.
+The prior knowledge is that of the dry run: an ensemble of arms from `[arm.prior]` or from an earlier result. Its mean
+and widened covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run needs
+too, only the planned torque is known: the first motion then trains the model, and only later motion is judged.
 """
 
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hil.config.schema import Config
+from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
@@ -20,43 +20,53 @@ from hil.estimator.models.parameters import CONSTANTS
 
 ARMS = 64
 WIDENED = 1.5
-"""Times the ensemble's standard deviations: what its arms lack is none of their parameters."""
+"""Factor on the ensemble's standard deviations, for effects that its model does not include."""
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
 _FRICTIONS = 8.0
-"""Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
-an alarm."""
-_TILT_SHARE = 0.2  # of gravity, in a direction that the angles' zero does not expect
+"""Smallest torque scale, in multiples of the mean dry friction, so that less than twice the friction causes no alarm.
+"""
+_TILT_SHARE = 0.2  # standard deviation of gravity out of the assumed direction, relative to gravity
+_FRICTION_SPREAD = 3.0
+"""Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
 _STILL_RAD_S = 0.06
+_VAGUE_S = 0.004
+"""Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 
 
 class ModelWatch:
-    """Looks at every sample; None of `look` where all is well. arms: prior knowledge of the arm, by default from the
-    configuration.
+    """Checks every sample against the model.
 
-    planned: largest goal of each joint [A, or V under PWM].
+    planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
+    configuration.
     """
 
     def __init__(self, config: Config, planned: Sequence[float], arms: Ensemble | None = None) -> None:
         self._constants = [joint.torque_per_goal for joint in config.joints]
         largest = np.array([constant * goal for constant, goal in zip(self._constants, planned, strict=True)])
-        mean, covariance = _known(config, largest, arms)
+        mean, covariance = known_arm(config, largest, arms)
         interval = 1.0 / config.experiment.rate
-        # A pilot's torque is hardly more than dry friction, and what that does near standstill is not in the model.
-        dry = [_FRICTIONS * mean.get(f"coulomb_{number}", 0.0) for number in range(1, len(largest) + 1)]
+        # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
+        is_described = arms is not None or config.arm.link_lengths is not None
+        dry = [_FRICTIONS * is_described * mean[f"coulomb_{number}"] for number in range(1, len(largest) + 1)]
         self._observer = MomentumObserver(mean, covariance, np.maximum(largest, dry), interval)
         self._names = [joint.joint.title for joint in config.joints]
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
+        self._shortest = float("inf")
+        self._long = max(interval, _VAGUE_S)
 
     def look(self, state: State) -> None:
-        """Process the latest sample; raises SafetyStop if no arm in the ensemble could have moved like this."""
+        """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
         if any(state.missing):
             return
         goal, self._goal = self._goal, state.goal_current
         seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
-        if goal is None:
+        # When in a long exchange the servos measured is not known: the motion up to there tells nothing.
+        took = state.time_after_read - state.time_before_write
+        self._shortest = min(self._shortest, took)
+        if goal is None or took - self._shortest > self._long:
             goal, seconds = state.goal_current, float("inf")
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
@@ -68,28 +78,28 @@ class ModelWatch:
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
             said = (
-                f"{name} stands still although {abs(lacking):.3f} N m drive it, which would move any arm consistent "
-                "with the prior and the data so far. Something holds it, it is stuck, or its encoder is frozen."
+                f"{name} stands still although a torque of {abs(lacking):.3f} N m drives it, which would move any arm "
+                "consistent with the prior and the data so far. Something blocks it, or its encoder is frozen."
             )
         else:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
-                f"{lacking:+.3f} N m of the commanded torque do not show in its motion. Its motor or its "
+                f"{lacking:+.3f} N m of the commanded torque are not reflected in its motion. Its motor or its "
                 "encoder has failed, something pushes or holds it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
 
 
-def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
+def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
     """Mean and covariance of the observer's parameters."""
     if arms is None and config.arm.link_lengths is None:
-        return {}, np.diag(_hardly_known(largest) ** 2)
+        return _hardly_known(config, largest)
     arms = prior_ensemble(config, ARMS) if arms is None else arms
     joint = np.array([1 if name.endswith("_2") else 0 for name in NAMES])
     drawn = np.array(
         [[dict(zip(CONSTANTS, each.vector, strict=True)).get(name, 0.0) for name in NAMES] for each in arms.physics]
     )
-    # What is known of an arm in N m is known in units of the commanded torque as well as its torque constants are.
+    # Convert to units of the commanded torque, which adds the uncertainty of the torque constants.
     drawn = drawn / arms.torque_scale[:, np.minimum(joint, len(largest) - 1)]
     if len(largest) == 1:
         drawn[:, [name in _OF_TWO for name in NAMES]] = 0.0
@@ -104,12 +114,22 @@ def _known(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[
     return dict(zip(NAMES, mean.tolist(), strict=True)), np.asarray(covariance)
 
 
-def _hardly_known(largest: Array) -> Array:
-    """Standard deviations of the parameters of an arm of which only the required torque is known."""
-    each = {"gravity": 3.0, "tilt": 1.0, "coulomb": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
-    torque = [largest[-1] if name.endswith("_2") else largest[0] for name in NAMES]
-    share = [each.get(name.rpartition("_")[0], 3.0) for name in NAMES]
-    spread: Array = np.array(share) * np.array(torque)
-    if len(largest) == 1:
-        spread[[name in _OF_TWO for name in NAMES]] = 0.0
-    return spread
+def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Array]:
+    """Mean and covariance if only the planned torque and the servos' dry friction are known.
+
+    Friction decides whether a joint that stands still is held: without a bound on it, any torque might be too small.
+    """
+    each = {"gravity": 3.0, "tilt": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
+    guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
+    mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
+    spread = np.zeros(len(NAMES))
+    for index, name in enumerate(NAMES):
+        if len(largest) == 1 and name in _OF_TWO:
+            continue
+        joint = len(largest) - 1 if name.endswith("_2") else 0
+        term = name.rpartition("_")[0]
+        if term == "coulomb":
+            spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
+        else:
+            spread[index] = each.get(term, 3.0) * largest[joint]
+    return mean, np.diag(spread**2)

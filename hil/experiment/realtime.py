@@ -1,15 +1,14 @@
-"""What Linux offers a loop that must be on time: requested, used where granted, and reported either way.
+"""Real-time settings of Linux for the control loop: requested, used if granted, and reported either way.
 
-real-time scheduling   SCHED_FIFO: nothing but other real-time work may take the processor away
-locked memory          mlockall: no page of ours has to be fetched back in the middle of a cycle
-own core               the loop stays on one core and keeps its caches; asked for only together with SCHED_FIFO, since
-                       without it a loop that may not move waits for whoever holds its core
-timer slack            1 ns instead of 50 us by which the kernel may delay a wake-up
-no garbage collection  Python's collector is off inside the loop, and never looks at what was there before it
-short thread switch interval     another thread of this process (the progress bar) hands the interpreter back in 50 us,
-not 5 ms
+real-time scheduling   SCHED_FIFO: only other real-time tasks may preempt the loop
+locked memory          mlockall: no page of this process is swapped in during a cycle
+own core               the loop stays on one core and keeps its caches; only together with SCHED_FIFO, because
+                       otherwise a pinned loop has to wait for other tasks on its core
+timer slack            the kernel may delay a wake-up by 1 ns instead of 50 us
+no garbage collection  Python's collector is off inside the loop, and existing objects are frozen
+short switch interval  another Python thread (the progress bar) releases the interpreter after 50 us, not 5 ms
 
-Only the calling thread gets the first and the third. Everything is undone at the end.
+The first and the third apply only to the calling thread. All settings are restored at the end.
 """
 
 import ctypes
@@ -21,7 +20,7 @@ from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
 PRIORITY = 20
-"""Of SCHED_FIFO's 1 to 99: above ordinary work, below the kernel's own threads (50), which serve the serial port."""
+"""Priority for SCHED_FIFO (1 to 99): above ordinary tasks, below the kernel threads (50) that serve the serial port."""
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
@@ -41,7 +40,7 @@ class Granted(NamedTuple):
 
 @contextmanager
 def real_time() -> Iterator[list[Granted]]:
-    """Request all settings; the block runs with those granted, which are listed."""
+    """Request all settings. Yields the list of settings and whether each was granted."""
     with ExitStack() as undo:
         yield [step(undo) for step in (_fifo, _own_core, _lock_memory, _timer_slack, _no_collection, _short_turns)]
 
@@ -50,7 +49,7 @@ def _fifo(undo: ExitStack) -> Granted:
     name = "real-time scheduling"
     before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        # RESET_ON_FORK: a child process must not inherit a priority that it does not know of.
+        # RESET_ON_FORK: child processes must not inherit the priority.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except OSError as error:
         return Granted(name, False, f"{error.strerror}; needs `ulimit -r {PRIORITY}` or root")
@@ -63,7 +62,7 @@ def _own_core(undo: ExitStack) -> Granted:
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return Granted(name, False, "only with real-time scheduling")
     before = os.sched_getaffinity(0)
-    # The last one: interrupts mostly land on the first.
+    # The last core, because interrupts are mostly handled by the first.
     core = max(before)
     try:
         os.sched_setaffinity(0, {core})
@@ -75,7 +74,7 @@ def _own_core(undo: ExitStack) -> Granted:
 
 def _lock_memory(undo: ExitStack) -> Granted:
     name = "locked memory"
-    # ONFAULT: pages are kept once touched, instead of fetching everything that is mapped, LLVM and all.
+    # ONFAULT locks pages when first touched instead of loading everything that is mapped, such as LLVM.
     refused = _libc("mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
     if refused:
         return Granted(name, False, f"{refused}; needs `ulimit -l unlimited` or root")
@@ -115,7 +114,7 @@ def _short_turns(undo: ExitStack) -> Granted:
 
 
 def _libc(function: str, *arguments: int) -> str:
-    """Call a function of the C library; why it failed, or nothing."""
+    """Call a function of the C library; return an error message, or an empty string on success."""
     call: Callable[..., int] = getattr(ctypes.CDLL(None, use_errno=True), function)
     if call(*map(ctypes.c_ulong, arguments)) == 0:
         return ""

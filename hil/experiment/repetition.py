@@ -1,7 +1,11 @@
-"""Successive periods compared as they are played, so that no burst of work is needed at the end of a period.
+"""Comparison of successive periods while they are played, which avoids a burst of work at the end of a period.
 
-The difference is that of `hil.estimator.data.periodicity.settling_difference`, summed sample by sample: at the end of a
-period only a few divisions are left. The former period lies in one buffer, which the latest one overwrites.
+The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated sample by sample: at the end
+of a period only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
+
+The same torque must give the same motion. From the third period on each sample is also compared with the same sample of
+the period before: a joint that is farther from it than `TIMES` the RMS difference of the two periods before, for
+`LASTING_S`, does not repeat its motion (`unlike`).
 """
 
 from array import array
@@ -10,25 +14,48 @@ from math import inf, isnan, sqrt
 
 _EMPTY = float("nan")
 
+TIMES = 10.0
+FLOOR_RAD = 0.05
+"""Deviation from the previous period that is always accepted: stiction may end a little earlier or later."""
+
+LASTING_S = 0.03
+_FEWEST = 2  # samples, however slow the rate
+
 
 class Repetition:
-    """Positions of a period, of at most `samples`, against those of the period before it."""
+    """Compares the positions of a period of up to `samples` samples with those of the period before.
 
-    def __init__(self, samples: int, joints: int) -> None:
+    interval: time between samples [s].
+    """
+
+    def __init__(self, samples: int, joints: int, interval: float) -> None:
         self._half = 0
+        self._lasting = max(_FEWEST, round(LASTING_S / interval))
+        self._sums: list[_Sums] = [_Sums() for _ in range(joints)]
         self._former = [array("d", [_EMPTY]) * samples for _ in range(joints)]
         self.begin(samples)
 
     def begin(self, samples: int) -> None:
-        """A new period of so many samples starts."""
+        """Start a new period of `samples` samples."""
         self._half = samples // 2
+        self._allowed = [TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]
+        self._unlike_for = [0] * len(self._former)
         self._sums = [_Sums() for _ in self._former]
 
+    def forget(self) -> None:
+        """Forget all periods: what follows plays another torque."""
+        self._sums = [_Sums() for _ in self._former]
+        self._former = [array("d", [_EMPTY]) * len(former) for former in self._former]
+
     def add(self, index: int, position: Sequence[float]) -> None:
-        """Sample `index` of the period: positions of all joints [rad], NaN where missing."""
+        """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
         compared = index >= self._half
-        for former, sums, latest in zip(self._former, self._sums, position, strict=True):
+        for joint, (former, sums, latest) in enumerate(zip(self._former, self._sums, position, strict=True)):
             if not isnan(latest):
+                # False where the former sample is missing, as every comparison with NaN is.
+                self._unlike_for[joint] = (
+                    self._unlike_for[joint] + 1 if abs(latest - former[index]) > self._allowed[joint] else 0
+                )
                 sums.lowest = min(sums.lowest, latest)
                 sums.highest = max(sums.highest, latest)
                 if compared:
@@ -36,18 +63,28 @@ class Repetition:
             former[index] = latest
 
     @property
+    def unlike(self) -> int | None:
+        """Index of a joint that does not repeat the motion of the period before, or None."""
+        for joint, count in enumerate(self._unlike_for):
+            if count >= self._lasting:
+                return joint
+        return None
+
+    @property
     def moved(self) -> list[float]:
-        """From the lowest to the highest position of this period (joints,) [rad]; NaN where no reply came."""
+        """Range of each joint's positions in this period (joints,) [rad]; NaN if no reply was received."""
         return [sums.highest - sums.lowest if sums.highest >= sums.lowest else _EMPTY for sums in self._sums]
 
     @property
     def difference(self) -> float:
-        """RMS difference of the later halves over the RMS of the motion, the worst joint."""
+        """RMS difference between the second halves of the periods, relative to the RMS of the motion; the worst
+        joint's.
+        """
         return max(sums.relative for sums in self._sums)
 
 
 class _Sums:
-    """One joint's."""
+    """Running sums of one joint."""
 
     __slots__ = ("_first", "_pairs", "_seen", "_squared", "_sum", "_sum_of_squares", "highest", "lowest")
 
@@ -59,7 +96,7 @@ class _Sums:
 
     def add(self, former: float, latest: float) -> None:
         if self._seen == 0:
-            self._first = latest  # sums of small numbers keep their digits
+            self._first = latest  # subtracting it avoids cancellation
         from_first = latest - self._first
         self._seen += 1
         self._sum += from_first
@@ -68,6 +105,11 @@ class _Sums:
             change = latest - former
             self._pairs += 1
             self._squared += change * change
+
+    @property
+    def rms_change(self) -> float:
+        """RMS difference from the period before [rad]; infinite if there was none to compare with."""
+        return sqrt(self._squared / self._pairs) if self._pairs else inf
 
     @property
     def relative(self) -> float:

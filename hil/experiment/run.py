@@ -1,4 +1,4 @@
-"""The experiment on the bus: open, check, arm, stream, and torque off however it ends."""
+"""The experiment on the bus: open, check, switch torque on, stream, and switch torque off however it ends."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -13,11 +13,13 @@ from hil.drivers.latency import command_to_set, latency_timer
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
+from hil.estimator.chain.rollout import ChainArms
+from hil.experiment.guard import MOST_OUTSIDE_RAD
 from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
-from hil.plan.chain_plan import plan_of
+from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
@@ -27,19 +29,19 @@ from hil.runs.timing import lateness_histogram
 from hil.setup.servo_session import has_moved, servo_session
 
 _LAST_SAMPLES = 100
-"""How many samples an error carries with it."""
+"""Number of samples attached to an exception."""
 
 _MOST_UNSEEN = 20
-"""How much progress may wait for whoever watches; about a second."""
+"""Number of progress reports that may be queued for the observer; about one second."""
 
 _PATIENCE_S = 0.2
-"""How long the end of a run waits for whoever watches."""
+"""Time for which the end of a run waits for the observer [s]."""
 
 
 _MOVED = 2.0
 
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
-"""How long the next run waits for an arm to come to rest, how often it looks, and how little may change in between."""
+"""Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
 
 
 def run_experiment(
@@ -48,15 +50,24 @@ def run_experiment(
     shown_path: Path,
     watch: Watch,
     plan: Plan | None = None,
-    arms: Ensemble | None = None,
+    arms: Ensemble | ChainArms | None = None,
 ) -> str:
-    """Run the configured experiment and record it in `run`. Returns a sentence on the final torque state.
+    """Run the configured experiment and record it in `run`. Returns a sentence about the final torque state.
 
-    shown_path: the configuration's path as the user wrote it. plan: in place of the one made from `config`. arms: prior
-    knowledge of the arm, by default from the configuration.
-    Raises HilError and DriverError; once torque was on, the exception carries a note that says whether it is off.
+    Args:
+        config: configuration of the arm.
+        run: folder of the recording.
+        shown_path: the configuration's path as the user wrote it.
+        watch: called with progress reports.
+        plan: replaces the plan made from `config`.
+        arms: prior knowledge of the arm; by default, from the configuration.
+
+    Raises:
+        HilError, DriverError: if torque was switched on, the exception carries a note that says whether it is off.
     """
     plan = plan_of(config) if plan is None else plan
+    if config.is_chain and not config.is_fake:
+        check_clearance(config, plan)
     fakes.register_for(config.url)
     with StopRequest() as stop, EventLog(run) as log, servo_session(config, run.path) as bus:
         clock = bus.port.clock
@@ -64,6 +75,8 @@ def run_experiment(
         def note(what: str) -> None:
             log.note(clock.now(), what)
 
+        if config.is_chain and not config.is_fake:
+            note("experiments on real arms in space are not tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
         if has_moved():
@@ -71,19 +84,19 @@ def run_experiment(
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
-            # Signals are only noted from before torque comes on until the servos are as they were.
+            # Signals are deferred from before torque comes on until the servos' settings are restored.
             with stop.only_noted(), servo_limits(config, bus, note):
                 _play(config, plan, bus, recorder, stop, shown, note, arms)
             torque = str(bus.torque_off_report)
             note(torque)
-            with suppress(RunFolderError):  # the recording holds all of it
+            with suppress(RunFolderError):  # the same information is in the recording
                 write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
         _check_still_wanted(stop, torque)
     return torque
 
 
 def _check_still_wanted(stop: StopRequest, torque: str) -> None:
-    """Honour a request that came while torque was being cut: the recording stays, but nothing follows."""
+    """Raise a stop request that arrived while torque was being cut: the recording stays, but nothing follows."""
     try:
         stop.check()
     except StopRequested as request:
@@ -99,12 +112,12 @@ def _play(
     stop: StopRequest,
     watch: Watch,
     note: Note,
-    arms: Ensemble | None,
+    arms: Ensemble | ChainArms | None,
 ) -> None:
-    """Torque on, stream, torque off; whatever stops it is logged as an event."""
+    """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event."""
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     try:
-        # In this order: what _on_time does takes longer than the watchdog waits.
+        # In this order, because _on_time takes longer than the watchdog's timeout.
         with _on_time(bus.port.clock, note), bus.torque(config.safety.watchdog):
             note(f"torque on, watchdog {config.safety.watchdog:g} s")
             stream.run()
@@ -119,7 +132,7 @@ def _play(
 
 
 def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> None:
-    """Ask the servos for the cause of an alert: now that torque is off, since a silent one takes long to answer."""
+    """Ask the servos for the cause of an alert; only once torque is off, because a silent servo delays the answer."""
     stop = error if isinstance(error, SafetyStop) else error.__context__
     if state is None or not isinstance(stop, SafetyStop) or stop.cause is not Cause.ALERT:
         return
@@ -133,7 +146,7 @@ def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> 
 
 @contextmanager
 def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
-    """In real time `watch` is called by a thread of its own, so that a stopped terminal cannot hold up the stream."""
+    """In real time, call `watch` from a separate thread, so that a blocked terminal cannot delay the stream."""
     if not isinstance(clock, WallClock):
         yield watch
         return
@@ -146,7 +159,7 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
 
 @contextmanager
 def _on_time(clock: Clock, note: Note) -> Iterator[None]:
-    """Real-time scheduling and the like while the stream runs on the wall clock; a virtual one is never late."""
+    """Apply real-time settings while the stream runs on the wall clock; a virtual clock needs none."""
     if not isinstance(clock, WallClock):
         yield
         return
@@ -156,7 +169,7 @@ def _on_time(clock: Clock, note: Note) -> Iterator[None]:
 
 
 def _check_rate(config: Config, bus: ServoBus) -> None:
-    """Refuse rates that the wire or the adapter rules out from the outset; `hil check` measures what is possible."""
+    """Refuse a rate that wire time or adapter latency rules out; `hil check` measures what is possible."""
     rate, wire = config.experiment.rate, bus.prepared.longest
     if wire > 1 / rate:
         raise WrongSetting(
@@ -170,8 +183,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
-            "at "
-            f"most {1 / slowest:.0f} Hz, and this user may not change it. Type: {command_to_set(file)}"
+            f"at most {1 / slowest:.0f} Hz, and this user may not change it. Type: {command_to_set(file)}"
         )
     if bus.port.latency_measured:
         raise WrongSetting(
@@ -182,7 +194,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 
 
 def _wait_for_rest(bus: ServoBus) -> None:
-    """A run that ended early leaves the arm swinging: wait for it, at most _LONGEST_REST_S."""
+    """Wait for an arm that still swings after an earlier run, for at most _LONGEST_REST_S."""
     clock = bus.port.clock
     former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S
     while clock.now() < end:
@@ -194,11 +206,12 @@ def _wait_for_rest(bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """Check that the arm hangs where the configuration says; otherwise zero_ticks, direction or the arm itself is not
-    as described.
+    """Check that the arm is in its rest pose; otherwise zero_ticks, direction or the arm itself is not as described.
 
-    Where the run before it has passed that check, friction may hold the arm twice as far away.
+    After a run that passed this check, friction may hold the arm at up to twice the tolerance.
     """
+    if has_moved():
+        _check_inside(config, bus)
     tolerance = config.arm.rest_tolerance * (_MOVED if has_moved() else 1.0)
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
@@ -207,6 +220,17 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
                 f"{joint} is at {position:.3f} rad; arm.rest_pose is {rest:.3f} and arm.rest_tolerance allows "
                 f"{tolerance:g}. Move it there by hand: friction may hold it away from rest. Only "
                 f"if it is in its rest pose now, set zero_ticks = {ticks}."
+            )
+
+
+def _check_inside(config: Config, bus: ServoBus) -> None:
+    """Refuse an arm that the run before left far beyond its limits: an upright one that fell when torque was cut."""
+    for joint, position, limited in zip(bus.joints, bus.read_positions(), config.joints, strict=True):
+        low, high = limited.position_limit
+        if not low - MOST_OUTSIDE_RAD <= position <= high + MOST_OUTSIDE_RAD:
+            raise ExperimentError(
+                f"{joint} is at {position:.3f} rad, where the stop of the run before left it: its position limit is "
+                f"[{low:g}, {high:g}]. Move it back to arm.rest_pose by hand, then start again."
             )
 
 

@@ -1,6 +1,6 @@
-"""The servos' own limits: read, compared with the configuration, lowered, read back; the session puts them back.
+"""The servos' own current and PWM limits: read, compared with the configuration, lowered, and read back.
 
-Should this program ever command nonsense, a servo refuses every goal beyond its own Current Limit.
+With its own Current Limit lowered, a servo refuses larger goals even if this program fails. The session restores it.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,9 +16,9 @@ from hil.setup.current_limit import current_limit_ticks
 
 @contextmanager
 def servo_limits(config: Config, bus: ServoBus, note: Callable[[str], None]) -> Iterator[None]:
-    """Inside the block the servos take no more than `current_limit`; enter it with torque off.
+    """Lower the servos' Current Limit to `current_limit`; enter with torque off.
 
-    Raises WrongSetting where a servo takes less than the configuration wants, which would silently refuse goals.
+    Raises WrongSetting if a servo allows less than the configuration needs, which would silently refuse goals.
     """
     for joint, described in zip(bus.joints, config.joints, strict=True):
         if joint.mode is Mode.CURRENT:
@@ -35,7 +35,7 @@ def _lower(config: Config, bus: ServoBus, joint: Joint, limit: float, note: Call
         if present < needed:
             raise WrongSetting(
                 f"{servo.title}: its Current Limit is {present}, but current_limit = {limit:g} A needs {needed}; "
-                "larger goals would be silently refused. Set current_limit to "
+                "the servo would silently refuse larger goals. Set current_limit to "
                 f"{present * len(servos) * abs(joint.drive_unit(0.0)):.3g} or less, or "
                 "raise the register with DYNAMIXEL Wizard 2.0."
             )
@@ -45,7 +45,7 @@ def _lower(config: Config, bus: ServoBus, joint: Joint, limit: float, note: Call
 
 
 def _check_pwm_limit(bus: ServoBus, joint: Joint, limit: float) -> None:
-    """PWM Limit bounds the voltage in current mode too: it must drive `limit` [A] through motors at rest."""
+    """Check PWM Limit, which bounds the voltage in current mode too: it must allow `limit` [A] in a motor at rest."""
     servos = bus.servos(joint)
     needed = limit / len(servos) * joint.servo.resistance
     for servo in servos:
@@ -55,6 +55,5 @@ def _check_pwm_limit(bus: ServoBus, joint: Joint, limit: float) -> None:
             raise WrongSetting(
                 f"{servo.title}: its PWM Limit is {pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply; "
                 f"current_limit = {limit:g} A needs {needed:.1f} V, so the motor could not reach the commanded "
-                "current. "
-                "Raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
+                "current. Raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
             )

@@ -1,8 +1,8 @@
-"""Servo status besides motion: is torque on, the watchdog armed, the goal accepted, the reply current?
+"""Checks of a servo's status registers: is torque on, the watchdog armed, the goal accepted, the reply current?
 
-None of this shows in a reply's position and velocity, and it shows in the current only if the servo has a motor current
-sensor. The registers are read back a few times in 0.1 s (hil.drivers.bus), so each of these faults is detected within
-0.1 s.
+None of this is visible in position and velocity, and it is visible in the current only if the servo has a motor current
+sensor. The registers are read back several times per 0.1 s (hil.drivers.bus), so each of these faults is detected
+within 0.1 s.
 """
 
 from hil.config.schema import Config
@@ -15,18 +15,18 @@ from hil.errors import Cause
 _TRIPPED = 255
 _WRAP_S = 32.768
 _CLOCK_TOLERANCE_S = 0.004
-"""By how much a servo's clock, which counts milliseconds, may be behind what is expected of it."""
+"""Largest lag of a servo's clock, which counts milliseconds, behind its expected value [s]."""
 
-_REBOOTED_S = 1.0  # ahead by more than any delay of a request
+_REBOOTED_S = 1.0  # larger than any delay of a request
 _CLOCK_DRIFT = 0.01
 _LEARNT_READINGS = 3
 _STALE_READINGS = 2
 _GOALS_MISSED = 2
-"""Times in a row that a goal may not have arrived: one packet may get lost."""
+"""Consecutive mismatches before a goal counts as lost, because a single packet may get lost."""
 
 
 class StatusCheck:
-    """Compares reported with sent values. `look` returns what is wrong, or None."""
+    """Compares reported values with the commanded ones. `look` returns the fault, or None."""
 
     def __init__(self, config: Config) -> None:
         self._armed = round(config.safety.watchdog / WATCHDOG_UNIT)
@@ -34,11 +34,19 @@ class StatusCheck:
         self._half_tick = [0.5 * abs(joint.joint.drive_unit(12.0)) for joint in config.joints]
         self._unit = [joint.drive_mode.goal_unit for joint in config.joints]
         self._missed = [0] * len(config.joints)
-        # Per joint: the least seen of servo's less computer's clock [s], when that was, readings, stale ones in a row.
+        # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
+    @property
+    def is_in_doubt(self) -> bool:
+        """Whether the latest status was wrong in a way that one lost packet could explain: read it again at once."""
+        return any(self._missed) or any(stale for *_, stale in self._clock)
+
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
-        """sent: the joint's goal in the same exchange [A or V]; now: its time [s]. Returns the fault as text."""
+        """Check a status reading; return the fault's cause and text, or None.
+
+        sent: the joint's goal in the same exchange [A or V]. now: time of the exchange [s].
+        """
         if status.hardware_error:
             error = describe_error(HardwareError(status.hardware_error))
             return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle it."
@@ -74,15 +82,16 @@ class StatusCheck:
             return None
         unit = self._unit[joint]
         return Cause.GOALS_LOST, (
-            f"does not take its goals: it holds {status.goal:.3f} {unit} where {sent:.3f} {unit} was sent, and missed "
+            f"does not take its goals: it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent, and it missed "
             "an earlier one too. Goals are lost on the way, or the servo refuses them: check its cable and limits."
         )
 
     def look_at_clock(self, joint: int, tick: float, now: float) -> tuple[Cause, str] | None:
-        """tick: the servo's own clock [s]; now: the computer's, before it asked [s].
+        """Detect old replies and reboots by the servo's clock; return the fault's cause and text, or None.
 
-        A servo's clock may be ahead of what is expected, since the request was late, but never behind: then the reply
-        is an old one. The expected lead is the smallest observed one, which may drift.
+        tick: the servo's clock [s]. now: the computer's clock before the request [s]. Because a request may be late, a
+        servo's clock may be ahead of its expected value, but it is never behind unless the reply is old. The expected
+        value follows from the smallest lead observed so far, which may drift.
         """
         behind, seen_at, readings, stale = self._clock[joint]
         offset = (tick - now) % _WRAP_S

@@ -1,12 +1,12 @@
-"""Ctrl-C, SIGTERM and SIGHUP as a request that is honoured between two samples and never lost.
+"""Ctrl-C, SIGTERM and SIGHUP as requests that are handled between two samples and never lost.
 
-A signal that raised wherever the program happens to be could land inside the path that cuts torque. So while a servo
-may have torque the handlers only note the request; the stream checks it between two samples. A first signal brakes the
-arm, then cuts torque; a second one cuts at once; more change nothing. While no servo has torque a signal ends the
-program at once.
+An exception raised by a signal handler could interrupt the code that cuts torque. Therefore, while a servo may have
+torque, the handlers only record the request, and the stream checks for it between two samples. The first signal brakes
+the arm, then cuts torque; a second one cuts torque at once; further ones have no effect. While no servo has torque, a
+signal ends the program at once.
 
-A request holds until the outermost block is left: what came while torque was being cut stops the steps of a pilot that
-would have followed, and whatever swallowed the exception, no further experiment starts.
+A request stays in effect until the outermost block is left: a request made while torque is being cut also cancels the
+remaining steps of a pilot. Even if the exception is swallowed, no further experiment starts.
 """
 
 import signal
@@ -22,10 +22,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
-    """Context manager that catches the signals; `check` raises StopRequested after one came.
+    """Context manager that catches the signals; `check` raises StopRequested after a signal.
 
-    A block inside another one of the same thread shares the outer one's request. In a thread that is not the main one,
-    which gets no signals, there is never a request.
+    A block inside another one in the same thread shares the outer one's request. Threads other than the main one
+    receive no signals, so there is never a request.
     """
 
     _outermost: ClassVar["StopRequest | None"] = None
@@ -59,7 +59,7 @@ class StopRequest:
 
     @contextmanager
     def only_noted(self) -> Iterator[None]:
-        """Inside the block, where servos may have torque, a signal raises nothing by itself."""
+        """While the block runs and servos may have torque, signals are recorded but raise no exception."""
         self.check()
         self._armed += 1
         try:
@@ -73,8 +73,18 @@ class StopRequest:
 
     @property
     def insisted(self) -> bool:
-        """Whether a second signal came: then braking ends."""
+        """Whether a second signal arrived, which ends braking."""
         return self._count > 1
+
+    def check_again(self, asked: int) -> None:
+        """Raise StopRequested when more than `asked` signals have come."""
+        if self._count > asked:
+            raise StopRequested(self._said())
+
+    @property
+    def count(self) -> int:
+        """How many signals came."""
+        return self._count
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1

@@ -1,8 +1,8 @@
-"""The real-time loop: at each tick one exchange, a guard check and a recorded sample.
+"""The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-Played in order: rest; for each multisine a ramp in, periods until two successive ones match, the periods to
-be used, a ramp out; then no current until the arm is at rest. Where a stop allows it, the arm is braked before `run`
-raises; torque is cut by whoever switched it on.
+The sequence is: rest; for each multisine a ramp in, periods until two successive ones match, the remaining periods to
+be recorded, and a ramp out; then no current until the arm is at rest. If the cause of a stop allows it, the arm is
+braked before `run` raises; the caller that switched torque on switches it off.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,11 +15,15 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
+from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import DidNotMove, ExperimentError, NotSettled
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
+from hil.estimator.chain.rollout import ChainArms
+from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
+from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
@@ -27,13 +31,16 @@ from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
 from hil.plan.stabiliser import Stabiliser
 from hil.runs.recording import Phase, Recorder, missed
+from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
+_AGAIN_S = 2.2 * MOST_PATIENCE_S
+"""From one sample to the next there is time for two exchanges, however long both take."""
 
 
 class Progress(NamedTuple):
-    """Progress for the user: samples taken, the number expected, the phase, and the latest state."""
+    """Progress for the user: samples taken, the number expected, phase, role of the multisine, and the latest state."""
 
     taken: int
     expected: int
@@ -49,9 +56,9 @@ Note = Callable[[str], None]
 class Stream:
     """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
 
-    watch: called about 20 times a second with the progress. note: called with each event worth keeping. Neither may
-    block. arms: prior knowledge of the arm, by default from the configuration. Create it before torque is on: it
-    precomputes everything it can.
+    watch: called with the progress about 20 times a second. note: called with each event to be logged. Neither may
+    block. arms: prior knowledge of the arm; by default, from the configuration. Create the stream before torque is on:
+    it precomputes as much as possible.
     """
 
     def __init__(
@@ -63,7 +70,7 @@ class Stream:
         stop: StopRequest,
         watch: Watch,
         note: Note,
-        arms: Ensemble | None = None,
+        arms: Ensemble | ChainArms | None = None,
     ) -> None:
         self._bus = bus
         self._clock = bus.port.clock
@@ -71,15 +78,22 @@ class Stream:
         self._config = config
         self._safety = config.safety
         planned = _largest_goals(plan)
-        self._guard = Guard(config, planned)
-        # Of a chain there is no such model yet: position, velocity, current and status are what is looked at.
-        self._model = None if config.is_chain else ModelWatch(config, planned, arms)
+        self._left_by_a_run = has_moved()
+        self._guard = Guard(config, planned, left_by_a_run=self._left_by_a_run)
+        self._model: ModelWatch | ChainWatch = (
+            ModelWatch(config, planned, arms)
+            if not isinstance(arms, ChainArms) and not config.is_chain
+            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None)
+        )
+        self._lowering = Lowering(config, plan) if config.is_chain else None
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
         self._watch = watch
         self._note = note
         self._interval = 1 / plan.rate
+        # A lost reply is asked for again where the next sample is far away.
+        self._asks_again = self._interval > _AGAIN_S
         self._ticks = FixedRate(bus.port.clock, plan.rate)
         self._index = 0
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
@@ -89,7 +103,7 @@ class Stream:
         self._sent_at: float | None = None
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
-        self._repetition = Repetition(longest, len(bus.joints))
+        self._repetition = Repetition(longest, len(bus.joints), self._interval)
 
     @property
     def state(self) -> State | None:
@@ -97,11 +111,13 @@ class Stream:
         return self._state
 
     def run(self) -> None:
-        """Play the whole plan; raises ExperimentError, SafetyStop, StopRequested, PortLost."""
+        """Play the whole plan. Raises ExperimentError, SafetyStop, StopRequested, PortLost."""
         try:
             self._play_all()
         except ExperimentError as error:
-            if may_brake(self._config, error):
+            if self._lowering is not None and may_lower(self._config, error):
+                self._lower(self._lowering, error)
+            elif may_brake(self._config, error):
                 self._brake()
             raise
 
@@ -110,6 +126,7 @@ class Stream:
         for number, segment in enumerate(self._plan.segments):
             self._segment = number
             self._note(f"{segment.role}: ramp in")
+            self._repetition.forget()
             self._play(self._ramps[number][0], Phase.RAMP_IN)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
@@ -120,11 +137,21 @@ class Stream:
         self._note("rest")
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
+        window = rest_window(self._plan.rate)
+        # The stabiliser may have to bring it back first from where the run before was stopped.
+        for _ in range(0, self._plan.end_samples if self._left_by_a_run else 0, window):
+            if not moving:
+                break
+            moving = self._moving(self._play(self._silence(window), Phase.REST))
         if moving:
-            raise ExperimentError(f"The arm is moving before the start: {moving}. Let it hang still, then start again.")
+            raise ExperimentError(
+                f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
+            )
 
     def _play_periods(self, segment: Segment) -> None:
-        """Play periods until one matches its predecessor, which is then the first settled one; then the rest."""
+        """Play periods until one matches its predecessor; it is the first settled one. Then play the other periods to
+        record.
+        """
         samples = len(segment.period_current)
         repetition = self._repetition
         self._play_period(segment, 0)
@@ -144,12 +171,11 @@ class Stream:
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
             f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. Check for play, a "
-            "dragging cable or a slipping joint; or raise "
-            "max_settling_periods."
+            "dragging cable or a slipping joint; or raise max_settling_periods."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
-        """Detect a joint held by friction or an obstacle after one period, before minutes are wasted."""
+        """Detect a joint held by friction or an obstacle after one period, before more time is wasted."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 raise DidNotMove(
@@ -158,12 +184,19 @@ class Stream:
                 )
 
     def _play_period(self, segment: Segment, period: int) -> None:
-        """Play one period; each sample is compared with the same of the period before as it comes."""
+        """Play one period and compare each sample with the one in the period before."""
         repetition = self._repetition
         repetition.begin(len(segment.period_current))
         for index, row in enumerate(segment.period_current):
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)
+            if (joint := repetition.unlike) is not None:
+                raise SafetyStop(
+                    f"{self._bus.joints[joint].title} does not repeat its motion: under the same torque it is at "
+                    f"{state.position[joint]:.3f} rad, far from where it was one period ago. Something pushes or holds "
+                    "it, it slips, or its encoder has failed.",
+                    Cause.UNLIKE_BEFORE,
+                )
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")
@@ -171,7 +204,7 @@ class Stream:
         for _ in range(0, self._plan.end_samples, window):
             self._play(self._silence(window), Phase.COMING_TO_REST)
             speeds = np.abs(self._recorder.samples["velocity"][-window:])
-            # Replies that are missing say nothing; a joint of which none came is not known to be at rest.
+            # Missing replies are ignored; a joint without any reply does not count as being at rest.
             fastest = np.fmax.reduce(speeds, axis=0)
             if (fastest < self._safety.rest_velocity).all():
                 self._note("at rest")
@@ -180,21 +213,24 @@ class Stream:
         self._note(f"still moving at {told} rad/s after {self._safety.rest_time:g} s without current")
 
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
-        """Send goal currents, (samples, joints) [A], one row a tick; the last state."""
+        """Send goal currents (samples, joints) [A], one row per tick; return the last state."""
         state = missed(self._goal, self._clock.now())
-        for row in goals:  # row by row: all at once would hold up the loop where a period is long
+        for row in goals:  # row by row: converting a long period at once would delay the loop
             state = self._sample(row.tolist(), phase, period)
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
         deadline, now, late = self._ticks.wait()
         if late:
-            # Skipped, never caught up in a burst: the servos keep the former goal.
+            # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
             state = missed(self._goal, now)
         else:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
             self._goal = self._guard.clamp(wanted)
             state = self._bus.exchange(self._goal)
+            if self._asks_again and any(state.missing):
+                self._guard.look(state)
+                state = self._bus.exchange(self._goal, hurried=True)
             self._sent_at = state.time_before_write
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
@@ -203,7 +239,7 @@ class Stream:
         else:
             self._look(state, phase)
         self._stop.check()
-        # Heat and supply come with one sample in many: that one is always shown.
+        # Temperature and voltage come with only a few samples, which are always shown.
         if self._index % self._watch_every == 0 or state.slow is not None:
             role = self._plan.segments[self._segment].role
             self._watch(Progress(self._index, self._plan.expected, phase, role, state))
@@ -212,13 +248,14 @@ class Stream:
     def _look(self, state: State, phase: Phase) -> None:
         former, self._state = self._state, state
         self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
-        if self._model is not None:
-            self._model.look(state)
+        if state.status is not None and self._guard.wants_status:
+            self._bus.read_status_next()
+        self._model.look(state)
         if phase is Phase.REST and self._stabiliser is None:
             self._guard.look_at_rest(state)
 
     def _brake(self) -> None:
-        """Brake until the arm is slow, sensing fails, time is up, or a second signal comes. Never raises."""
+        """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""
         brake = Brake(self._config)
         state = self._state
         with suppress(DriverError):
@@ -231,6 +268,41 @@ class Stream:
                     return
                 state = self._bus.exchange(goals)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
+
+    def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
+        """Brake and lower the arm until it lies, anything is wrong, or a second signal comes. Never raises."""
+        state = self._state
+        if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
+            return
+        self._note(f"lowering the arm after: {error}")
+        try:
+            state = self._way_down(lowering, state)
+        except (SafetyStop, StopRequested, DriverError) as ended:
+            self._told(error, f"Torque was cut while the arm was being lowered, so it fell from there: {ended}")
+            return
+        done = "was lowered to its rest pose" if lowering.lies(state) else "was lowered, but not to its rest pose"
+        self._told(error, f"The arm {done}.")
+
+    def _way_down(self, lowering: Lowering, state: State) -> State:
+        """The last state; raises SafetyStop, StopRequested, DriverError."""
+        asked = max(1, self._stop.count)
+        for index in range(lowering.begin(state, self._goal)):
+            deadline, now, late = self._ticks.wait()
+            self._stop.check_again(asked)
+            if late:
+                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
+                lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
+                continue
+            self._goal = lowering.goals(index, state)
+            former, state = state.time_before_write, self._bus.exchange(self._goal)
+            self._sent_at = state.time_before_write
+            self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
+            lowering.look(index, state, state.time_before_write - former)
+        return state
+
+    def _told(self, error: ExperimentError, what: str) -> None:
+        error.add_note(what)
+        self._note(what)
 
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))
@@ -245,6 +317,5 @@ class Stream:
 
 
 def _largest_goals(plan: Plan) -> list[float]:
-    """Of each joint [A, or V under PWM]; the guard rejects values that are not numbers."""
-    peaks = [np.nan_to_num(np.abs(segment.period_current)).max(axis=0) for segment in plan.segments]
-    return [float(peak) for peak in np.max(peaks, axis=0)]
+    """Largest goal of each joint [A, or V under PWM]; NaN counts as 0 here, since the guard rejects it."""
+    return [float(peak) for peak in np.max([segment.peak_goal for segment in plan.segments], axis=0)]

@@ -1,1 +1,1 @@
-"""An identified arm and its recording in the formats of other tools. One format per module."""
+"""Export of an identified arm and its recording to the formats of other tools, one module per format."""

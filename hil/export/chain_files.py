@@ -1,7 +1,7 @@
-"""URDF and MJCF of an identified arm in space.
+"""URDF and MJCF of an identified spatial arm.
 
-The URDF is the one it was identified with: names, frames, limits and meshes stay, inertias, damping and friction of the
-arm's joints change. The MJCF is written from its geometry.
+The URDF is the one used for the identification: names, frames, limits and meshes stay; inertias, damping and friction
+of the arm's joints are replaced. The MJCF is written from its geometry.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ from hil.export.xml_text import comment, numbers, to_text
 
 
 def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write `path`; what URDF cannot represent. Raises ExportError."""
+    """Write the URDF `path`; return what URDF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     if is_mjcf(found.path):
         return _export_own_urdf(found, model, path)
@@ -74,7 +74,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
 
 
 def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
-    """Write `path`; what MJCF cannot represent. Raises ExportError."""
+    """Write the MJCF `path`; return what MJCF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
     left = ["the URDF's meshes, effort limits and fixed frames", *found.left_out]
@@ -105,11 +105,10 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
 
 
 def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: list[str]) -> None:
-    """At the head of the file: where it is from, what was identified and what was kept."""
+    """Add comments at the top of the file: its origin, and what was identified or kept."""
     words = [
         f"Inertias, damping and friction identified by hil {__version__}; everything else is from {found.path.name}.",
-        "Of the many dynamically equivalent sets of link inertias, the one closest to that file's; only these "
-        "combinations were identified:",
+        "Link inertias: the dynamically equivalent set closest to that file. Only these combinations were identified:",
         *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
         *(f"Not representable in this format: {sentence}" for sentence in left),
     ]
@@ -138,7 +137,7 @@ def _roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """w, x, y, z."""
+    """Convert a rotation matrix (3, 3) to a quaternion w, x, y, z (4,)."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()

@@ -1,4 +1,4 @@
-"""The links of an identified arm in space: physical ones that move as identified, nearest to those of its URDF."""
+"""The links of an identified spatial arm: physically consistent, with the identified dynamics, closest to the URDF."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,30 +14,30 @@ from hil.estimator.chain.geometry import Chain
 from hil.estimator.chain.physical_links import nearest_links
 from hil.export.source import Source
 
-FAR = 3.0  # standard errors that a physical arm may be from the identified parameters without a word
+FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added
 _SAID = ("viscous", "coulomb", "armature", "torque_scale", "moment", "inertia", "mass")
 
 
 @dataclass(frozen=True)
 class ChainLinks:
-    """An arm to be written: its description, and for each joint the link's body and the rotor's inertia [kg m^2]."""
+    """An arm to be exported: its description and, per joint, the link's body and the rotor's inertia [kg m^2]."""
 
     path: Path
     arm: ArmDescription
     bodies: tuple[Body, ...]
     armature: tuple[float, ...]
     left_out: tuple[str, ...]
-    """What no description of a robot has a place for, in words."""
+    """What a robot description cannot represent, one sentence each."""
 
 
 def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
-    """From a run folder, which holds the URDF; raises ExportError."""
+    """Compute the links from a run folder, which holds the URDF. Raises ExportError."""
     assert source.result.chain is not None
     path = source.run / source.result.chain.urdf
     try:
         arm = read_arm(path, [joint.name for joint in model.joints])
     except ArmFileError as error:
-        raise ExportError(f"The URDF that the run was made with is needed: {error}.") from error
+        raise ExportError(f"The URDF used for the run is needed: {error}.") from error
     geometry = model.geometry
     base = BaseParameters.of(Chain(geometry.rotation, geometry.translation, geometry.axis, geometry.gravity))
     value = np.array([model.values[name] for name in base.names])
@@ -48,8 +48,7 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     if found.misfit > FAR:
         said.append(
             "the identified values exactly: no physically consistent links have them; the nearest are "
-            f"{found.misfit:.1f} "
-            "standard errors away"
+            f"{found.misfit:.1f} standard errors away"
         )
     bodies = tuple(_body(row) for row in found.links)
     return ChainLinks(path, arm, bodies, tuple(found.armature.tolist()), (*said, *_left_out(model)))
@@ -60,7 +59,7 @@ def _left_out(model: ChainArmModel) -> list[str]:
 
 
 def _body(link: np.ndarray) -> Body:
-    """Mass, centre and inertia about it, of a link's ten parameters."""
+    """Convert a link's ten parameters to mass, centre of mass and inertia about it."""
     mass, centre = float(link[0]), link[1:4] / link[0]
     about = np.zeros((3, 3))
     about[np.triu_indices(3)] = link[4:]

@@ -1,4 +1,4 @@
-"""The recording as plain columns, one number a row, for formats that know no arrays within a row."""
+"""The recording as scalar columns, for formats that do not support arrays within a row."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ COLUMN_UNITS = {
 
 
 def columns(source: Source) -> dict[str, NDArray[np.generic]]:
-    """Columns (samples,) by name; what each joint has is numbered from the base: position_1, position_2."""
+    """Columns (samples,) by name; columns that exist per joint are numbered from the base: position_1, position_2."""
     samples = source.samples
     found: dict[str, NDArray[np.generic]] = {}
     for name in samples.dtype.names or ():

@@ -1,4 +1,4 @@
-"""The formats by name: which function writes them, and what the file is called unless told."""
+"""The export formats by name: the function that writes each, and its default file name."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +18,10 @@ Exporter = Callable[[Source, Path], list[str]]
 
 @dataclass(frozen=True)
 class Format:
-    """One format. write: writes a file and returns what it cannot represent. file_name: within the run folder."""
+    """One format.
+
+    write: writes a file and returns what it cannot represent. file_name: default name in the run folder.
+    """
 
     write: Exporter
     file_name: str
@@ -48,7 +51,7 @@ class Written:
 
 
 def export(run: Path, name: str, out: Path | None = None, link_length: float | None = None) -> Written:
-    """Write the run in one format, into the run folder unless told; raises ResultError, ExportError, RunFolderError."""
+    """Write the run in one format, by default into the run folder. Raises ResultError, ExportError, RunFolderError."""
     if name not in FORMATS:
         raise ExportError(f"{name!r} is not a format of hil export. Possible: {', '.join(FORMATS)}.")
     chosen = FORMATS[name]

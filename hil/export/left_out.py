@@ -1,10 +1,10 @@
-"""What a robot description cannot represent, in words: said on the terminal and in the file, never dropped silently."""
+"""What a robot description cannot represent: reported in the terminal and in the file, never dropped silently."""
 
 from hil.arm_model import ArmModel
 from hil.estimator.models.terms import term_of
 
 _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
-"""Every robot description has a place for these, or `torque_constants` says them."""
+"""Terms that every robot description can represent or that `torque_constants` reports."""
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:

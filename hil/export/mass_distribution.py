@@ -1,15 +1,15 @@
-"""Masses, centres and inertias that have exactly the identified base parameters.
+"""Masses, centres of mass and inertias that have exactly the identified base parameters.
 
-Torque and position determine sums such as m2 l1 c2, never one mass. URDF and MJCF want masses, so one distribution is
-chosen among all that move alike, by this rule (m mass, c centre, J inertia about the centre, l length):
+Torque and position determine sums such as m2 l1 c2, never a single mass. URDF and MJCF need masses, so one distribution
+is chosen among all dynamically equivalent ones (m mass, c centre, J inertia about the centre, l length):
 
     l1      = coupling g / gravity_2, which a ruler can check; a horizontal arm needs it from the user
     link 2  first moment m2 c2 = gravity_2 / g = coupling / l1, second moment m2 c2^2 + J2 = inertia_2
     link 1  with the elbow's servo: first moment gravity_1 / g - m2 l1, second moment inertia_1 - m2 l1^2, which holds
             joint 1's rotor too, because a fixed base cannot tell the two apart
 
-Of each second moment 3/4 is m c^2, as in a uniform rod held at its end, and more where a rod would be too heavy for
-inertia_1. Link 1's centre is not put beyond its length; what its moment then leaves is J1. This is possible if
+As in a uniform rod held at its end, m c^2 is 3/4 of each second moment, or more if a rod would be too heavy for
+inertia_1. The centre of link 1 is kept within its length, and the rest of its second moment is J1. This is possible if
 and only if inertia_1 inertia_2 > coupling^2, which all bodies of positive mass obey.
 """
 
@@ -23,12 +23,12 @@ from hil.errors import ExportError
 ROD = 0.75
 """Share of m c^2 in the second moment of a uniform rod about its end."""
 
-_UNKNOWN_LENGTH = 0.1  # m: scale of a pendulum without gravity, whose mass nothing tells
+_UNKNOWN_LENGTH = 0.1  # m, arbitrary length of a pendulum without gravity, whose mass cannot be identified
 
 
 @dataclass(frozen=True)
 class LinkMass:
-    """One link: mass [kg], centre from its joint along it [m], inertia about the centre [kg m^2], length [m]."""
+    """One link: mass [kg], centre of mass along the link from its joint [m], inertia about it [kg m^2], length [m]."""
 
     mass: float
     centre: float
@@ -37,7 +37,7 @@ class LinkMass:
 
 
 def distribute(model: ArmModel, link_length: float | None = None) -> tuple[LinkMass, ...]:
-    """Links from the base outwards; raises ExportError when none of positive mass has these parameters."""
+    """Links from the base outwards. Raises ExportError if no links of positive mass have these parameters."""
     p = model.values
     if len(model.joints) == 1:
         _reject_length(link_length, "an arm with one joint has no elbow")
@@ -62,22 +62,20 @@ def _elbow(model: ArmModel, link_length: float | None) -> tuple[float, float]:
         if link_length is None:
             raise ExportError(
                 "A horizontal arm's parameters do not determine the length of link 1: measure it from joint to joint "
-                "and "
-                "give it with --link-length METRES."
+                "and give it with --link-length METRES."
             )
         return link_length, coupling / link_length
     _reject_length(link_length, "it follows from coupling * gravity / gravity_2")
     if weight == 0 or coupling / weight <= 0:
         raise ExportError(
             f"coupling = {coupling:.4g} kg m^2 and gravity_2 = {weight:.4g} N m: both must have the same sign, since "
-            "their "
-            "ratio times gravity is the length of link 1. Check zero_ticks and direction, and excite joint 2 more."
+            "their ratio times gravity is the length of link 1. Check zero_ticks and direction; excite joint 2 more."
         )
     return coupling * model.gravity / weight, weight / model.gravity
 
 
 def _share_of_rod(p: Mapping[str, float]) -> float:
-    """Share of m2 c2^2 in inertia_2: a rod's, or more where inertia_1 could not carry a rod so heavy."""
+    """Share of m2 c2^2 in inertia_2: that of a rod, or more if such a rod would be too heavy for inertia_1."""
     needed = p["coupling"] ** 2 / (p["inertia_1"] * p["inertia_2"])
     if needed >= 1:
         raise ExportError(
@@ -89,7 +87,9 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
 
 
 def _link(moment: float, about_joint: float, share: float, farthest: float) -> LinkMass:
-    """A link of first moment m c and second moment about its joint J + m c^2, `share` of it m c^2 where it can be."""
+    """A link with first moment m c and second moment J + m c^2 about its joint, with `share` of it in m c^2 if
+    possible.
+    """
     if moment == 0:
         length = farthest if math.isfinite(farthest) else _UNKNOWN_LENGTH
         return LinkMass(about_joint / length**2, 0.0, about_joint, length)

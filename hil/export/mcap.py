@@ -1,4 +1,4 @@
-"""MCAP: one topic per joint, JSON messages with a schema, result.json attached. For Foxglove and PlotJuggler."""
+"""MCAP export, for Foxglove and PlotJuggler: one topic per joint, JSON messages with a schema, result.json attached."""
 
 import json
 import math
@@ -20,7 +20,7 @@ _PER_JOINT = (
 
 
 def export_mcap(source: Source, path: Path) -> list[str]:
-    """Write `path`; messages carry the time of their sample's deadline, counted from the run's start. Needs mcap."""
+    """Write `path`. Each message is stamped with its sample's deadline relative to the start of the run. Needs mcap."""
     try:
         from mcap.writer import CompressionType, Writer
     except ImportError as error:
@@ -58,7 +58,7 @@ def _write(writer: Any, source: Source) -> None:
 
 
 def _number(value: float) -> float | None:
-    """JSON has no NaN: a missing measurement is null."""
+    """Replace NaN by None: JSON has no NaN, so a missing measurement is null."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 

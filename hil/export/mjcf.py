@@ -1,4 +1,4 @@
-"""MJCF: bodies with masses, hinges with armature and friction, actuators commanded in the servo's own unit."""
+"""MJCF export: bodies with masses, hinges with armature and friction, actuators commanded in the servo's own unit."""
 
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -15,7 +15,7 @@ _CARRIED = ("armature", "offset", "lag")
 
 
 def export_mjcf(source: Source, path: Path) -> list[str]:
-    """Write `path`; what MJCF cannot represent. Raises ExportError when no physical masses exist."""
+    """Write `path`; return what MJCF cannot represent. Raises ExportError if no physical masses exist."""
     model = source.model
     if isinstance(model, ChainArmModel):
         return export_chain_mjcf(source, model, path)
@@ -45,12 +45,12 @@ def _add_body(parent: ET.Element, model: ArmModel, index: int, link: LinkMass, a
         type="hinge",
         axis=axis(model),
         range=numbers(*facts.position_limit),
-        # Joint 1's rotor is within the inertia of link 1.
+        # The inertia of link 1 includes the rotor of joint 1.
         armature=numbers(model.values.get(f"armature_{number}", 0.0)),
         damping=numbers(model.values[f"viscous_{number}"]),
         frictionloss=numbers(model.values[f"coulomb_{number}"]),
     )
-    # Only the inertia across the plane was measured; the others are set equal, which every engine takes as physical.
+    # Only the inertia about the joint axis was identified; the others are set equal, which every engine accepts.
     inertia = numbers(*(link.inertia,) * 3)
     ET.SubElement(body, "inertial", pos=numbers(link.centre, 0, 0), mass=numbers(link.mass), diaginertia=inertia)
     seen = {"type": "capsule", "size": "0.01", "fromto": numbers(0, 0, 0, link.length, 0, 0)}
@@ -59,7 +59,9 @@ def _add_body(parent: ET.Element, model: ArmModel, index: int, link: LinkMass, a
 
 
 def _add_actuators(root: ET.Element, model: ArmModel) -> None:
-    """Motors controlled by a goal [A, or V in pwm mode]: gain its torque, bias the offset, filter the drive's lag."""
+    """Add actuators controlled by a goal [A, or V in pwm mode]: gain gives torque, bias the offset, filter the drive's
+    lag.
+    """
     actuators = ET.SubElement(root, "actuator")
     units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)
     comment(actuators, f"control is the servo's goal: {units}")

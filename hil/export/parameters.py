@@ -1,4 +1,4 @@
-"""TOML and JSON of the identified parameters; `hil.load_model` reads both back to the last digit."""
+"""TOML and JSON export of the identified parameters; `hil.load_model` reads both without loss of precision."""
 
 import json
 from pathlib import Path
@@ -23,13 +23,13 @@ _KEPT = (
 
 
 def export_json(source: Source, path: Path) -> list[str]:
-    """Write `path`; JSON holds all of it."""
+    """Write `path`; nothing is left out."""
     write_text(path, strict_json.dumps(_kept(source), indent=2) + "\n")
     return []
 
 
 def export_toml(source: Source, path: Path) -> list[str]:
-    """Write `path`; TOML holds all of it."""
+    """Write `path`; nothing is left out."""
     lines = ["# Base parameters of an identified arm [SI]; equations in docs/model.md. Read it with hil.load_model."]
     _write_table(lines, (), _kept(source))
     write_text(path, "\n".join(lines) + "\n")
@@ -42,10 +42,10 @@ def _kept(source: Source) -> dict[str, Any]:
 
 
 def _write_table(lines: list[str], path: tuple[str, ...], table: dict[str, Any]) -> None:
-    """A table's own values, then its tables, then its arrays of tables."""
+    """Append a table's own values, then its subtables, then its arrays of tables."""
     tables = {key: value for key, value in table.items() if isinstance(value, dict)}
     arrays = {key: value for key, value in table.items() if _is_array_of_tables(value)}
-    # TOML has no null: what a result does not hold is left out.
+    # TOML has no null: empty entries are left out.
     plain = [key for key in table if key not in tables and key not in arrays and table[key] is not None]
     lines += [f"{key} = {_value(table[key])}" for key in plain]
     for key, value in tables.items():

@@ -1,10 +1,10 @@
-"""Arms drawn from the posterior of an identification, for domain randomisation: one file an arm, one table for all.
+"""Arms drawn from the posterior of an identification, for domain randomisation: one file per arm, one table for all.
 
-Drawn are the parameters from their covariance (a normal distribution), and one factor common to all torques, since the
-torque constant is known far less well than anything else: the motion shows the ratio of the joints' constants, so one
-factor remains, as uncertain as that of the best-known joint. What a goal [A or V] gives is scaled with it, so that
-every drawn arm moves alike under the same goals as far as the recording tells. The draws are matched to the covariance:
-their mean and covariance are those stated, not those of a small sample.
+The parameters are drawn from a normal distribution with their covariance, together with one factor common to all
+torques, because the torque constant is known far less accurately than anything else: the motion reveals the ratio of
+the joints' constants, so one factor remains, as uncertain as the best-known joint's. The torque per goal [A or V] is
+scaled with it, so that the drawn arms move alike under the same goals, within the accuracy of the recording. The draws
+are matched so that their mean and covariance are exactly those of the posterior.
 """
 
 from collections.abc import Sequence
@@ -26,17 +26,18 @@ FORMATS = {"mjcf": (export_mjcf, "xml"), "urdf": (export_urdf, "urdf")}
 TABLE = "arms.parquet"
 MOST_SAMPLES = 100_000
 _TRIES = 20
-"""Rounds of draws in place of arms that no masses have."""
+"""Rounds in which draws without physical masses are replaced."""
 
 _IN_TORQUE = ("N m", "kg m^2")
-"""Units that begin so scale with the torque constant."""
+"""Parameters whose units start like this scale with the torque constant."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Arms drawn from one result. values: (samples, names) [SI]; torque_factor: (samples,), 1 in the mean.
+    """Arms drawn from one result.
 
-    redrawn: how many draws had no physical masses and were drawn again.
+    values: parameters (samples, names) [SI]. torque_factor: common torque factor (samples,), with a mean of 1. redrawn:
+    number of draws without physical masses, which were replaced.
     """
 
     models: tuple[ArmModel, ...]
@@ -47,9 +48,9 @@ class Drawn:
 
 
 def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: bool = True) -> Drawn:
-    """Draw arms whose parameters have the result's mean and covariance; raises ExportError.
+    """Draw arms whose parameters have the result's mean and covariance. Raises ExportError.
 
-    torque_constants: False leaves the torque constants where they are.
+    torque_constants: if false, the torque constants are not varied.
     """
     if not 2 <= samples <= MOST_SAMPLES:
         raise ExportError(f"--samples {samples}: must be from 2 to {MOST_SAMPLES}.")
@@ -69,7 +70,7 @@ def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: 
 def export_samples(
     run: Path, formats: Sequence[str], out: Path, samples: int, seed: int = 1, link_length: float | None = None
 ) -> Drawn:
-    """Draw arms and write them into the folder `out`: arm_0000.xml or .urdf and so on, and arms.parquet.
+    """Draw arms and write them to the folder `out`: arm_0000.xml or .urdf and so on, and arms.parquet.
 
     Raises ExportError, ResultError, RunFolderError.
     """
@@ -81,7 +82,7 @@ def export_samples(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunFolderError(f"{out} cannot be made: {error.strerror}.") from error
+        raise RunFolderError(f"{out} cannot be created: {error.strerror}.") from error
     for name in formats:
         if name == "parquet":
             _write_table(source, drawn, out / TABLE)
@@ -93,22 +94,21 @@ def export_samples(
 
 
 def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:
-    """Names, means (names,) and covariance (names, names) [SI]; raises ExportError if the covariance is not finite."""
+    """Names, mean (names,) and covariance (names, names) [SI]. Raises ExportError if the covariance is not finite."""
     result = source.result
     covariance = result.covariance.array()
     unseen = [name for name, row in zip(result.covariance.names, covariance, strict=True) if not np.isfinite(row).all()]
     if unseen:
         raise ExportError(
             f"The recording contains no information about {', '.join(unseen)}, so there is no distribution to draw "
-            "from. "
-            "Identify again with more motion, or export without --samples."
+            "from. Identify again with more motion, or export without --samples."
         )
     mean = np.array([result.quantities[name].value for name in result.covariance.names])
     return result.covariance.names, mean, covariance
 
 
 def _root(covariance: Array) -> Array:
-    """A with A A^T = covariance, which may be singular."""
+    """A matrix A with A A^T = covariance, which may be singular."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     safe = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
@@ -117,7 +117,7 @@ def _root(covariance: Array) -> Array:
 
 
 def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
-    """Standard normal draws (samples, count), with exactly that mean and covariance where there are enough of them."""
+    """Standard normal draws (samples, count), with exactly zero mean and unit covariance if there are enough draws."""
     z = rng.standard_normal((samples, count))
     if samples <= count + 1:
         return z
@@ -130,7 +130,9 @@ def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
 def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    """Draws in which every inertia and friction is positive and masses exist; others are drawn again."""
+    """Replace draws with negative inertia or friction or without physical masses; return the draws and the number
+    replaced.
+    """
     root, redrawn = _root(covariance), 0
     for _ in range(_TRIES):
         bad = [index for index, row in enumerate(values) if not _is_physical(_model(source.model, names, row, 1.0))]
@@ -155,7 +157,7 @@ def _is_physical(model: ArmModel) -> bool:
 
 
 def _torque_spread(model: ArmModel) -> float:
-    """Relative standard deviation of the common factor: the best-known joint's."""
+    """Relative standard deviation of the common torque factor: that of the best-known joint."""
     return min(joint.torque_per_goal_std / joint.torque_per_goal for joint in model.joints)
 
 
@@ -166,7 +168,7 @@ def _model(model: ArmModel, names: tuple[str, ...], row: Array, factor: float) -
 
 
 def _write_table(source: Source, drawn: Drawn, path: Path) -> None:
-    """One row an arm: parameters, the torque factor, and the actuators' figures under the names of Isaac Lab."""
+    """Write one row per arm: parameters, torque factor, and actuator properties under the names of Isaac Lab."""
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -189,7 +191,7 @@ def _write_table(source: Source, drawn: Drawn, path: Path) -> None:
 
 
 def _actuator(drawn: Drawn, joint: int) -> dict[str, tuple[Array, str]]:
-    """armature, friction (dry), viscous_friction, effort_limit and velocity_limit of each drawn arm (samples,)."""
+    """Actuator properties of each drawn arm (samples,) with their units, under the names of Isaac Lab."""
     facts = drawn.models[0].joints[joint - 1]
 
     def column(name: str) -> Array:

@@ -1,4 +1,4 @@
-"""What an exporter works from: one run folder, read once."""
+"""The input of all exporters: one run folder, read once."""
 
 import json
 from dataclasses import dataclass
@@ -11,35 +11,41 @@ from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
 from hil.errors import RunFolderError
-from hil.model_file import model_of, read_settled_result
-from hil.results.result import SettledResult
+from hil.model_file import model_of, read_usable_result
+from hil.results.result import Result
 
 
 @dataclass(frozen=True)
 class Source:
-    """A run with a result. link_length: of link 1 [m], where the parameters do not say it (see `mass_distribution`)."""
+    """A run with a result; link_length: length of link 1 [m] if the parameters do not determine it."""
 
     run: Path
-    result: SettledResult
+    result: Result
     model: ArmModel
     link_length: float | None = None
 
     @classmethod
     def open(cls, run: Path, link_length: float | None = None) -> "Source":
         """Read a run folder; raises ResultError."""
-        result = read_settled_result(run)
+        result = read_usable_result(run)
         return cls(run, result, model_of(result, run), link_length)
 
     @cached_property
     def samples(self) -> NDArray[np.void]:
-        """The recording's rows (hil.runs.recording.sample_type); raises RunFolderError."""
+        """The recording's rows (hil.runs.recording.sample_type). Raises RunFolderError."""
         from hil.runs.recording import load_samples
+        from hil.runs.recording_folder import is_recording_folder
 
+        if is_recording_folder(self.run):
+            raise RunFolderError(
+                f"{self.run} is an estimate from another tool's recording: the samples are in its files. Export the "
+                "arm: urdf, mjcf, toml or json."
+            )
         return load_samples(self.run / "samples.npy", len(self.model.joints))
 
     @cached_property
     def started(self) -> float:
-        """When the run was started [s since 1970]; raises RunFolderError."""
+        """When the run was started [s since 1970]. Raises RunFolderError."""
         path = self.run / "run.json"
         try:
             return datetime.fromisoformat(json.loads(path.read_text(encoding="utf-8"))["started"]).timestamp()
@@ -48,7 +54,7 @@ class Source:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all; raises RunFolderError."""
+    """Write a file completely or not at all. Raises RunFolderError."""
     temporary = path.with_name(path.name + ".partial")
     try:
         temporary.write_text(text, encoding="utf-8")

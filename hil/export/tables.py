@@ -1,4 +1,4 @@
-"""CSV, Parquet and MAT: the recording as columns, the result beside it where the format has a place."""
+"""CSV, Parquet and MAT export: the recording as columns, with the result if the format has a place for it."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ from hil.export.source import Source, write_text
 
 
 def export_csv(source: Source, path: Path) -> list[str]:
-    """Write `path`, numbers to their last digit, missing values as nan."""
+    """Write `path` with all digits; missing values are written as nan."""
     table = columns(source)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -27,7 +27,7 @@ def export_csv(source: Source, path: Path) -> list[str]:
 
 
 def export_parquet(source: Source, path: Path) -> list[str]:
-    """Write `path`, with the unit in each column's metadata and result.json in the file's. Needs pyarrow."""
+    """Write `path` with the unit in each column's metadata and result.json in the file's. Needs pyarrow."""
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -47,7 +47,7 @@ def export_parquet(source: Source, path: Path) -> list[str]:
 
 
 def export_mat(source: Source, path: Path) -> list[str]:
-    """Write `path` for MATLAB and Octave: structs `samples`, `units`, `parameters`, `std`; result.json as text."""
+    """Write `path` for MATLAB and Octave: structs `samples`, `units`, `parameters`, `std`, and result.json as text."""
     from scipy.io import savemat
 
     table = columns(source)

@@ -1,4 +1,4 @@
-"""URDF: links with masses, joints with limits, viscous and Coulomb friction."""
+"""URDF export: links with masses, joints with limits, viscous and Coulomb friction."""
 
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -15,7 +15,7 @@ STANDARD_GRAVITY = 9.81
 
 
 def export_urdf(source: Source, path: Path) -> list[str]:
-    """Write `path`; what URDF cannot represent. Raises ExportError when no physical masses exist."""
+    """Write `path`; return what URDF cannot represent. Raises ExportError if no physical masses exist."""
     model = source.model
     if isinstance(model, ChainArmModel):
         return export_chain_urdf(source, model, path)
@@ -38,7 +38,7 @@ def _add_link(root: ET.Element, number: int, link: LinkMass) -> None:
     inertial = ET.SubElement(element, "inertial")
     ET.SubElement(inertial, "origin", xyz=numbers(link.centre, 0, 0))
     ET.SubElement(inertial, "mass", value=numbers(link.mass))
-    # Only the inertia across the plane was measured; the others are set equal, which every engine takes as physical.
+    # Only the inertia about the joint axis was identified; the others are set equal, which every engine accepts.
     moments = dict.fromkeys(("ixx", "iyy", "izz"), numbers(link.inertia))
     products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
     ET.SubElement(inertial, "inertia", {**moments, **products})

@@ -1,4 +1,4 @@
-"""The little that URDF and MJCF share: numbers that read back exactly, comments, the file's head."""
+"""What URDF and MJCF export share: numbers without loss of precision, comments, and the comments at the top."""
 
 from xml.etree import ElementTree as ET
 
@@ -7,17 +7,17 @@ from hil.arm_model import ArmModel
 
 
 def numbers(*values: float) -> str:
-    """Numbers as an attribute, each to its last digit."""
+    """Format numbers as an attribute, without loss of precision."""
     return " ".join(repr(float(value)) for value in values)
 
 
 def comment(parent: ET.Element, text: str) -> None:
-    """Append a comment; XML allows no double hyphen in one."""
+    """Append a comment; XML comments cannot contain a double hyphen."""
     parent.append(ET.Comment(f" {text.replace('--', '- -')} "))
 
 
 def describe(root: ET.Element, model: ArmModel, left: list[str]) -> None:
-    """Say at the head of the file where it comes from and what it lacks."""
+    """Add comments at the top of the file about its origin and what it cannot represent."""
     comment(
         root, f"Written by hil {__version__} from an identified arm. Angles are hil's: joint 1 from the horizontal."
     )
@@ -29,11 +29,11 @@ def describe(root: ET.Element, model: ArmModel, left: list[str]) -> None:
 
 
 def axis(model: ArmModel) -> str:
-    """The joints' axis: across the vertical x-z plane, or upright for an arm in a horizontal plane."""
+    """The joint axis: normal to the vertical x-z plane, or vertical for a horizontal arm."""
     return "0 -1 0" if model.gravity else "0 0 1"
 
 
 def to_text(root: ET.Element) -> str:
-    """The document."""
+    """The document as indented text."""
     ET.indent(root)
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"

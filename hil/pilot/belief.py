@@ -1,10 +1,10 @@
-"""Current belief about the arm: an ensemble of simulated arms, drawn from the prior and updated by measured motion.
+"""The current belief about the arm: an ensemble drawn from the prior and updated by measured motion.
 
 Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
-Computers and Geosciences 55 (2013) 3): every arm plays what the real one played, and is updated towards the
-measured motion by regressing parameters on motion over the ensemble. It needs no derivatives, no initial guess and
-no motion that separates all parameters: what a motion does not determine keeps the prior's spread. A joint that did not
-move is informative too: arms that would have moved are shifted towards more friction.
+Computers and Geosciences 55 (2013) 3): every arm of the ensemble plays what the real one played, and is updated towards
+the measured motion by regressing parameters on motion over the ensemble. This needs no derivatives, no initial guess
+and no motion that separates all parameters: what a motion does not determine keeps the prior's spread. A joint that did
+not move is informative too: arms that would have moved are shifted towards more friction.
 """
 
 from dataclasses import dataclass, replace
@@ -25,31 +25,34 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _LINEAR = ("offset", "zero")
-"""Of either sign: not by their logarithms."""
+"""Parameters of either sign, which are not represented by their logarithm."""
 
 _TIMES = 160
-"""Instants of a motion that are compared, of each joint."""
-_LINEAR_RANGE = 0.02  # rad: smaller displacements count as they are, larger ones by their logarithms
+"""Number of instants of a motion that are compared, per joint."""
+_LINEAR_RANGE = 0.02  # rad, below which displacements are compared linearly, and above it by their logarithms
 _ERROR = 0.08
-"""Of a displacement so counted: what models of this kind leave."""
+"""Relative error of a compared displacement that models of this kind leave."""
 _LEAST_ERROR_STEPS = 1.5
-MOVED_STEPS = 12
-"""Encoder steps that a joint must swing to count as moved."""
-_STILL = 0.02  # rad: what a simulated joint may swing where the real one stood still
+MOVED_STEPS = 26
+"""Smallest range of motion of a joint that counts as having moved [encoder steps]."""
+_STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
-"""Of friction's logarithm, one after the other, until a simulated joint stands still too."""
+"""Largest number of increases of log friction until a simulated joint stands still too, and their range."""
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
-"""By how much errors are overstated each time; the reciprocals add up to 1, which makes the data count once."""
-_LONGEST_MOVE = 1.0  # of a parameter at a time, in e-folds, or in standard deviations of the prior
-_HOPELESS = 3.0  # times the median misfit: an arm beyond is replaced by a better one
-_LEAST_SPREAD = 0.01  # relative: what models of this kind leave, per doubling of the range
+"""Error inflation of each update; the reciprocals add up to 1, so that the data count once."""
+_LONGEST_MOVE = 1.0  # largest change of a parameter per update, in e-folds or prior standard deviations
+_HOPELESS = 3.0  # multiple of the median misfit above which an arm is replaced
+_LEAST_SPREAD = 0.01  # relative model error, per doubling of the range of motion
 
 
 @dataclass(frozen=True)
 class Belief:
-    """Arms that could be the real one. coordinates: (arms, parameters), logarithms but for names of either sign, which
-    count in standard deviations of the prior, `scale` (parameters,).
+    """Arms that could be the real one.
+
+    coordinates: (arms, parameters), logarithms of positive parameters; parameters of either sign are divided by
+    `scale`. scale: standard deviation in the prior (parameters,). fixed: parameters that do not vary. learned: number
+    of updates.
     """
 
     names: tuple[str, ...]
@@ -61,7 +64,7 @@ class Belief:
 
     @property
     def parameters(self) -> list[dict[str, float]]:
-        """By the estimator's names [SI], torques as one sees them who supposes the first joint's torque constant."""
+        """Parameters of every arm by the estimator's names [SI], assuming the first joint's nominal torque constant."""
         return [
             within_range({**self.fixed, **dict(zip(self.names, values.tolist(), strict=True))})
             for values in self._values(self.coordinates)
@@ -69,7 +72,7 @@ class Belief:
 
     @property
     def middle(self) -> dict[str, float]:
-        """The median arm."""
+        """Parameters of the median arm."""
         values = self._values(np.median(self.coordinates, axis=0)[None])[0]
         return within_range({**self.fixed, **dict(zip(self.names, values.tolist(), strict=True))})
 
@@ -78,7 +81,7 @@ class Belief:
         return float(self.coordinates[:, self.names.index(name)].std())
 
     def ensemble(self, farther: float = 1.0) -> Ensemble:
-        """Ensemble for a dry run. farther: ratio of the range of motion to be simulated to the observed range."""
+        """Ensemble for a dry run; farther: ratio of the range of motion to be simulated to the observed range."""
         belief = self if not self.learned else self._widened(_LEAST_SPREAD * (1.0 + np.log2(max(1.0, farther))))
         parameters = belief.parameters
         joints = 2 if "torque_scale_2" in parameters[0] else 1
@@ -87,7 +90,7 @@ class Belief:
         return Ensemble(physics, scale, "belief" if self.learned else "prior")
 
     def after(self, config: Config, seen: Seen) -> "Belief":
-        """The belief updated by `seen`."""
+        """The belief after an update with the recorded motion `seen`."""
         step = np.array([joint.joint.servo.position_unit for joint in config.joints])
         moved = seen.swing > MOVED_STEPS * step
         random = np.random.default_rng((self.seed, 8, self.learned))
@@ -97,7 +100,7 @@ class Belief:
         return replace(belief, learned=self.learned + 1)
 
     def _held(self, config: Config, seen: Seen, still: Mask, random: np.random.Generator) -> "Belief":
-        """Arms whose joints move where the real ones stood `still` (joints,) get dry friction until they stand too."""
+        """Raise the dry friction of arms whose joints move although the real ones stood `still` (joints,)."""
         belief = self
         places = [self.names.index(f"coulomb_{joint + 1}") for joint in np.flatnonzero(still)]
         for _ in range(_MOST_RAISES if places else 0):
@@ -111,7 +114,7 @@ class Belief:
         return belief
 
     def _drawn_to(self, config: Config, seen: Seen, moved: Mask, random: np.random.Generator) -> "Belief":
-        """The smoother, on the motion of the joints that `moved` (joints,)."""
+        """Apply the smoother to the motion of the joints that `moved` (joints,)."""
         index = np.unique(np.linspace(0, seen.command.shape[1] - 1, _TIMES).astype(int))
         index = index[np.isfinite(seen.position[:, index]).all(axis=0)]
         step = np.array([joint.joint.servo.position_unit for joint in config.joints])
@@ -129,14 +132,14 @@ class Belief:
         return belief._without_strays(left, random)
 
     def _motions(self, config: Config, seen: Seen) -> Array:
-        """Of every arm under what was commanded (arms, joints, samples) [rad]."""
+        """Motion of every arm under the recorded commands (arms, joints, samples) [rad]."""
         ensemble = replace(self, learned=0).ensemble()
         poses = np.tile(seen.pose, (ensemble.size, 1))
         arms = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback_of(config))
         return arms.positions(seen.command, config.experiment.rate)
 
     def _moved(self, foreseen: Array, measured: Array, inflation: float, random: np.random.Generator) -> "Belief":
-        """One update: data of so much larger errors."""
+        """One smoother update with measurement errors scaled by sqrt(inflation)."""
         x = self.coordinates
         parts, data = x - x.mean(axis=0), foreseen - foreseen.mean(axis=0)
         goal = measured + np.sqrt(inflation) * random.standard_normal(foreseen.shape)
@@ -147,7 +150,7 @@ class Belief:
         return replace(self, coordinates=x + change)
 
     def _without_strays(self, left: Array, random: np.random.Generator) -> "Belief":
-        """Arms that fit far worse than the rest are replaced by slightly perturbed copies of others."""
+        """Replace arms that fit far worse than the rest by slightly perturbed copies of others."""
         strays = left > _HOPELESS * np.median(left) + 1.0
         if not strays.any() or strays.all():
             return self
@@ -167,7 +170,7 @@ class Belief:
 
 
 def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
-    """From link lengths and `[arm.prior]`. Raises ConfigError."""
+    """Draw the prior belief from link lengths and `[arm.prior]`. Raises ConfigError."""
     base, scale = base_draws(config, arms, seed), scale_draws(config, arms, seed)
     supposed = {name: v / scale[:, 0] if term_of(name).of_torque else v for name, v in base.items()}
     if scale.shape[1] == 2:
@@ -184,5 +187,7 @@ def _of_draws(draws: dict[str, Array], seed: int) -> Belief:
 
 
 def _compressed(displacement: Array) -> Array:
-    """Linear near zero, a logarithm far from it: how far an arm moved counts by its ratio."""
+    """Compress displacements: linear near zero, logarithmic far from it, so that large ones are compared by their
+    ratio.
+    """
     return np.asarray(np.arcsinh(displacement / _LINEAR_RANGE))

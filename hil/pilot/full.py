@@ -1,4 +1,4 @@
-"""From link lengths to the result: the search, the full run, its estimate."""
+"""From link lengths to the result: the amplitude search, the full run, and its estimate."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,28 +8,35 @@ from hil.dry_run.amplitude import Amplitude
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
+from hil.pilot.chain_search import identify_chain_in_steps
 from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player, Say
+from hil.plan.plan import ROLES
 from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
 
-MOST_TRIES = 3
-"""Full runs, where one passes a limit or does not settle."""
+MOST_TRIES = 6
+"""Largest number of full runs if one exceeds a limit or does not settle; each has less torque than the one before."""
+
+_MOST_UNSETTLED = 0.1
+"""Largest experiment.settle_within that a repeated full run goes on to."""
 
 _BACK_OFF = 0.85
-"""Torque factor after a run that never settled: large motion with little friction need not settle at all."""
+"""Torque factor after a run that never settled: large motion with little friction may never settle."""
 
 
 def identify_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
 ) -> tuple[str, SettledResult]:
-    """From link lengths to the result. Returns the sentence about torque and the result.
+    """Identify an arm from link lengths only. Returns the sentence about the torque state and the result.
 
-    Raises what a run raises, and ExperimentError when a joint does not move at its current limit.
+    Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
     """
-    # A request to stop that comes in one step, however late, is for all that would follow. What the servos were set to
-    # is kept once for all steps, and put back once: EEPROM wears.
+    if config.is_chain:
+        return identify_chain_in_steps(config, run, shown_path, watch, say)
+    # A stop request in one step also cancels all later ones. Servo settings are saved and restored once for all steps,
+    # because EEPROM wears.
     with StopRequest(), servo_session(config, run.path, say):
         search = Search.of(config, run, Player(shown_path, watch, say))
         played = _full(search, *search.find())
@@ -40,7 +47,11 @@ def identify_in_steps(
 
 
 def _full(search: Search, config: Config, found: Amplitude) -> Played:
-    """Play the full run, with less torque where it passed a limit or did not settle."""
+    """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle.
+
+    Friction may hold an arm elsewhere in every period, however long it moves: each time more of that is accepted. The
+    fit does not need the periods to be equal, and the verdict says how well they are predicted.
+    """
     run, say = search.run, search.player.say
     number = 0
     while True:
@@ -55,7 +66,19 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
             raise played.error
         say("Repeating with less torque.")
         run.set_aside(f"stopped-{number}", chosen)
-        if not played.passed_limit:
+        if played.passed_limit:
+            config, plan = search.held, found.plan
+        else:
             search.cap = _BACK_OFF * found.peak_torque
-        config = search.held
-        found = search.amplitude(config, 1.0, found.plan)
+            search.config = _tolerant(search.config)
+            config = search.held
+            plan = search.waves(config)
+        found = search.amplitude(config, 1.0, plan)
+
+
+def _tolerant(config: Config) -> Config:
+    """The configuration with other waves, and with periods that may differ twice as much."""
+    experiment = config.experiment
+    within = min(2.0 * experiment.settle_within, max(experiment.settle_within, _MOST_UNSETTLED))
+    update = {"seed": experiment.seed + len(ROLES), "settle_within": within}
+    return config.model_copy(update={"experiment": experiment.model_copy(update=update)})

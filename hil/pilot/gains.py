@@ -1,7 +1,8 @@
-"""Gains of a software spring and damper for an arm that does not come back to its rest pose: flat, or upright.
+"""Gains of a software spring and damper for an arm that does not return to its rest pose: horizontal, upright, or with
+so much friction that gravity moves none of a joint's links. Such a joint wanders, from one period to the next too.
 
-Stiff enough to outweigh gravity in nearly every arm that could be this one and to overcome friction within a radian,
-soft enough to leave most of the torque to the excitation.
+The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
+and soft enough to leave most of the torque to the excitation.
 """
 
 import numpy as np
@@ -12,41 +13,63 @@ from hil.pilot.belief import Belief
 
 Array = NDArray[np.float64]
 
-_FREQUENCY = 0.7  # Hz, of each joint on its spring alone
+_FREQUENCY = 0.7  # Hz, natural frequency of each joint on its own spring
 _DAMPING_RATIO = 0.35
-_OUTWEIGHS = 1.3  # times gravity's pull away from the pose in the arm that it pulls most
+_OUTWEIGHS = 1.3  # relative to the largest destabilising gravity stiffness of all arms
 _FRICTIONS_PER_RADIAN = 1.5
-_TORQUE_SHARE = 0.35  # of the torque limit at a radian, at most, beyond what gravity needs
+_HELD = 1.5  # friction over gravity's torque at one radian from rest: at 1 it holds the joint at any angle
+_TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
 def needs_stabiliser(config: Config, belief: Belief) -> bool:
-    """Whether gravity fails to return the median arm to its rest pose."""
-    return float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min()) <= 0.0
+    """Whether the median arm has a joint that gravity fails to return to its rest pose."""
+    return bool(wandering(config, belief).any())
 
 
-def with_stabiliser(config: Config, belief: Belief) -> Config:
-    """The configuration with gains where it has none and needs some."""
-    if config.stabiliser is not None or not needs_stabiliser(config, belief):
+def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
+    """Joints that need a spring (joints,): all of an arm that falls over or lies flat, else those held by friction."""
+    arm = belief.middle
+    stiffness = gravity_stiffness(config, arm)
+    if float(np.linalg.eigvalsh(stiffness).min()) <= 0.0:
+        return np.ones(len(stiffness), dtype=np.bool_)
+    friction = [arm[f"coulomb_{j + 1}"] * (1.0 + arm[f"stribeck_rise_{j + 1}"]) for j in range(len(stiffness))]
+    return np.asarray(np.array(friction) > _HELD * np.diag(stiffness))
+
+
+def falls_over(config: Config, belief: Belief) -> bool:
+    """Whether gravity drives the median arm away from its rest pose, to which only a person can bring it back."""
+    lowest = float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min())
+    return bool(config.arm.gravity) and lowest <= 0.0
+
+
+def with_stabiliser(config: Config, belief: Belief, springs: NDArray[np.bool_] | None = None) -> Config:
+    """Add gains to a configuration that needs a stabiliser and has none.
+
+    springs: joints that get one in any case (joints,).
+    """
+    at = wandering(config, belief) if springs is None else springs | wandering(config, belief)
+    if config.stabiliser is not None or not at.any():
         return config
-    return config.model_copy(update={"stabiliser": proposed(config, belief)})
+    return config.model_copy(update={"stabiliser": proposed(config, belief, at)})
 
 
-def proposed(config: Config, belief: Belief) -> StabiliserConfig:
-    """Gains for the arms of `belief`."""
+def proposed(config: Config, belief: Belief, springs: NDArray[np.bool_]) -> StabiliserConfig:
+    """Gains suitable for the arms of `belief`, 0 for joints without a spring."""
     parameters = belief.parameters
     away = np.max([_pull_away(config, each) for each in parameters], axis=0)
     inertia = np.median([_inertia(config, each) for each in parameters], axis=0)
     friction, viscous = (np.median(_per_joint(config, parameters, name), axis=0) for name in ("coulomb", "viscous"))
     limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
-    # With both joints on springs of their own frequency the pair is slower than each; gravity comes on top.
+    # Two coupled joints on such springs oscillate more slowly than each alone; gravity is added.
     spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
     stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)
+    stiffness, damping = np.where(springs, stiffness, 0.0), np.where(springs, damping, 0.0)
     return StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
 
 
 def gravity_stiffness(config: Config, parameters: dict[str, float]) -> Array:
-    """Torque by which gravity draws the arm back per angle from its rest pose (joints, joints) [N m/rad]."""
+    """Restoring torque of gravity per angle from the rest pose (joints, joints) [N m/rad]."""
     pose = np.array(config.arm.rest_pose)
     first = -parameters["gravity_1"] * np.sin(pose[0])
     if len(pose) == 1:
@@ -56,13 +79,13 @@ def gravity_stiffness(config: Config, parameters: dict[str, float]) -> Array:
 
 
 def _pull_away(config: Config, parameters: dict[str, float]) -> Array:
-    """Stiffness per joint (joints,) [N m/rad] that just outweighs gravity: its rows, coupling included."""
+    """Stiffness per joint (joints,) [N m/rad] that just outweighs gravity, coupling included."""
     away: Array = np.maximum(-gravity_stiffness(config, parameters), 0.0).sum(axis=1)
     return away
 
 
 def _inertia(config: Config, parameters: dict[str, float]) -> Array:
-    """Of each joint with the others free to follow as they are, in the rest pose (joints,) [kg m^2]."""
+    """Inertia of each joint in the rest pose (joints,) [kg m^2]."""
     if len(config.joints) == 1:
         return np.array([parameters["inertia_1"]])
     coupling = parameters["coupling"] * np.cos(config.arm.rest_pose[1])

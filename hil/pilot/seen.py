@@ -1,4 +1,4 @@
-"""What a run showed of the arm: commands and motion from the first ramp on, whatever ended it."""
+"""What a run reveals about the arm: commands and motion from the first ramp on, however the run ended."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,15 @@ from hil.runs.recording import Phase
 
 Array = NDArray[np.float64]
 
-_FEWEST = 40  # samples from which anything is learned
+_FEWEST = 40  # smallest useful number of samples
 
 
 @dataclass(frozen=True)
 class Seen:
-    """command: torque without the stabiliser's (joints, samples) [N m]; position: (joints, samples) [rad], NaN where a
-    reply was missing; pose: where the arm stood before, end: where it was last (joints,) [rad].
+    """Commands and motion of a run.
+
+    command: torque without the stabiliser's (joints, samples) [N m]. position: (joints, samples) [rad], NaN where a
+    reply is missing. pose: pose before the run (joints,) [rad]. end: last pose (joints,) [rad].
     """
 
     command: Array
@@ -27,13 +29,13 @@ class Seen:
 
     @property
     def swing(self) -> Array:
-        """From end to end (joints,) [rad]."""
+        """Range of motion (joints,) [rad]."""
         swing: Array = np.nanmax(self.position, axis=1) - np.nanmin(self.position, axis=1)
         return swing
 
 
 def seen_of(config: Config, samples: NDArray[np.void], periods: int = 1) -> Seen | None:
-    """Ramp and first `periods` of what was recorded (hil.runs.recording); None where that is next to nothing."""
+    """Extract the ramp and the first `periods` periods of a recording; None if it is too short."""
     before = np.nonzero(samples["phase"] == Phase.REST)[0]
     played = (samples["phase"] == Phase.RAMP_IN) | (samples["phase"] == Phase.PERIODIC)
     rows = np.nonzero(played & (samples["segment"] == 0) & (samples["period"] < periods))[0]
@@ -52,5 +54,5 @@ def seen_of(config: Config, samples: NDArray[np.void], periods: int = 1) -> Seen
 
 
 def _last_finite(position: Array) -> Array:
-    """The median of the last samples of each joint (joints,)."""
+    """Median of each joint's last samples (joints,)."""
     return np.asarray(np.nanmedian(position[-20:], axis=0), dtype=np.float64)

@@ -26,8 +26,11 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Step:
-    """One intermediate run: its name, torque (joints,) [N m], predicted median and 99 % peaks and those seen
-    (quantities, joints), in hil.dry_run.prediction.QUANTITIES. ended: why it ended early, empty where it did not.
+    """One intermediate run.
+
+    name: shown to the user. peak_torque: (joints,) [N m]. median, quantile: predicted median and 99 % peaks; seen:
+    measured peaks, each (quantities, joints) in the order of hil.dry_run.prediction.QUANTITIES. ended: why the run
+    ended early; empty if it did not.
     """
 
     name: str
@@ -39,7 +42,7 @@ class Step:
 
     @property
     def within(self) -> bool:
-        """Whether all seen peaks that have a limit stayed within the predicted 99 %."""
+        """Whether all measured peaks that have a limit stayed within the predicted 99 %."""
         low, high, velocity = self.seen[:GUARDED]
         bounds = self.quantile
         return bool((low >= bounds[0]).all() and (high <= bounds[1]).all() and (velocity <= bounds[2]).all())
@@ -54,7 +57,7 @@ class Step:
         return f"{self.name}, peak torque {torque} N m: {each}."
 
     def played(self) -> PlayedStep:
-        """As the result keeps it."""
+        """The step in the form stored in a result."""
         median, quantile, seen = (tuple(map(tuple, rows.tolist())) for rows in (self.median, self.quantile, self.seen))
         torque = tuple(self.peak_torque.tolist())
         return PlayedStep(self.name, torque, median, quantile, seen, self.within, self.ended or None)
@@ -62,8 +65,11 @@ class Step:
 
 @dataclass(frozen=True)
 class Played:
-    """torque: the sentence about torque at the end. seen: what there is to learn from, None where that is too little.
-    error: what ended the run early, if anything did; only such as tells of the arm, never of servos, bus or a person.
+    """The outcome of a run.
+
+    step: comparison with the prediction. seen: commands and motion; None if there are too few. torque: sentence about
+    the final torque state. error: what ended the run early, or None; only errors that are informative about the arm,
+    not those of servos, bus or user.
     """
 
     step: Step
@@ -73,22 +79,23 @@ class Played:
 
     @property
     def passed_limit(self) -> bool:
-        """Whether the guard stopped it at a limit of the motion."""
+        """Whether the guard stopped the run at a motion limit."""
         return isinstance(self.error, SafetyStop) and self.error.cause is not Cause.UNEXPECTED
 
 
 @dataclass(frozen=True)
 class Player:
-    """Plays runs: the configuration file, the watcher and the reporter."""
+    """Plays runs; knows the configuration file, the observer of the stream and the function that shows messages."""
 
     shown_path: Path
     watch: Watch
     say: Say
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
-        """Run one step on an arm that could be any of `arms`, compare with the prediction, report.
+        """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
-        Raises what a run raises, but for what tells of the arm alone: a limit passed, no motion, no steady motion.
+        Raises what a run raises, except errors that are informative about the arm: limit exceeded, no motion, no steady
+        motion.
         """
         torque, error = "", None
         try:
@@ -106,21 +113,23 @@ class Player:
             self.say(f"{name} ended early: {error}")
         if not step.within:
             self.say(
-                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
-                "assumed."
+                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
+                "assumptions."
             )
         return Played(step, seen_of(config, samples), torque, error)
 
 
 def tells_of_the_arm(error: ExperimentError) -> bool:
-    """Whether a run that ended so may be followed by another: a limit of its motion, no motion, no steady motion."""
+    """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
+    motion.
+    """
     if isinstance(error, SafetyStop):
         return error.cause in (Cause.POSITION, Cause.VELOCITY)
     return isinstance(error, NotSettled | DidNotMove)
 
 
 def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> bool:
-    """Whether all that was unexpected is a joint that has not moved at all: friction is larger than was thought."""
+    """Whether the only unexpected thing was a joint that did not move at all: friction is larger than believed."""
     if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED:
         return False
     position = load_samples(folder.samples_path, len(config.joints))["position"]

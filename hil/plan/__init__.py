@@ -1,1 +1,1 @@
-"""What is played: one period of torque, the software spring and damper, the brake."""
+"""What the experiment plays: excitation, software spring and damper, brake."""

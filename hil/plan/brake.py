@@ -1,8 +1,8 @@
-"""The first part of a stop, where possible: braking, with a current opposing each joint's velocity.
+"""The first part of a stop, if possible: braking, with a current opposing each joint's velocity.
 
-For a bounded time and within the current limits; over at once when a reply is missing, a servo alerts, a deadline is
-missed, a second signal comes, or a joint gets faster instead of slower, as one does whose motor turns the wrong way.
-Torque is cut after it in any case.
+Braking lasts a bounded time, within the current limits. It ends at once when a reply is missing, a servo raises an
+alert, a deadline is missed, a second signal arrives, or a joint accelerates, as it does if its motor turns the wrong
+way. Torque is cut afterwards in any case.
 """
 
 from hil.config.schema import Config
@@ -10,34 +10,36 @@ from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop
 
 FULL_AT = 0.5
-"""Share of the velocity limit at which the brake uses the whole current limit. A fiercer one stops hardly sooner, and
-throws the arm back much farther where the connection is lost while it brakes.
+"""Fraction of the velocity limit at which the brake uses the full current limit.
+
+A stronger brake hardly stops sooner, and throws the arm back much farther if the connection is lost during braking.
 """
 
 
 GETS_FASTER = 0.2
-"""Share of the velocity limit by which a joint may get faster than it was before the brake is given up: gravity and its
-neighbour's brake pull at it.
+"""Increase in speed, relative to the velocity limit, at which braking is abandoned.
+
+Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
 NOTICED_AFTER = 2
-"""Samples for which a brake that pushes acts before the sample that shows it, once it shows: one, and one under way."""
+"""Samples for which a brake of the wrong sign acts before it is noticed: one sample, and one in progress."""
 
 
 def may_brake(config: Config, error: BaseException) -> bool:
-    """Whether this stop brakes before torque is cut: configuration and cause must both allow it."""
+    """Whether this stop brakes before torque is cut: both the configuration and the cause must allow it."""
     if config.safety.stop == "cut" or not isinstance(error, ExperimentError):
         return False
     return error.cause.allows_braking if isinstance(error, SafetyStop) else True
 
 
 def braking_gains(config: Config) -> list[float]:
-    """A per rad/s, per joint."""
+    """Braking gain of each joint [A s/rad]."""
     return [joint.goal_limit / (FULL_AT * joint.velocity_limit) for joint in config.joints]
 
 
 class Brake:
-    """Goal currents against the measured velocities."""
+    """Computes goal currents that oppose the measured velocities."""
 
     def __init__(self, config: Config) -> None:
         self._gains = braking_gains(config)
@@ -47,7 +49,9 @@ class Brake:
         self._first: list[float] | None = None
 
     def goals(self, state: State) -> list[float] | None:
-        """Goal currents [A] for this sample; None when it is over: at rest, a joint cannot be felt, or it pushes."""
+        """Goal currents [A] for this sample; None if braking is over: arm at rest, reply missing, or a joint
+        accelerates.
+        """
         speeds = [abs(velocity) for velocity in state.velocity]
         if any(state.missing) or any(state.error) or all(speed < self._enough for speed in speeds):
             return None
@@ -59,7 +63,7 @@ class Brake:
         ]
 
     def _pushes(self, speeds: list[float]) -> bool:
-        """Whether a joint is faster than when the braking began."""
+        """Whether a joint is clearly faster than when braking began."""
         if self._first is None:
             self._first = speeds
         return any(now > first + more for now, first, more in zip(speeds, self._first, self._allowed, strict=True))

@@ -17,7 +17,7 @@ ROLES = (IDENTIFY, HELD_OUT)
 
 @dataclass(frozen=True)
 class Segment:
-    """One multisine and what it is for. `period_current`: goal currents of one period, (samples, joints) [A]."""
+    """One multisine and its role; `period_current`: goal currents of one period (samples, joints) [A]."""
 
     role: str
     multisine: Multisine
@@ -26,14 +26,16 @@ class Segment:
 
     @property
     def ramp_in(self) -> NDArray[np.float64]:
-        """Goal currents before the first period: its end, faded in, so that the period itself starts whole."""
+        """Goal currents before the first period: the end of a period, faded in, so that the first period starts
+        complete.
+        """
         count = self.ramp_samples
         fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
         return self._before(count) * fade[:, None]
 
     @property
     def ramp_out(self) -> NDArray[np.float64]:
-        """Goal currents after the last period: its beginning, faded out."""
+        """Goal currents after the last period: the beginning of a period, faded out."""
         count = self.ramp_samples
         fade = 0.5 + 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
         index = np.arange(count) % len(self.period_current)
@@ -45,6 +47,12 @@ class Segment:
         peaks: NDArray[np.float64] = np.abs(self.multisine.torque).max(axis=1)
         return peaks
 
+    @property
+    def peak_goal(self) -> NDArray[np.float64]:
+        """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as nothing."""
+        peaks: NDArray[np.float64] = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
+        return peaks
+
     def _before(self, count: int) -> NDArray[np.float64]:
         index = np.arange(-count, 0) % len(self.period_current)
         return self.period_current[index]
@@ -52,7 +60,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that the stream will play, in order."""
+    """Everything that the stream plays, in order."""
 
     rate: float
     segments: tuple[Segment, ...]
@@ -63,27 +71,29 @@ class Plan:
     periods: int
     settle_within: float
     drift_within: float
+    lower_samples: int = 0
+    """The most that lowering an arm in space takes after a stop."""
 
     def first_segment(self) -> "Plan":
-        """The plan with its first multisine alone."""
+        """The plan with only its first multisine."""
         return replace(self, segments=self.segments[:1])
 
     @property
     def capacity(self) -> int:
-        """The largest number of samples that playing can take."""
+        """Largest possible number of samples."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played + self.end_samples + self.brake_samples
+        return self.rest_samples + played + 2 * self.end_samples + self.brake_samples + self.lower_samples
 
     @property
     def expected(self) -> int:
-        """The number of samples when the second period is settled, as on most arms."""
+        """Number of samples if the second period is already settled, as on most arms."""
         played = sum((1 + self.periods) * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
         return self.rest_samples + played
 
 
 def scaled(config: Config, plan: Plan, peak_torque: NDArray[np.float64]) -> Plan:
-    """The same waves with other peaks, (joints,) [N m]; each segment's own peaks are brought to these."""
+    """The same waves scaled to other peak torques (joints,) [N m]."""
     return replace(plan, segments=tuple(_scaled_segment(config, segment, peak_torque) for segment in plan.segments))
 
 
@@ -96,7 +106,7 @@ def _scaled_segment(config: Config, segment: Segment, peak_torque: NDArray[np.fl
 
 
 def period_current(config: Config, multisine: Multisine) -> NDArray[np.float64]:
-    """One period of goal currents within the limits, (samples, joints) [A]."""
+    """One period of goal currents (samples, joints) [A], clipped to the limits."""
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     limits = np.array([joint.goal_limit for joint in config.joints])
     clipped: NDArray[np.float64] = np.clip(multisine.torque.T / constants, -limits, limits)
@@ -109,7 +119,7 @@ def make_plan(config: Config) -> Plan:
 
 
 def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) -> Plan:
-    """What is played, each segment designed by `segment` for its role with a seed of its own."""
+    """Make a plan whose segments are designed by `segment`, each for its role and with its own seed."""
     experiment = config.experiment
     roles = ROLES if experiment.held_out else (IDENTIFY,)
     return Plan(
@@ -126,19 +136,19 @@ def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) ->
 
 
 def rest_window(rate: float) -> int:
-    """Samples after which the stream looks whether the arm has come to rest."""
+    """Number of samples after which the stream checks whether the arm has come to rest."""
     return max(1, round(0.2 * rate))
 
 
 def _end_samples(config: Config) -> int:
-    """Samples that coming to rest may take: whole windows."""
+    """Largest number of samples for coming to rest, a multiple of the window."""
     rate = config.experiment.rate
     window = rest_window(rate)
     return window * max(1, math.ceil(config.safety.rest_time * rate / window))
 
 
 def _lines(config: Config) -> Sequence[Sequence[int]]:
-    """The harmonics of each joint; the configuration has either a band or the lines themselves."""
+    """The harmonics of each joint, from the configured lines or band."""
     experiment = config.experiment
     if experiment.band is None:
         return experiment.lines or []

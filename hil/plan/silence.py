@@ -1,27 +1,27 @@
-"""Time without replies, and time without commands: both in seconds, both within what the servos' watchdogs allow."""
+"""Limits on the time without replies and the time without commands [s], within the servos' watchdog timeout."""
 
 from typing import NamedTuple
 
 from hil.config.schema import Config
 
 WATCHDOG_SHARE = 0.8
-"""Of the watchdog's time: nothing is waited for longer than that."""
+"""Upper bound on both limits, relative to the watchdog timeout."""
 
 _FEWEST_MISSING = 2
-"""Replies that must be missing at least: a single lost packet is no fault, however slow the rate."""
+"""Smallest number of missing replies that counts: a single lost packet is no fault, however low the rate."""
 
 _ROUNDING_S = 1e-6
 
 
 class Limit(NamedTuple):
-    """A time [s] and what it comes from, in words."""
+    """A time limit [s] and the setting it comes from, as text."""
 
     seconds: float
     said: str
 
 
 def missing_limit(config: Config) -> Limit:
-    """How long a servo may stay without a reply."""
+    """How long a servo may fail to reply."""
     safety = config.safety
     if safety.max_missing is not None:
         chosen = Limit((safety.max_missing + 1) / config.experiment.rate, f"safety.max_missing = {safety.max_missing}")
@@ -31,7 +31,7 @@ def missing_limit(config: Config) -> Limit:
 
 
 def late_limit(config: Config) -> Limit:
-    """For how long deadlines may be missed."""
+    """How long deadlines may be missed."""
     safety = config.safety
     if safety.max_late is not None:
         chosen = Limit((safety.max_late + 0.5) / config.experiment.rate, f"safety.max_late = {safety.max_late}")
@@ -41,7 +41,7 @@ def late_limit(config: Config) -> Limit:
 
 
 def is_missing_too_long(count: int, seconds: float, limit: Limit) -> bool:
-    """Whether `count` replies in a row, the last one `seconds` ago, are too many."""
+    """Whether `count` consecutive missing replies, the last reply being `seconds` ago, exceed the limit."""
     return count >= _FEWEST_MISSING and seconds >= limit.seconds - _ROUNDING_S
 
 

@@ -1,7 +1,7 @@
-"""A spring and a damper in software, for arms that have no stable pose of their own: horizontal, inverted.
+"""A software spring and damper for arms without a stable rest pose: horizontal or inverted.
 
-The estimator is given the torque that was really commanded, spring and damper included; their contribution can be
-recomputed from the recording, since it depends only on the previous sample's position and velocity.
+The estimator receives the torque that was actually commanded, including spring and damper; their contribution can be
+recomputed from the recording, because it depends only on the previous sample's position and velocity.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from hil.results.parts import StabiliserShare
 
 
 class Stabiliser:
-    """Adds its currents to a goal. A joint whose reply was missing keeps its previous current."""
+    """Adds spring and damper currents to a goal. A joint whose reply is missing keeps its previous contribution."""
 
     def __init__(self, config: Config) -> None:
         assert config.stabiliser is not None
@@ -31,7 +31,7 @@ class Stabiliser:
         self._added = [0.0] * len(self._gains)
 
     def add(self, goal: list[float], former: State | None) -> list[float]:
-        """Goal currents [A] with the stabiliser's own added. former: the sample before this command."""
+        """Goal currents [A] with the stabiliser's contribution added; former: the sample before this command."""
         if former is None:
             return goal
         added = self._added
@@ -42,7 +42,7 @@ class Stabiliser:
 
 
 def feedback_of(config: Config) -> Feedback:
-    """The stabiliser, or nothing, and the clamp [N m]."""
+    """The configured stabiliser, with zero gains if there is none, and the torque limits [N m]."""
     limit = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
     pose = np.array(config.arm.rest_pose)
     if config.stabiliser is None:
@@ -51,7 +51,7 @@ def feedback_of(config: Config) -> Feedback:
 
 
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
-    """From consecutive recorded rows of one multisine (hil.runs.recording)."""
+    """The stabiliser's share of the torque in consecutive rows of one multisine (hil.runs.recording)."""
     torque = feedback_torque(config, samples)
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     commanded = samples["goal_current"][1:] * constants
@@ -63,7 +63,7 @@ def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserSha
 
 
 def feedback_torque(config: Config, samples: NDArray[np.void]) -> NDArray[np.float64]:
-    """The stabiliser's torque in all rows but the first, (rows - 1, joints) [N m]; NaN where a reply was missing."""
+    """The stabiliser's torque in all rows but the first (rows - 1, joints) [N m]; NaN where a reply is missing."""
     assert config.stabiliser is not None
     stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
     former = samples[:-1]

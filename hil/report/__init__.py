@@ -1,1 +1,1 @@
-"""A run as one HTML page that needs no network: words first, then numbers and pictures. One section per module."""
+"""The report of a run as one self-contained HTML page, with one module per section."""

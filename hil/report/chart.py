@@ -1,4 +1,4 @@
-"""Pictures as data: what a chart or a matrix shows, whoever draws it (hil.report.svg, hil.report.png)."""
+"""Figures as data, independent of the renderer (hil.report.svg, hil.report.png)."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart.
+# Okabe and Ito's colours, distinguishable for colour-blind readers.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8f98"
 
 Kind = Literal["line", "broad", "dashed", "points", "dots", "area", "steps"]
@@ -16,7 +16,10 @@ Kind = Literal["line", "broad", "dashed", "points", "dots", "area", "steps"]
 
 @dataclass(frozen=True)
 class Series:
-    """One curve. x, y: (n,), a gap where NaN; `area` fills between y and `low`; `steps` has x as n + 1 edges."""
+    """One curve.
+
+    x, y: (n,), with a gap at each NaN. kind: `area` fills between y and `low`; `steps` has n + 1 edges as x.
+    """
 
     name: str
     x: Array
@@ -28,7 +31,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart with one x and one y axis. name: file name without ending."""
+    """A chart with one x and one y axis; name: file name without extension."""
 
     name: str
     title: str
@@ -40,7 +43,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Matrix:
-    """A square of values from -1 to 1 with the same labels down and across; NaN stays blank."""
+    """A square matrix of values from -1 to 1 with the same labels on both axes; NaN stays blank."""
 
     name: str
     title: str
@@ -52,7 +55,7 @@ Figure = Chart | Matrix
 
 
 def thin(x: Array, y: Array, most: int) -> tuple[Array, Array]:
-    """At most about `most` points of a curve: of each run of points the lowest and the highest, in their order."""
+    """Reduce a curve to about `most` points: the lowest and highest of each group of points, in order."""
     if len(x) <= most:
         return x, y
     count = len(x) // (most // 2)

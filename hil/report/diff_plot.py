@@ -1,4 +1,4 @@
-"""A picture of what changed between two runs: changes with intervals, significant ones marked."""
+"""Plot of the changes between two runs, with confidence intervals; significant changes are marked."""
 
 from pathlib import Path
 
@@ -10,12 +10,12 @@ _WIDTH_OF_95 = 1.96
 
 
 def save_diff_plot(difference: Difference, path: Path) -> None:
-    """Write a PNG or SVG, by the ending of `path`. Raises MissingExtra without matplotlib, RunFolderError."""
+    """Save a PNG or SVG, depending on the extension of `path`. Raises MissingExtra (no matplotlib), RunFolderError."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingExtra("The picture needs matplotlib: pip install 'hil[png]'.") from error
+        raise MissingExtra("The plot needs matplotlib: pip install 'hil[png]'.") from error
     shown = [change for change in difference.changes if _interval(change) is not None]
     figure = Figure(figsize=(7.0, 0.8 + 0.28 * len(shown)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -34,7 +34,7 @@ def save_diff_plot(difference: Difference, path: Path) -> None:
 
 
 def _interval(change: Change) -> tuple[float, float] | None:
-    """Change and half its 95 % interval [% of the value before]; None where that says nothing."""
+    """Change and half of its 95 % interval [% of the value before]; None if it is undefined or too wide to show."""
     if change.percent is None or not change.before:
         return None
     half = _WIDTH_OF_95 * 100 * (change.before_std**2 + change.after_std**2) ** 0.5 / abs(change.before)

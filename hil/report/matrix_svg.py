@@ -1,4 +1,4 @@
-"""A matrix of correlations as SVG: red together, blue against each other, each cell with its value to hover."""
+"""A correlation matrix as SVG: red for positive, blue for negative values, with each cell's value as a tooltip."""
 
 from html import escape
 
@@ -8,7 +8,7 @@ from hil.report.chart import Matrix
 
 
 def draw_matrix(matrix: Matrix, width: float, font: str) -> str:
-    """One `<svg>` element [px]."""
+    """Draw one `<svg>` element; width in px."""
     count = len(matrix.labels)
     letters = max(map(len, matrix.labels))
     size = 12.0 if width > 500 else 8.5
@@ -42,7 +42,7 @@ def _cell(matrix: Matrix, row: int, column: int, left: float, top: float, cell: 
 
 
 def colour(value: float) -> str:
-    """From blue at -1 over white at 0 to red at 1; grey where not known."""
+    """Colour from blue at -1 through white at 0 to red at 1; grey for NaN."""
     if np.isnan(value):
         return "#d0d3d8"
     far = min(1.0, abs(value))

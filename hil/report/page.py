@@ -1,6 +1,6 @@
-"""The page: its sections in their order, one template, one style sheet, one script, all in one file."""
+"""The report page: all sections, rendered by one template into a single self-contained file."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from importlib.resources import files
 from pathlib import Path
@@ -44,7 +44,11 @@ SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
 
 def write_report(data: RunData, path: Path) -> None:
     """Write the report of a run; raises RunFolderError when it cannot be written."""
-    page = make_page(data)
+    write_page(make_page(data), path)
+
+
+def write_page(page: str, path: Path) -> None:
+    """Write a page whole or not at all; raises RunFolderError."""
     temporary = path.with_name(path.name + ".partial")
     try:
         temporary.write_text(page, encoding="utf-8")
@@ -55,15 +59,20 @@ def write_report(data: RunData, path: Path) -> None:
 
 def make_page(data: RunData) -> str:
     """The whole HTML document."""
+    return render(Path(data.record.config).stem, data.record.started, sections(data))
+
+
+def render(title: str, started: str, shown: Sequence[Section]) -> str:
+    """The HTML document of these sections. started: ISO 8601."""
     folder = files("hil.report")
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(folder.joinpath("page.html.j2").read_text(encoding="utf-8"))
     return template.render(
-        title=Path(data.record.config).stem,
-        started=datetime.fromisoformat(data.record.started).strftime("%Y-%m-%d %H:%M"),
+        title=title,
+        started=datetime.fromisoformat(started).strftime("%Y-%m-%d %H:%M"),
         version=__version__,
-        sections=sections(data),
+        sections=shown,
         style=Markup(folder.joinpath("page.css").read_text(encoding="utf-8")),
         script=Markup(folder.joinpath("page.js").read_text(encoding="utf-8")),
         draw=_draw,
@@ -71,10 +80,10 @@ def make_page(data: RunData) -> str:
 
 
 def sections(data: RunData) -> list[Section]:
-    """The sections whose data the run holds."""
+    """The sections for which the run has data."""
     return [section for make in SECTIONS if (section := make(data)) is not None]
 
 
 def _draw(figure: Figure) -> Markup:
-    """Both widths; the style sheet shows the one that fits."""
+    """Draw both widths; the style sheet shows the one that fits."""
     return Markup(draw_svg(figure, WIDE) + draw_svg(figure, NARROW))

@@ -1,4 +1,4 @@
-"""The report's pictures as files of their own."""
+"""The report's figures as separate files."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from hil.report.svg import WIDE, draw_svg
 
 
 def save_pictures(data: RunData, folder: Path, kind: str) -> list[Path]:
-    """Save every picture in `folder` as "png" or "svg"; their paths. Raises ExportError, RunFolderError."""
+    """Save every figure in `folder` as "png" or "svg"; return the paths. Raises MissingExtra, RunFolderError."""
     saved = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -28,5 +28,5 @@ def save_pictures(data: RunData, folder: Path, kind: str) -> list[Path]:
 
 
 def figures(data: RunData) -> list[Figure]:
-    """All figures of the report, in its order."""
+    """All figures of the report, in order."""
     return [picture.figure for section in sections(data) for picture in section.pictures]

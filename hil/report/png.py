@@ -1,4 +1,4 @@
-"""Charts as PNG, drawn by matplotlib from the same description as the SVG."""
+"""Figures as PNG, drawn by matplotlib from the same description as the SVG."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,12 +11,12 @@ from hil.report.chart import Chart, Figure, Matrix, Series
 
 
 def save_png(figure: Figure, path: Path) -> None:
-    """Draw one picture; raises MissingExtra where matplotlib is not installed, OSError as writing does."""
+    """Save one figure. Raises MissingExtra if matplotlib is not installed, and OSError if writing fails."""
     draw_figures([figure], dpi=150).savefig(path)
 
 
 def draw_figures(figures: Sequence[Figure], dpi: int = 90) -> Any:
-    """The pictures below each other as one matplotlib figure; raises MissingExtra."""
+    """Draw the figures one below the other in a matplotlib figure. Raises MissingExtra."""
     heights = [8.2 if isinstance(figure, Matrix) else 3.6 for figure in figures]
     canvas = new_figure(8.8, sum(heights), dpi)
     rows = canvas.subplots(len(figures), 1, squeeze=False, height_ratios=heights)

@@ -18,7 +18,7 @@ from hil.runs.run_folder import RunFolder, RunRecord
 
 @dataclass(frozen=True)
 class RunData:
-    """A finished run. events: (time on the port's clock [s], what happened)."""
+    """A finished run; events: (time on the port's clock [s], what happened)."""
 
     run: RunFolder
     config: Config
@@ -31,7 +31,7 @@ class RunData:
 
     @classmethod
     def load(cls, path: Path) -> "RunData":
-        """Raises RunFolderError, ResultError and ConfigError, which name the file."""
+        """Read a run folder. Raises RunFolderError, ResultError and ConfigError, whose messages name the file."""
         result = read_settled_result(path)
         run = RunFolder.open(path)
         config = run.load_config()
@@ -53,10 +53,10 @@ class RunData:
 
     @property
     def fitted(self) -> PlayedPeriod | None:
-        """The settled period that the model was fitted to."""
+        """The settled period to which the model was fitted."""
         return self.periods.get(IDENTIFY)
 
     @property
     def held_out(self) -> PlayedPeriod | None:
-        """The settled period that the model predicted without having seen it."""
+        """The settled period that was held out from the fit and only predicted."""
         return self.periods.get(HELD_OUT)

@@ -1,4 +1,4 @@
-"""Axes: from data to pixels, and where the ticks are."""
+"""Axes: mapping of data to pixels, and positions of the ticks."""
 
 import math
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class Scale:
-    """Maps low..high of the data to start..end in pixels, on a logarithm where `log`."""
+    """Maps the data range low..high to start..end in pixels, logarithmically if `log`."""
 
     low: float
     high: float
     start: float
     end: float
     log: bool = False
-    spacing: float = 70  # px between ticks, about
+    spacing: float = 70  # approximate px between ticks
 
     def pixels(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixel coordinates of data (n,)."""
@@ -45,7 +45,7 @@ class Scale:
 
 
 def span(values: NDArray[np.float64], log: bool, margin: float) -> tuple[float, float]:
-    """An axis's ends that hold all finite values with some margin; a fallback where there are none."""
+    """Axis limits that contain all finite values with a margin; a default range if there are none."""
     finite = values[np.isfinite(values) & (values > 0)] if log else values[np.isfinite(values)]
     if not finite.size:
         return (0.1, 1.0) if log else (0.0, 1.0)
@@ -62,7 +62,7 @@ def span(values: NDArray[np.float64], log: bool, margin: float) -> tuple[float, 
 
 
 def label(value: float, log: bool = False) -> str:
-    """A tick's text; a power of ten on a logarithmic axis."""
+    """Text of a tick label; a power of ten on a logarithmic axis."""
     if log and not 0.01 <= value <= 100:
         return "10" + f"{round(math.log10(value))}".translate(_RAISED)
     return f"{value:.6g}".replace("-", "\u2212")

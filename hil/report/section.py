@@ -1,4 +1,4 @@
-"""What a section of the report consists of, whatever it is about."""
+"""The parts of a report section."""
 
 from dataclasses import dataclass, field
 
@@ -7,9 +7,10 @@ from hil.report.chart import Figure
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under column heads. Columns after the first `left` ones hold numbers, set to the right.
+    """Rows of text with column headings.
 
-    aside: a column that a phone has no room for.
+    left: number of left-aligned text columns; the others hold right-aligned numbers. aside: a column that is hidden on
+    narrow screens.
     """
 
     head: tuple[str, ...]
@@ -21,7 +22,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure and what to see in it."""
+    """A figure and its caption."""
 
     figure: Figure
     caption: str
@@ -29,7 +30,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Folded:
-    """Long text that opens on a click."""
+    """Long text that is shown on a click."""
 
     title: str
     text: str
@@ -37,7 +38,7 @@ class Folded:
 
 @dataclass(frozen=True)
 class Section:
-    """One section: words, then tables, then pictures, then what is folded away. `tone` colours the verdict's."""
+    """One section: text, tables, figures, then folded text. `tone` sets the colour of the verdict."""
 
     key: str
     title: str

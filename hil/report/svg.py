@@ -1,4 +1,4 @@
-"""Charts as SVG, at two widths: for desks and paper, and for phones. The page's script finds the axes in `data-`."""
+"""Charts as SVG, in two widths: for large screens and paper, and for phones. `data-` attributes describe the axes."""
 
 from dataclasses import dataclass
 from html import escape
@@ -16,7 +16,7 @@ _ROW = 18.0  # px: height of a row of the legend
 
 @dataclass(frozen=True)
 class Size:
-    """Of a picture [px]; `points` is how many of a curve it has room for."""
+    """Size of a figure [px]; points: maximum number of points drawn per curve."""
 
     name: str
     width: float
@@ -29,7 +29,7 @@ NARROW = Size("narrow", 360, 270, 900)
 
 
 def draw_svg(figure: Figure, size: Size) -> str:
-    """The picture as one `<svg>` element that also stands alone as a file."""
+    """Draw the figure as one `<svg>` element that is also valid as a file."""
     if not isinstance(figure, Chart):
         return draw_matrix(figure, size.width, FONT)
     legend, rows = _legend(figure.series, size.width)
@@ -96,7 +96,7 @@ def _path(series: Series, x: Scale, y: Scale, points: int) -> str:
 
 
 def _polyline(across: Array, up: Array) -> str:
-    """A path through the points, broken where a height is not finite."""
+    """A path through the points, interrupted where a height is not finite."""
     text, pen = [], "M"
     for at, height in zip(across.tolist(), up.tolist(), strict=True):
         if np.isfinite(height):
@@ -131,7 +131,7 @@ def _y_axis(chart: Chart, x: Scale, y: Scale, size: Size) -> str:
 
 
 def _legend(series: tuple[Series, ...], width: float) -> tuple[str, int]:
-    """The legend above the chart, in as many rows as it needs, and their number."""
+    """The legend above the chart and its number of rows."""
     named = [one for one in series if one.name]
     across, row, parts = 58.0, 0, []
     for one in named:

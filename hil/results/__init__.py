@@ -1,1 +1,1 @@
-"""What an identification found, as frozen dataclasses, and their way to result.json and back."""
+"""Results of an identification as frozen dataclasses, and their conversion to and from result.json."""

@@ -7,14 +7,14 @@ from hil.results.parts import Quantity
 
 
 def as_text(title: str, quantities: Mapping[str, Quantity], sentences: Sequence[str]) -> str:
-    """A title, a line for every quantity, sentences."""
+    """Format a title, one line per quantity, and sentences."""
     return "\n".join([title, *(f"  {name:20s} {found}" for name, found in quantities.items()), *sentences])
 
 
 def as_html(
     title: str, quantities: Mapping[str, Quantity], truth: Mapping[str, float], sentences: Sequence[str]
 ) -> str:
-    """The same as HTML, with a column for the truth where there is one."""
+    """Format the same as HTML, with a column of true values if there are any."""
     head = ("parameter", "value", "standard error", "unit", *(("truth",) if truth else ()))
     rows = [
         (
@@ -31,7 +31,7 @@ def as_html(
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A plain table, every cell escaped."""
+    """A plain HTML table with every cell escaped."""
     cells = "".join(f"<th>{escape(each)}</th>" for each in head)
     body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
     return f"<table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table>"

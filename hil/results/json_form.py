@@ -1,8 +1,9 @@
-"""Frozen dataclasses to JSON values and back, without loss. Standard library only, so that a model loads quickly.
+"""Lossless conversion of frozen dataclasses to JSON values and back. Standard library only, so that models load fast.
 
-A field is a key of the same name, or of the name in its metadata under "key"; with False under "json", it is none.
-A field that may be None, and is unless given, is left out of the JSON while it is None. Keys that no field has are
-ignored when read: a newer hil wrote them.
+A field is stored under its own name, or under the name in its metadata entry "key"; with False under "json" it is not
+stored. An optional field whose default is None is omitted while it is None. Unknown keys are ignored when reading: a
+newer version wrote them.
+
 JSON has no infinity and no NaN: they are written as null, which is read as NaN, or as infinity in a `Spread`.
 """
 
@@ -16,17 +17,19 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 _NULL_IS_INFINITE = "null is infinite"
 
 Spread = Annotated[float, _NULL_IS_INFINITE]
-"""A standard error or a variance; infinite where the recording shows nothing of the parameter."""
+"""A standard error or variance; infinite if the recording contains no information about the parameter."""
 
 T = TypeVar("T")
 
 
 class FormError(ValueError):
-    """A JSON value does not have the form of the dataclass. The message is to be read after "it": has no 'arm'."""
+    """A JSON value does not match the dataclass. The message continues a sentence that starts with "it", as "has no
+    'arm'".
+    """
 
 
 def to_json(value: Any) -> Any:
-    """A dataclass as dictionaries, lists, numbers and text."""
+    """Convert a dataclass to dictionaries, lists, numbers and strings."""
     if is_dataclass(value):
         return {
             _key(field): to_json(entry)
@@ -41,7 +44,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(kind: type[T], value: Any) -> T:
-    """A `kind` from what `to_json` gave; raises FormError."""
+    """Convert the output of `to_json` back to a `kind`. Raises FormError."""
     read: T = _read(kind, value, "")
     return read
 
@@ -58,7 +61,7 @@ def _read(kind: Any, value: Any, where: str) -> Any:
     if origin in (tuple, Sequence):
         entries = _checked(value, list, where)
         if len(arguments) > 1 and arguments[-1] is not ... and len(entries) != len(arguments):
-            raise FormError(f"has {len(entries)} entries in place of {len(arguments)} as {where!r}")
+            raise FormError(f"has {len(entries)} entries instead of {len(arguments)} as {where!r}")
         return tuple(_read(arguments[0], entry, f"{where}[{index}]") for index, entry in enumerate(entries))
     if origin is not None and issubclass(origin, Mapping):
         table = _checked(value, dict, where)
@@ -82,7 +85,7 @@ def _read_dataclass(kind: Any, value: Any, where: str) -> Any:
 
 
 def _checked(value: Any, kind: Any, where: str) -> Any:
-    # To Python, True is an int.
+    # In Python, a bool is an int.
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise FormError(f"has {_shown(value)} as {where!r}" if where else f"is {_shown(value)}")
     return value

@@ -1,4 +1,4 @@
-"""The parts of a result. Lists per joint run from the base outwards; names are the keys of result.json."""
+"""The parts of a result. Values per joint are ordered from the base outwards; fields are the keys of result.json."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -55,28 +55,29 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Covariance:
-    """Of all parameters together; rows and columns in the order of `names`, units those of the parameters."""
+    """Joint covariance of all parameters, in the order of `names` and in the parameters' units."""
 
     names: tuple[str, ...]
     matrix: tuple[tuple[Spread, ...], ...]
 
     def array(self) -> NDArray[np.float64]:
-        """(names, names); infinite where nothing was seen of a parameter."""
+        """The covariance as an array (names, names); infinite for parameters about which there is no information."""
         return np.array(self.matrix, dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """residual_rms_ticks: measured minus simulated position in encoder steps RMS, per joint."""
+    """Quality of a fit; residual_rms_ticks: measured minus simulated position in encoder steps RMS, per joint."""
 
     residual_rms_ticks: PerJoint
 
 
 @dataclass(frozen=True, kw_only=True)
 class SettledFit(Fit):
-    """Of settled periods. quantisation_floor_ticks: residual due to encoder rounding alone, in the same unit.
+    """Fit of settled periods.
 
-    periods: how many were averaged. correlation_time: samples over which the residual is correlated.
+    quantisation_floor_ticks: residual due to encoder rounding alone, in encoder steps RMS. periods: number of averaged
+    periods. correlation_time: number of samples over which the residual is correlated.
     """
 
     quantisation_floor_ticks: float
@@ -89,7 +90,8 @@ class SettledFit(Fit):
 
 @dataclass(frozen=True, kw_only=True)
 class ShootingFit(Fit):
-    """Of any motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint."""
+    """Of any motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint; residual_rms_ticks is
+    empty where the encoders' resolution is not known."""
 
     residual_rms_rad: PerJoint
     residual_rms_ticks: PerJoint
@@ -107,7 +109,7 @@ class Confounded:
 
 @dataclass(frozen=True)
 class Levels:
-    """RMS per joint in encoder steps, all lines together."""
+    """RMS of all lines together in encoder steps, per joint."""
 
     excited_lines: PerJoint
     distortion: PerJoint
@@ -118,7 +120,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Lines of one kind: how many, the motion on one of them and what the model leaves of it, encoder steps RMS."""
+    """Lines of one kind: their number, and the RMS motion and residual of one line in encoder steps, per joint."""
 
     lines: int
     motion: PerJoint
@@ -127,7 +129,7 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class LineLevels:
-    """RMS of one line in encoder steps, by kind of line; None for a kind that the multisine does not have."""
+    """RMS of one line in encoder steps, by kind of line; None for kinds that the multisine does not have."""
 
     noise: PerJoint
     excited: LineGroup | None = None
@@ -146,10 +148,10 @@ class LineLevels:
 class Validation:
     """How well the model predicts, per joint; None where it was not checked.
 
-    held_out_rms: error of the free prediction of another multisine, which was not fitted, over the motion's RMS;
-    free_run_rms: the same of the fitted one. residual_over_floor: residual over what rounding and scatter leave.
-    correlated_lags: share of the residual's autocorrelations that white noise would not have. condition: of the scaled
-    information matrix.
+    held_out_rms: open-loop prediction error of a held-out multisine, relative to the motion's RMS. free_run_rms: the
+    same for the fitted multisine. residual_over_floor: residual relative to the effect of rounding and scatter.
+    correlated_lags: fraction of the residual's autocorrelations that exceed those of white noise. condition: condition
+    number of the scaled information matrix.
     """
 
     held_out_rms: PerJoint | None = None
@@ -164,7 +166,10 @@ class Validation:
 
 @dataclass(frozen=True)
 class Verdict:
-    """trust: "yes", "with care" or "no". weakest: the least certain parameter. sentences: why, for a person."""
+    """The verdict on a result.
+
+    trust: "yes", "with care" or "no". weakest: the least certain parameter. sentences: the reasons.
+    """
 
     trust: str
     weakest: str
@@ -173,7 +178,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class TriedModel:
-    """One of the friction models that were tried. held_out_rms, score: None where it could not be judged."""
+    """One of the friction models that were tried. held_out_rms and score are None if the model could not be judged."""
 
     model: str
     parameters: int
@@ -184,10 +189,10 @@ class TriedModel:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelChoice:
-    """With friction = "auto": the model chosen, what it gained over the first one and what it cost.
+    """The model chosen with friction = "auto", and its gain and cost.
 
-    error_divided_by: prediction error of the first model over that of the chosen one. standard_errors_times: how many
-    times larger the standard errors became; None where that was not compared.
+    error_divided_by: prediction error of the first model divided by that of the chosen one. standard_errors_times:
+    factor by which the standard errors grew; None if that was not compared.
     """
 
     chosen: str
@@ -198,7 +203,7 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class Quantiles:
-    """Of durations [us]."""
+    """Quantiles of a duration [us]."""
 
     p50: float
     p99: float
@@ -208,11 +213,11 @@ class Quantiles:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamTiming:
-    """How the stream kept time. rate_held [Hz], seconds [s].
+    """How well the stream kept its deadlines; rate_held [Hz], seconds [s].
 
-    lateness_us: from each deadline to its write. round_trip_us: from the write to the last reply. drift_us: how much
-    later the last tenth of the writes was than the first. servo_clock_ppm: how much faster each servo's own clock runs
-    than the computer's; None where it was read too seldom.
+    lateness_us: time from each deadline to its write. round_trip_us: time from the write to the last reply. drift_us:
+    difference in lateness between the last and the first tenth of the writes. servo_clock_ppm: how much faster each
+    servo's clock runs than the computer's; None if it was read too rarely.
     """
 
     samples: int
@@ -228,25 +233,25 @@ class StreamTiming:
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """estimation_seconds: how long the estimation took [s]."""
+    """Duration of the estimation [s]."""
 
     estimation_seconds: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunTiming(Timing, StreamTiming):
-    """Of a recording of this program and its estimation."""
+    """Timing of a recording and of its estimation."""
 
     @classmethod
     def of(cls, stream: StreamTiming, estimation_seconds: float) -> "RunTiming":
-        """Both together."""
+        """Combine the timing of a stream with the duration of the estimation [s]."""
         kept = {each.name: getattr(stream, each.name) for each in fields(StreamTiming)}
         return cls(estimation_seconds=estimation_seconds, **kept)
 
 
 @dataclass(frozen=True)
 class ArmFacts:
-    """What is needed to use the model: gravity in the arm's plane [m/s^2], rest pose [rad], the joints."""
+    """Facts needed to use the model: gravity in the plane of the arm [m/s^2], rest pose [rad], joints."""
 
     gravity: float
     rest_pose: PerJoint
@@ -255,12 +260,12 @@ class ArmFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainFacts:
-    """Of an arm in space: what its URDF says, which its base parameters are relative to.
+    """Facts from the URDF of a spatial arm, which define its base parameters.
 
-    urdf: the file's name, beside the configuration. rotation, translation [m], axis: of each joint's frame in that of
-    the link before, and its axis in its own. gravity: in the base's frame [m/s^2]. groups: what each base parameter is
-    made of. from_prior: those that the recording hardly determines, taken from the URDF. held: the URDF's joints
-    that are taken as fixed. doubts: what is implausible about its inertias.
+    urdf: file name, relative to the configuration. rotation, translation [m]: pose of each joint's frame in the
+    previous link's frame. axis: joint axis in its own frame. gravity: in the base frame [m/s^2]. groups: linear
+    combination that each base parameter stands for. from_prior: parameters that the recording hardly determines, taken
+    from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible inertias.
     """
 
     urdf: str
@@ -276,14 +281,14 @@ class ChainFacts:
 
 @dataclass(frozen=True)
 class PhysicalQuantity(Quantity):
-    """A mass, centre or inertia. known: [known] gave it."""
+    """A mass, centre of mass or inertia; known: whether it was given in [known]."""
 
     known: bool
 
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres and inertias, using [known]. not_told_apart: groups that need another known one."""
+    """Masses, centres of mass and inertias, using [known]. not_told_apart: groups that need another known quantity."""
 
     quantities: Mapping[str, PhysicalQuantity]
     not_told_apart: tuple[tuple[str, ...], ...]
@@ -292,7 +297,7 @@ class Physical:
 
 @dataclass(frozen=True)
 class StabiliserShare:
-    """What the stabiliser did during the periods, per joint [N m]: RMS and peak of its torque, RMS of all torque."""
+    """Torque of the stabiliser during the periods, per joint [N m]: RMS, peak, and the RMS of the total torque."""
 
     rms: PerJoint = field(metadata={"key": "rms_torque"})
     peak: PerJoint = field(metadata={"key": "peak_torque"})
@@ -300,11 +305,11 @@ class StabiliserShare:
 
     @property
     def share(self) -> PerJoint:
-        """The stabiliser's RMS over that of all torque, per joint; over 1 where the excitation worked against it."""
+        """RMS of the stabiliser relative to that of the total torque, per joint; may exceed 1."""
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:
-        """In one sentence, for the joints of these names."""
+        """One sentence about the stabiliser's share, with these joint names."""
         each = ", ".join(
             f"{name} {rms:.3f} of {whole:.3f} N m RMS ({100 * part:.0f} %, peak {peak:.3f})"
             for name, rms, whole, part, peak in zip(
@@ -316,8 +321,10 @@ class StabiliserShare:
 
 @dataclass(frozen=True)
 class PlayedStep:
-    """One run on the way from the pilot to full size. Rows are the quantities of hil.dry_run.prediction.QUANTITIES,
-    columns the joints; peak_torque [N m]. ended: why it ended early, None where it did not.
+    """One run between the pilot and full amplitude.
+
+    Rows are the quantities of hil.dry_run.prediction.QUANTITIES, columns the joints. peak_torque: [N m]. ended: why the
+    run ended early; None if it did not.
     """
 
     name: str
@@ -331,7 +338,7 @@ class PlayedStep:
 
 @dataclass(frozen=True, kw_only=True)
 class Zeros:
-    """Of one recording: true minus measured angle of each joint, with standard errors [rad]."""
+    """Encoder zeros of one recording: true minus measured angle of each joint, with standard errors [rad]."""
 
     zero: PerJoint
     std: tuple[Spread, ...]

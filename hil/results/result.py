@@ -1,24 +1,24 @@
-"""A result: result.json as one frozen dataclass.
+"""Results: the contents of result.json as frozen dataclasses.
 
 schema, method, config, joints
-parameters   the base parameters: value, std (null on file where the recording shows nothing of it), unit
-extra        what the model needed beside them (friction's shape, drive's lag): value, std, unit
+parameters   the base parameters: value, std (null in the file if there is no information about it), unit
+extra        further model terms (shape of the friction curve, lag of the drive): value, std, unit
 covariance   of parameters and extra together, rows in the order of `names`
-fit          residual, in encoder steps, against the encoder's own rounding
-validation   free prediction of another multisine and of this one, as fractions of the motion's RMS; residual against
-             rounding, whiteness, conditioning; noise, distortion and model error in encoder steps
-verdict      trust it or not, the weakest parameter, and why, in sentences
-warnings     what looked wrong in the recording, in sentences
-model_choice with friction = "auto": the models tried, the one chosen, what it gained and cost
-timing       how the stream kept its ticks, and how long the estimation took
-arm          what a model needs to be used: gravity, rest pose, and per joint name, servo, mode, limits, torque per
+fit          residual in encoder steps, and the effect of encoder rounding
+validation   open-loop prediction of another multisine and of this one, relative to the motion's RMS; residual relative
+             to rounding, whiteness, conditioning; noise, distortion and model error in encoder steps
+verdict      whether to trust the result, the weakest parameter, and the reasons as sentences
+warnings     problems of the recording, as sentences
+model_choice with friction = "auto": the models tried, the one chosen, its gain and cost
+timing       how well the stream kept its deadlines, and the duration of the estimation
+arm          facts needed to use the model: gravity, rest pose, and per joint name, servo, mode, limits, torque per
              goal [N m/A, or N m/V in pwm mode]
 chain        only of an arm in space: its geometry, and what each base parameter is made of
 truth        only on a fake arm: the base parameters it was built with
 physical     masses, centres and inertias, where [known] says something
 stabiliser   what it gave of the torque, where there was one
 steps        with a pilot: what was predicted of each step, and what was seen
-zeros, recordings   only of recordings made elsewhere
+zeros, recordings, notes   only of recordings made elsewhere; notes: what was guessed, put right or averaged
 """
 
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Result:
-    """What an identification found, whatever it was estimated from. Fields in the order of result.json.
+    """The outcome of an identification. Fields are in the order of result.json.
 
     parameters, extra: by name, in the order of `covariance.names`. truth: by name [SI].
     """
@@ -83,11 +83,11 @@ class Result:
 
     @property
     def values(self) -> dict[str, float]:
-        """The same without error bars [SI]."""
+        """Values of all quantities by name [SI], without error bars."""
         return {name: found.value for name, found in self.quantities.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """As result.json holds it; numbers that are not finite are still themselves (see hil.strict_json)."""
+        """The object stored in result.json, except that numbers may still be infinite or NaN (see hil.strict_json)."""
         described: dict[str, Any] = to_json(self)
         return described
 
@@ -111,9 +111,9 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class SettledResult(Result):
-    """From the settled periods of a run."""
+    """Result of an estimate from the settled periods of a run."""
 
-    # field(): a redeclared field would keep the default of the class above.
+    # field(): without it, a redeclared field would keep the default of the base class.
     fit: SettledFit
     verdict: Verdict = field()
     timing: RunTiming
@@ -124,15 +124,16 @@ class SettledResult(Result):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ShootingResult(Result):
-    """From any motion, by multiple shooting: recordings made elsewhere, and runs without a settled period."""
+    """Result of multiple shooting on arbitrary motion: recordings made elsewhere, and runs without a settled period."""
 
     fit: ShootingFit
     zeros: tuple[Zeros, ...] | None = None
     recordings: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
 
 
 def result_from_json(value: Mapping[str, Any]) -> Result:
-    """The result in an object of result.json's form; raises FormError."""
+    """Convert an object of the form of result.json to a result. Raises FormError."""
     fit = value.get("fit")
     shooting = isinstance(fit, dict) and "residual_rms_rad" in fit
     kind: type[Result] = ShootingResult if shooting else SettledResult

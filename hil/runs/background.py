@@ -1,8 +1,9 @@
-"""What may block, done by a thread of its own: files, terminals, whoever watches.
+"""Work that may block, done by a separate thread: files, terminals, callbacks.
 
-Whoever has servos under torque must not wait for a disk or a terminal: a terminal stopped with Ctrl-S or a file behind
-a hung network blocks a write without end, and Python acts on no signal meanwhile. So the control loop only puts into a
-bounded queue, which never blocks; what does not fit is dropped and counted.
+While servos have torque, the control loop must not wait for a disk or a terminal: a terminal stopped with Ctrl-S or a
+file on a disconnected network drive can block a write indefinitely, and Python handles no signal meanwhile. Therefore
+the control loop only puts items into a bounded queue, which never blocks; items that do not fit are dropped and
+counted.
 """
 
 import threading
@@ -14,10 +15,10 @@ _Item = TypeVar("_Item")
 
 
 class Background(Generic[_Item]):
-    """Calls `act` with each item in a thread of its own, in order. most: items that may wait.
+    """Calls `act` with each item, in order, in a separate thread.
 
-    dropped: items that found the queue full. failure: the first exception that `act` raised; later items are tried all
-    the same.
+    most: maximum number of queued items. dropped: number of items dropped because the queue was full. failure: the
+    first exception raised by `act`; later items are still processed.
     """
 
     def __init__(self, act: Callable[[_Item], None], most: int) -> None:
@@ -28,19 +29,19 @@ class Background(Generic[_Item]):
         self._queue: SimpleQueue[_Item | None] = SimpleQueue()
         self._now: _Item | None = None
         self._abandoned = False
-        # A daemon: what blocks it must not keep the program from ending.
+        # A daemon thread: if it is blocked, the program can still end.
         self._thread = threading.Thread(target=self._run, name="hil background", daemon=True)
         self._thread.start()
 
     def put(self, item: _Item) -> None:
-        """Hand over an item, or drop it where too many wait already. Never blocks."""
+        """Queue an item, or drop it if the queue is full. Never blocks."""
         if self._queue.qsize() >= self._most:
             self.dropped += 1
         else:
             self._queue.put(item)
 
     def close(self, patience: float) -> list[_Item]:
-        """Wait at most `patience` [s] until everything is done; the items that were not, in order."""
+        """Wait up to `patience` [s] until all items are processed. Returns the unprocessed items in order."""
         self._queue.put(None)
         self._thread.join(patience)
         if not self._thread.is_alive():

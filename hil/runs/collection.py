@@ -1,9 +1,10 @@
-"""Run folders as a collection: which arm, when, what came of it, under which name, with which note.
+"""A collection of run folders: arm, date, outcome, name and note of each run.
 
-A name and a note stand in note.json in the run's own folder, so that they move with it.
+Name and note are stored in note.json in the run's own folder, so that they move with it.
 """
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -20,7 +21,7 @@ _LONGEST = 2000
 
 @dataclass(frozen=True)
 class Note:
-    """What a person says of a run."""
+    """A user's name and note for a run."""
 
     name: str = ""
     text: str = ""
@@ -28,9 +29,10 @@ class Note:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """One run. started: None where run.json does not tell. verdict: "yes", "with care", "no", or what is missing.
+    """Summary of one run.
 
-    residual: the worst joint's, in encoder steps; None without a result. steps: pilot and intermediate runs within it.
+    started: None if run.json does not contain it. verdict: "yes", "with care", "no", or what is missing. residual: of
+    the worst joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in it.
     """
 
     path: Path
@@ -42,26 +44,26 @@ class RunSummary:
     note: Note
 
     def to_json(self) -> dict[str, Any]:
-        """Strict JSON; `started` in ISO 8601."""
+        """The summary as plain values; `started` in ISO 8601."""
         started = self.started.isoformat() if self.started else None
         return asdict(self) | {"path": str(self.path), "started": started}
 
 
 def find_runs(folder: Path) -> list[RunSummary]:
-    """The runs in `folder`, or `folder` itself where it is one, oldest first; pilot steps belong to their run.
+    """The runs in `folder`, or `folder` itself if it is a run, oldest first; pilot steps belong to their run.
 
-    Raises RunFolderError when the folder does not exist.
+    Raises RunFolderError if the folder does not exist.
     """
     if not folder.is_dir():
         raise RunFolderError(
-            f"{folder} is not a folder. Runs are in runs/ of the folder where `hil identify` was started."
+            f"{folder} is not a folder. `hil identify` creates its runs in runs/ of the current folder."
         )
     found = [summarise(path) for path in _run_folders(folder)]
     return sorted(found, key=lambda run: (run.started.timestamp() if run.started else 0.0, str(run.path)))
 
 
 def summarise(path: Path) -> RunSummary:
-    """What can be said of one run folder; a damaged file is said, not raised."""
+    """Summarise one run folder; a damaged file is reported in the summary, not raised."""
     facts = _facts(path)
     arm = Path(str(facts.get("config", ""))).stem or path.name
     verdict, residual = _outcome(path)
@@ -74,7 +76,7 @@ def summarise(path: Path) -> RunSummary:
 
 
 def read_note(path: Path) -> Note:
-    """The note of a run, empty where there is none; raises RunFolderError when it is damaged."""
+    """The note of a run, empty if there is none. Raises RunFolderError if it is damaged."""
     file = path / NOTE_FILE
     if not file.is_file():
         return Note()
@@ -86,7 +88,7 @@ def read_note(path: Path) -> Note:
 
 
 def write_note(path: Path, note: Note) -> None:
-    """Keep a name and a note with the run; raises RunFolderError."""
+    """Store a name and a note with the run. Raises RunFolderError."""
     if not _is_run(path):
         raise RunFolderError(f"{path} is not a run folder: it has neither run.json nor samples.npy.")
     if len(note.name) > _LONGEST or len(note.text) > _LONGEST:
@@ -123,12 +125,14 @@ def _started(facts: dict[str, Any]) -> datetime | None:
 
 
 def _outcome(path: Path) -> tuple[str, float | None]:
-    """Verdict and worst residual; why there is none otherwise."""
+    """Verdict and worst residual; if there is no result, the reason and None."""
     if not (path / "result.json").is_file():
         return "not estimated" if (path / "samples.npy").is_file() else "not finished", None
     try:
         result = read_result(path)
     except ResultError:
+        return "result.json is damaged", None
+    if not all(math.isfinite(value) for value in result.values.values()):
         return "result.json is damaged", None
     verdict = "no verdict" if result.verdict is None else result.verdict.trust
     return verdict, max(result.fit.residual_rms_ticks, default=None)

@@ -1,4 +1,4 @@
-"""The events of a run, written by a thread of its own, so that no disk can hold up the control loop."""
+"""The events of a run, written by a separate thread, so that a slow disk cannot delay the control loop."""
 
 import json
 import os
@@ -10,14 +10,16 @@ from hil.runs.run_folder import RunFolder
 
 MOST_WAITING = 1000
 PATIENCE_S = 0.5
-"""How long the end of a run waits for its events to be on file, torque being off by then."""
+"""Time for which the end of a run, with torque off, waits for its events to be written [s]."""
 
 LATE_NAME = "events-late.jsonl"
 
 
 class EventLog:
-    """Events of one run. Leaving it waits a moment until all are on file; those that events.jsonl did not take by then
-    (it blocks, as a FIFO does that nobody reads) go to events-late.jsonl.
+    """Events of one run.
+
+    On exit it waits a moment until all events are written; those that events.jsonl did not accept in time, because it
+    blocks, go to events-late.jsonl.
     """
 
     def __init__(self, run: RunFolder) -> None:
@@ -36,12 +38,12 @@ class EventLog:
             _write_without_waiting(self._late_path, left)
 
     def note(self, time: float, what: str) -> None:
-        """Hand over an event with its time on the port's clock [s]. Never blocks, never raises."""
+        """Queue an event with its time on the port's clock [s]. Never blocks, never raises."""
         self._written.put((time, what))
 
     @property
     def failure(self) -> Exception | None:
-        """Why events could not be written, where that is so."""
+        """Why events could not be written, or None."""
         return self._written.failure
 
 

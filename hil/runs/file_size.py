@@ -1,7 +1,7 @@
 """Limits on file size, checked before anything is loaded.
 
-A run folder may come from somebody else. A compressed archive of 12 MB can hold 1.7 GB, and a header of 128 bytes can
-promise any number of rows: both are checked first.
+A run folder may come from an untrusted source: a compressed archive of 12 MB can expand to 1.7 GB, and a header of 128
+bytes can declare any number of rows.
 """
 
 from pathlib import Path
@@ -12,16 +12,16 @@ import numpy as np
 from hil.errors import RunFolderError
 
 MOST_ARCHIVE_BYTES = 512 * 2**20
-"""Of all arrays of a period.npz together: hours of samples at 4 kHz."""
+"""Largest total size of the arrays in a period.npz [bytes]: hours of samples at 4 kHz."""
 
 MOST_CSV_BYTES = 1024 * 2**20
 
 MOST_COMPRESSED = 200.0
-"""Times that measured numbers can be compressed; more is no measurement."""
+"""Largest plausible compression ratio of measured data."""
 
 
 def check_archive(path: Path) -> None:
-    """Raise RunFolderError where an .npz would take more memory than any recording's; raises OSError, BadZipFile."""
+    """Raise RunFolderError if an .npz would expand beyond any real recording. Also raises OSError, BadZipFile."""
     with ZipFile(path) as archive:
         entries = archive.infolist()
     claimed, packed = sum(each.file_size for each in entries), sum(each.compress_size for each in entries)
@@ -33,7 +33,7 @@ def check_archive(path: Path) -> None:
 
 
 def check_array(path: Path) -> None:
-    """Raise RunFolderError where an .npy promises more than the file holds; raises OSError, ValueError."""
+    """Raise RunFolderError if an .npy declares more data than the file has. Also raises OSError, ValueError."""
     with path.open("rb") as file:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -43,5 +43,5 @@ def check_array(path: Path) -> None:
     held = path.stat().st_size - start
     if promised > held:
         raise RunFolderError(
-            f"{path} cannot be read as a recording: its header declares {promised} bytes but it has {held}."
+            f"{path} cannot be read as a recording: its header declares {promised} bytes, but there are only {held}."
         )

@@ -1,7 +1,7 @@
-"""period.npz: each multisine's settled period as it was measured and as the model has it, for pictures and other tools.
+"""period.npz: each multisine's settled period as measured and as predicted, for figures and other tools.
 
-Arrays are named ROLE_torque, ROLE_position, ROLE_predicted, ROLE_rate, with ROLE the multisine's: "identify", the one
-that was fitted, and "held_out", predicted from rest without its measurement.
+Arrays are named ROLE_torque, ROLE_position, ROLE_predicted, ROLE_rate. ROLE is "identify" for the fitted multisine, and
+"held_out" for the one that was predicted from rest without using its measurement.
 """
 
 from collections.abc import Mapping
@@ -23,8 +23,8 @@ _ARRAYS = ("torque", "position", "predicted")
 class PlayedPeriod:
     """One settled period.
 
-    rate: samples per second. torque: commanded motor torque [N m], position: measured joint angle, NaN where a reply is
-    missing, predicted: the model's [rad]; each (joints, samples).
+    rate: samples per second. torque: commanded motor torque (joints, samples) [N m]. position: measured joint angles
+    (joints, samples) [rad], NaN where a reply is missing. predicted: joint angles of the model (joints, samples) [rad].
     """
 
     rate: float
@@ -39,13 +39,13 @@ class PlayedPeriod:
 
     @property
     def relative_error(self) -> NDArray[np.float64]:
-        """RMS error of the prediction over RMS of the motion about its mean (joints,)."""
+        """RMS prediction error relative to the RMS of the motion about its mean (joints,)."""
         motion = self.position - np.nanmean(self.position, axis=1, keepdims=True)
         return np.asarray(np.sqrt(np.nanmean(self.error**2, axis=1) / np.nanmean(motion**2, axis=1)))
 
 
 def save_periods(run: Path, periods: Mapping[str, PlayedPeriod]) -> None:
-    """Write period.npz into a run folder; raises RunFolderError."""
+    """Write period.npz into a run folder. Raises RunFolderError."""
     arrays = {f"{role}_{name}": getattr(period, name) for role, period in periods.items() for name in _ARRAYS}
     rates = {f"{role}_rate": np.array(period.rate) for role, period in periods.items()}
     path = run / FILE_NAME
@@ -58,7 +58,7 @@ def save_periods(run: Path, periods: Mapping[str, PlayedPeriod]) -> None:
 
 
 def load_periods(run: Path) -> dict[str, PlayedPeriod]:
-    """The settled periods of a run by role; empty where the run has no period.npz. Raises RunFolderError."""
+    """The settled periods of a run by role; empty if there is no period.npz. Raises RunFolderError."""
     path = run / FILE_NAME
     if not path.is_file():
         return {}

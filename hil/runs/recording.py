@@ -1,7 +1,7 @@
 """Samples written to disk as they are taken: a preallocated, memory-mapped `.npy` of a structured type.
 
-The samples survive even if the process is killed (not if the machine loses power: the pages are the
-kernel's until it writes them). A row whose phase is 0 has not been recorded.
+The samples survive if the process is killed, but not if the machine loses power before the kernel has written the
+pages. A row whose phase is 0 has not been recorded.
 """
 
 import ctypes
@@ -23,13 +23,13 @@ from hil.runs.background import Background
 from hil.runs.file_size import check_array
 
 _CHUNK_BYTES = 1 << 20
-_POPULATE_WRITE = 23  # of madvise
+_POPULATE_WRITE = 23  # MADV_POPULATE_WRITE
 _TOUCH_S = 1.0
 _libc = ctypes.CDLL(None)
 
 
 class Phase(IntEnum):
-    """What the stream was doing when it took a sample."""
+    """Phase of the experiment in which a sample was taken."""
 
     NOT_RECORDED = 0
     REST = 1
@@ -38,12 +38,16 @@ class Phase(IntEnum):
     RAMP_OUT = 4
     COMING_TO_REST = 5
     BRAKING = 6
+    LOWERING = 7
 
 
 def sample_type(joints: int) -> np.dtype[np.void]:
-    """One row: times [s], where in the plan, and per joint goal and measured current [A], velocity [rad/s], position
-    [rad], the servo's ERR byte, whether its reply is missing (then the measured values are NaN), and, a few times a
-    second in turn (else NaN), the servo's own clock [s], its supply [V] and its temperature [degrees C].
+    """The type of one row.
+
+    It contains times [s], the position in the plan, and per joint goal and measured current [A], velocity [rad/s],
+    position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN). In turn,
+    a few times a second, it also contains the servo's clock [s], supply voltage [V] and temperature [degrees C], which
+    are NaN otherwise.
     """
     each = (joints,)
     return np.dtype(
@@ -68,7 +72,9 @@ def sample_type(joints: int) -> np.dtype[np.void]:
 
 
 class Recorder:
-    """Keeps samples in `path`, at most `capacity` of them. A context manager; leaving it cuts the file to length."""
+    """Records up to `capacity` samples in `path`. A context manager; on exit it truncates the file to the recorded
+    rows.
+    """
 
     def __init__(self, path: Path, joints: int, capacity: int) -> None:
         self._path = path
@@ -100,7 +106,7 @@ class Recorder:
         return self._samples[: self.count]
 
     def keep(self, deadline: float, phase: Phase, segment: int, period: int, state: State) -> None:
-        """Put one sample on file."""
+        """Record one sample."""
         if self.count == self._next_chunk:
             self._next_chunk += self._rows_a_chunk
             self._touched.put(self._next_chunk)
@@ -124,7 +130,7 @@ class Recorder:
         self.count += 1
 
     def close(self) -> None:
-        """Cut the file to the rows that were recorded; harmless when closed."""
+        """Truncate the file to the recorded rows; may be called again."""
         if self._bytes.nbytes == 0:
             return
         self._touched.close(_TOUCH_S)
@@ -133,26 +139,26 @@ class Recorder:
         self._samples = _cut(self._path, self._samples, self.count)
 
     def _touch(self, first: int) -> None:
-        """Have the kernel map the pages of a chunk of rows for writing: a page's first write can take it 0.4 ms."""
+        """Map the pages of a chunk of rows for writing: a page's first write can take the kernel 0.4 ms."""
         size = self._row.size
         chunk = self._bytes[first * size : (first + self._rows_a_chunk) * size]
         if not chunk.nbytes:
             return
         start = np.frombuffer(chunk, np.uint8).ctypes.data
         page = start - start % mmap.PAGESIZE
-        # Where the kernel does not know it (before 5.14) the writes do it, page by page.
+        # Kernels before 5.14 do not support this; the pages are then mapped by the writes themselves.
         _libc.madvise(ctypes.c_void_p(page), ctypes.c_size_t(start + chunk.nbytes - page), _POPULATE_WRITE)
 
 
 def _cut(path: Path, samples: NDArray[np.void], count: int) -> NDArray[np.void]:
-    """Cut the file to `count` rows where it lies: no second copy, no more room, whatever the disk has left."""
+    """Truncate the file to `count` rows in place, which needs no copy and no further disk space."""
     header = _header(samples.dtype, count, _header_size(path))
     with path.open("r+b") as file:
-        # In this order a reader finds a whole recording at any time: rows beyond the header's count are ignored.
+        # In this order the file is always a valid recording: rows beyond the header's count are ignored.
         file.write(header)
         file.flush()
         file.truncate(len(header) + count * samples.dtype.itemsize)
-    # What was handed out before must not reach behind the end of the file.
+    # The former mapping must not be used beyond the new end of the file.
     return np.lib.format.open_memmap(path, mode="r+") if count else samples[:0].copy()
 
 
@@ -165,7 +171,7 @@ def _header_size(path: Path) -> int:
 
 
 def _header(dtype: np.dtype[np.void], count: int, size: int) -> bytes:
-    """The header of an `.npy` of so many rows, padded to `size` bytes."""
+    """The header of an `.npy` with `count` rows, padded to `size` bytes."""
     written = BytesIO()
     np.lib.format.write_array_header_1_0(
         written, {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (count,)}
@@ -176,13 +182,13 @@ def _header(dtype: np.dtype[np.void], count: int, size: int) -> bytes:
 
 
 def _reserve(path: Path) -> None:
-    """Take the disk space now: writing to a mapped page that a full disk cannot hold would kill the process."""
+    """Allocate the disk space: writing to a mapped page would kill the process if the disk were full."""
     with path.open("r+b") as file:
         os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
 
 
 def missed(goal_current: Sequence[float], now: float) -> State:
-    """The sample of a deadline that passed unused: the previous goal currents stayed in force, nothing was measured."""
+    """The sample for a missed deadline: the previous goals stay in effect, and nothing is measured."""
     nothing = (float("nan"),) * len(goal_current)
     return State(
         now, now, tuple(goal_current), nothing, nothing, nothing, (0,) * len(goal_current), (True,) * len(goal_current)
@@ -190,7 +196,7 @@ def missed(goal_current: Sequence[float], now: float) -> State:
 
 
 def load_samples(path: Path, joints: int) -> NDArray[np.void]:
-    """The recorded rows of a `samples.npy`, also of one whose process was killed. Raises RunFolderError."""
+    """The recorded rows of a `samples.npy`, even if its process was killed. Raises RunFolderError."""
     try:
         check_array(path)
         samples = np.load(path, allow_pickle=False, mmap_mode="r")

@@ -1,15 +1,15 @@
 """The run folder: an exact copy of the configuration, versions and machine, events, samples, result.
 
 config.toml     copied byte for byte
-experiment.json the [experiment] that was really played, where the tool chose it (pilot, torque found by dry runs)
-stabiliser.json the [stabiliser] likewise
-run.json        versions, start time, and the few facts that the samples need to be read again
-servo_settings.json  what the servos were set to before (hil.setup.servo_session)
-events.jsonl    what happened when, one JSON object a line, written as it happens
+experiment.json the [experiment] as played, if hil chose it (pilot, torque found by dry runs)
+stabiliser.json the [stabiliser] as played, if hil chose it
+run.json        versions, start time, and the facts needed to interpret the samples
+servo_settings.json  the servos' settings before the run (hil.setup.servo_session)
+events.jsonl    events with their time, one JSON object per line, written as they happen
 samples.npy     every sample (hil.runs.recording)
-lateness.json   how many samples were how late (hil.runs.timing)
+lateness.json   histogram of the samples' lateness (hil.runs.timing)
 result.json     parameters with error bars, fit, validation, timing
-period.npz      the settled periods as measured and as the model has them (hil.runs.period_file)
+period.npz      the settled periods as measured and as predicted (hil.runs.period_file)
 """
 
 import json
@@ -42,10 +42,11 @@ _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What `estimate` needs beside configuration and samples.
+    """What `estimate` needs besides configuration and samples.
 
-    command_to_sample: s from the goal currents' arrival at the servos to the sampling of their positions.
-    position_step: rad per encoder step, per joint. segments: the role of each multisine, in the order played.
+    config: path of the configuration, as the user wrote it. command_to_sample: time from the arrival of the goal
+    currents at the servos to the sampling of their positions [s]. position_step: encoder step of each joint [rad].
+    segments: role of each multisine, in the order played.
     """
 
     config: str
@@ -56,7 +57,7 @@ class RunFacts:
 
 @dataclass(frozen=True)
 class Excitation:
-    """One multisine as it was played: its role, and per joint the excited harmonics and the crest factor."""
+    """One multisine as played: its role, and the excited harmonics and crest factor of each joint."""
 
     role: str
     lines: tuple[tuple[int, ...], ...]
@@ -65,7 +66,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class RunRecord(RunFacts):
-    """run.json: the facts, versions and machine. started: ISO 8601 with the offset from UTC."""
+    """The contents of run.json: facts, versions and machine. started: ISO 8601 with the offset from UTC."""
 
     started: str
     versions: Mapping[str, str]
@@ -93,14 +94,14 @@ _DESCRIPTIONS = (".urdf", ".xml")
 
 
 class RunFolder:
-    """A folder of one run. `create` makes a new one, `open` reads one that exists."""
+    """The folder of one run. `create` makes a new one, `open` reads an existing one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @classmethod
     def create(cls, path: Path, config: Config) -> "RunFolder":
-        """Make the folder and copy the configuration; raises RunFolderError when it is taken or not writable."""
+        """Create the folder and copy the configuration. Raises RunFolderError if it is not empty or not writable."""
         run = cls(path)
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -114,9 +115,9 @@ class RunFolder:
         return run
 
     def discard_if_unused(self) -> bool:
-        """Remove the folder of a start that failed before the first sample; whether it was removed.
+        """Remove the folder if the experiment failed before the first sample. Returns whether it was removed.
 
-        The same --out can then be used again. A folder with a sample, a result or a file of somebody else's is kept.
+        The same --out can then be used again. A folder with a sample, a result or a foreign file is kept.
         """
         files = [path for path in self.path.rglob("*") if path.is_file()]
         if any(path.name not in _OF_A_START and path.suffix not in _DESCRIPTIONS for path in files):
@@ -128,8 +129,13 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> "RunFolder":
-        """A folder that holds a run; raises RunFolderError."""
+        """Open the folder of a run. Raises RunFolderError."""
         run = cls(path)
+        if (path / "recordings.npz").is_file():
+            raise RunFolderError(
+                f"{path} is an estimate from another tool's recording; this command needs a run of hil identify or hil "
+                "record."
+            )
         for needed in (run.config_path, run.run_path, run.samples_path):
             if not needed.is_file():
                 raise RunFolderError(f"{path} is not a run folder: it has no {needed.name}.")
@@ -161,7 +167,12 @@ class RunFolder:
 
     def load_config(self) -> Config:
         """The configuration, with the experiment as it was actually played. Raises ConfigError, RunFolderError."""
-        config = parse_config(self.config_path.read_text(encoding="utf-8"), self.config_path)
+        try:
+            text = self.config_path.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+            raise RunFolderError(f"{self.config_path} cannot be read: {reason}.") from error
+        config = parse_config(text, self.config_path)
         if not self.played_path.is_file():
             return config
         played: dict[str, Any] = {}
@@ -176,7 +187,7 @@ class RunFolder:
         return config.model_copy(update=played)
 
     def below(self, name: str, played: Config) -> "RunFolder":
-        """A separate run in a subfolder of this one; raises RunFolderError."""
+        """Create a separate run in a subfolder. Raises RunFolderError."""
         folder = RunFolder.create(self.path / name, played)
         folder.write_played(played)
         return folder
@@ -186,26 +197,28 @@ class RunFolder:
         return self.path / "starts.json"
 
     def write_starts(self, starts: list[dict[str, float]]) -> None:
-        """Keep parameters from which the estimate starts too, now and when it is made anew."""
+        """Save initial guesses (parameters by name [SI]) for this and any later estimate."""
         write_json(self.starts_path, {"starts": starts})
 
     def load_starts(self) -> list[dict[str, float]]:
-        """Those kept, if any were; raises RunFolderError."""
+        """The saved initial guesses, if any. Raises RunFolderError."""
         if not self.starts_path.is_file():
             return []
         starts = _read_json(self.starts_path).get("starts")
         if not isinstance(starts, list):
-            raise RunFolderError(f"{self.starts_path} is damaged: it has no list of start times.")
+            raise RunFolderError(f"{self.starts_path} is damaged: it has no list of initial guesses.")
         return starts
 
     def write_played(self, played: Config) -> None:
-        """Save an [experiment] that differs from the file's (a pilot's, or one with computed torque), and the gains."""
+        """Save the [experiment] and [stabiliser] as played, if they differ from the file (pilot, computed torque or
+        gains).
+        """
         write_json(self.played_path, played.experiment.model_dump())
         if played.stabiliser is not None:
             write_json(self.stabiliser_path, played.stabiliser.model_dump())
 
     def set_aside(self, name: str, played: Config) -> None:
-        """Move what a run of `played` recorded into a folder below, so that another can be made in this one."""
+        """Move the recording of a run of `played` to a subfolder, so that another one can be made in this folder."""
         folder = self.below(name, played)
         try:
             for path in (self.samples_path, self.run_path, self.path / "lateness.json"):
@@ -234,7 +247,7 @@ class RunFolder:
         write_json(self.run_path, {"schema": SCHEMA, **to_json(record)})
 
     def load_facts(self) -> RunFacts:
-        """What of run.json an estimate needs. Raises RunFolderError."""
+        """The part of run.json that an estimate needs. Raises RunFolderError."""
         return self._load_run(RunFacts)
 
     def load_record(self) -> RunRecord:
@@ -245,7 +258,7 @@ class RunFolder:
         values = _read_json(self.run_path)
         if values.get("schema") != SCHEMA:
             raise RunFolderError(
-                f"{self.run_path}: schema {values.get('schema')!r} is not {SCHEMA}; this run was made by another "
+                f"{self.run_path}: schema is {values.get('schema')!r}, not {SCHEMA}; this run was made by another "
                 "version of hil."
             )
         try:
@@ -254,7 +267,7 @@ class RunFolder:
             raise RunFolderError(f"{self.run_path} is damaged: it {error}.") from error
 
     def event(self, time: float, what: str) -> None:
-        """Append one event, with its time on the port's clock [s]; raises RunFolderError."""
+        """Append one event with its time on the port's clock [s]. Raises RunFolderError."""
         log.info("%.3f s: %s", time, what)
         line = json.dumps({"time": round(time, 6), "event": what}, ensure_ascii=False)
         path = self.path / "events.jsonl"
@@ -265,7 +278,7 @@ class RunFolder:
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
 
     def load_events(self) -> tuple[tuple[float, str], ...]:
-        """(time on the port's clock [s], what happened); a last line that a crash cut short is left out.
+        """The events as (time on the port's clock [s], what happened); a last line cut short by a crash is ignored.
 
         Raises RunFolderError.
         """
@@ -289,14 +302,14 @@ class RunFolder:
 
 
 def _urdfs(config: Config) -> set[Path]:
-    """Files that the configuration names; a configuration finds one of them beside itself, whatever folder it names."""
+    """URDF files named by the configuration; a copied configuration finds them in its own folder."""
     chain = None if config.fake is None else config.fake.chain
     named = [config.arm.urdf, None if chain is None else chain.urdf]
     return {Path(each) for each in named if each is not None}
 
 
 def _has_samples(path: Path) -> bool:
-    """Whether anything was recorded in it; what cannot be read may have been."""
+    """Whether anything was recorded in the file; true if it cannot be read."""
     from hil.runs.recording import Phase
 
     try:
@@ -307,7 +320,7 @@ def _has_samples(path: Path) -> bool:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write a JSON file whole or not at all."""
+    """Write a JSON file completely or not at all. Raises RunFolderError."""
     temporary = path.with_suffix(".partial")
     try:
         temporary.write_text(strict_json.dumps(value, indent=2) + "\n", encoding="utf-8")

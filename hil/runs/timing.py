@@ -6,14 +6,14 @@ from numpy.typing import NDArray
 from hil.results.parts import Quantiles, StreamTiming
 
 SERVO_CLOCK_WRAP_S = 32.768
-"""Realtime Tick counts milliseconds from 0 to 32767."""
+"""The servos' Realtime Tick counts milliseconds from 0 to 32767."""
 
 _FEWEST_READINGS = 5
 _EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6)
 
 
 def timing(samples: NDArray[np.void], rate: float) -> StreamTiming:
-    """Rate held, lateness of the writes, round trips, missed ticks, lost replies and clock drifts of a recording."""
+    """Held rate, lateness, round trips, missed ticks, lost replies and clock drifts of a recording."""
     sent = _sent(samples)
     lateness_us = _lateness_us(sent)
     round_trip_us = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
@@ -33,7 +33,7 @@ def timing(samples: NDArray[np.void], rate: float) -> StreamTiming:
 
 
 def lateness_histogram(samples: NDArray[np.void]) -> dict[str, list[float]]:
-    """How many writes were how late: `counts[i]` between `edges_us[i]` and `edges_us[i + 1]`, the last one open."""
+    """Histogram of lateness: `counts[i]` writes between `edges_us[i]` and `edges_us[i + 1]`; the last bin is open."""
     counts, _ = np.histogram(_lateness_us(_sent(samples)), [*_EDGES_US, np.inf])
     return {"edges_us": list(_EDGES_US), "counts": counts.tolist()}
 
@@ -45,7 +45,7 @@ def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def _lateness_us(sent: NDArray[np.void]) -> NDArray[np.float64]:
-    # A clock that stands still while the program computes gives rounding errors of either sign.
+    # A virtual clock does not advance during computation, so rounding errors may have either sign.
     late: NDArray[np.float64] = np.maximum(0.0, 1e6 * (sent["time_before_write"] - sent["deadline"]))
     return late
 

@@ -1,1 +1,1 @@
-"""Servos made ready: scan, settings, preflight checks, a new arm's file."""
+"""Preparation of servos: scan, settings, preflight checks, and the file for a new arm."""

@@ -1,4 +1,4 @@
-"""The rate that a bus can sustain, measured with torque off for every way of sending an exchange."""
+"""The sample rate that a bus can sustain, measured with torque off for every way of exchanging data."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +17,11 @@ SHARE = 0.9
 
 
 @dataclass(frozen=True)
-class Way:
-    """One way of sending, measured. median_s, longest_s: round trips, the longest 1 % left out. lost: of CYCLES."""
+class ExchangeMode:
+    """Measured timing of one exchange mode.
+
+    median_s, longest_s: round trips [s], the longest 1 % ignored. lost: lost replies out of CYCLES.
+    """
 
     one_write: bool
     fast: bool
@@ -36,7 +39,7 @@ class Way:
 
     @property
     def rate(self) -> float:
-        """Exchanges per second that it can sustain."""
+        """Sustainable exchanges per second [Hz]."""
         return SHARE / self.longest_s
 
     def __str__(self) -> str:
@@ -46,34 +49,38 @@ class Way:
 
 @dataclass(frozen=True)
 class RateReport:
-    """All ways measured; `found` in words what the configured way can hold; `fix` is empty where that is enough."""
+    """Measurements of all exchange modes.
 
-    ways: tuple[Way, ...]
+    found: what the configured mode can sustain, as text. fix: what to change; empty if the rate is sustainable.
+    """
+
+    modes: tuple[ExchangeMode, ...]
     found: str
     fix: str
 
 
 def check_rate(bus: ServoBus, wanted: float) -> RateReport:
-    """Measure every way, on servos whose torque is off and whose goals stay as they are. Raises DriverError.
+    """Measure every exchange mode on servos whose torque is off, without changing their goals. Raises DriverError.
 
-    Every tenth exchange is one of the slow turns, so that their length counts.
+    Every tenth exchange includes the slow reads, so that their duration counts.
     """
     goals = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     reads = (True, False) if bus.knows_fast_sync_read() else (False,)
-    ways = [_measure(bus, goals, fast=fast, one_write=one_write) for fast in reads for one_write in (True, False)]
+    modes = [_measure(bus, goals, fast=fast, one_write=one_write) for fast in reads for one_write in (True, False)]
     configured = bus.config.one_write, bus.config.fast_sync_read and reads[0]
-    used = next(way for way in ways if (way.one_write, way.fast) == configured)
-    return RateReport(tuple(ways), f"{used.rate:.0f} Hz possible with {used.name}", _mend(used, ways, wanted))
+    used = next(mode for mode in modes if (mode.one_write, mode.fast) == configured)
+    return RateReport(tuple(modes), f"{used.rate:.0f} Hz possible with {used.name}", _fix(used, modes, wanted))
 
 
 def goal_register(joint: Joint) -> str:
-    """The goal that drives a joint in its mode."""
+    """Name of the goal register that drives a joint in its mode."""
     return "Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM"
 
 
 def goals_taken(bus: ServoBus) -> list[Joint]:
-    """The joints, one for each servo, that take goals from a Sync Write: each is sent a goal different from its
-    present one, read back, and restored. Only with torque off. Raises DriverError.
+    """The drives, one per servo, that accept goals from a Sync Write. Only with torque off. Raises DriverError.
+
+    Each is sent a goal different from its present one, which is read back and then restored.
     """
     before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     other = [goal - 1 if goal > 0 else goal + 1 for goal in before]
@@ -90,7 +97,7 @@ def goals_taken(bus: ServoBus) -> list[Joint]:
 
 
 def _give_back(bus: ServoBus, goals: Sequence[int]) -> None:
-    """To every servo that can still be reached; raises the first DriverError after all were tried."""
+    """Restore the goals of all servos that can be reached; raises the first DriverError after trying all."""
     failures: list[DriverError] = []
     for (drive, servo), goal in zip(bus.drives.items(), goals, strict=True):
         try:
@@ -102,8 +109,8 @@ def _give_back(bus: ServoBus, goals: Sequence[int]) -> None:
         raise failures[0]
 
 
-def _measure(bus: ServoBus, goals: Sequence[int], *, fast: bool, one_write: bool) -> Way:
-    # A run has its status read only where that fits into the rate: it does not bound the rate that is possible.
+def _measure(bus: ServoBus, goals: Sequence[int], *, fast: bool, one_write: bool) -> ExchangeMode:
+    # A run reads the status registers only if the rate leaves time for it, so they do not limit the rate.
     exchange = bus.make_exchange(fast=fast, one_write=one_write, slow_every=SLOW_EVERY, status=False)
     trips = np.empty(CYCLES)
     lost = 0
@@ -111,19 +118,19 @@ def _measure(bus: ServoBus, goals: Sequence[int], *, fast: bool, one_write: bool
         reply = exchange.cycle(goals)
         trips[index] = reply.time_after_read - reply.time_before_write
         lost += None in reply.servos
-    return Way(one_write, fast, float(np.median(trips)), float(np.quantile(trips, 0.99)), lost)
+    return ExchangeMode(one_write, fast, float(np.median(trips)), float(np.quantile(trips, 0.99)), lost)
 
 
-def _mend(used: Way, ways: list[Way], wanted: float) -> str:
+def _fix(used: ExchangeMode, modes: list[ExchangeMode], wanted: float) -> str:
     if used.sound and used.rate >= wanted:
         return ""
-    better = next((way for way in ways if way.sound and way.rate >= wanted), None)
+    better = next((mode for mode in modes if mode.sound and mode.rate >= wanted), None)
     if better is not None:
         one_write, fast = str(better.one_write).lower(), str(better.fast).lower()
         return f"Set port.one_write = {one_write} and port.fast_sync_read = {fast}."
-    if not any(way.sound for way in ways):
+    if not any(mode.sound for mode in modes):
         return "Replies are lost with every read method: check cables, supply and termination."
-    best = max((way for way in ways if way.sound), key=lambda way: way.rate)
+    best = max((mode for mode in modes if mode.sound), key=lambda mode: mode.rate)
     return (
         f"Set experiment.rate to at most {best.rate:.0f}, or raise the baud, or lower latency timer and return delay."
     )

@@ -1,4 +1,4 @@
-"""The commented TOML file of an arm, from the few facts that it needs."""
+"""The commented TOML file of an arm, generated from a few facts."""
 
 import json
 import math
@@ -9,16 +9,18 @@ from hil.drivers.servo_model import Mode, Published, servo_model
 from hil.drivers.servo_prior import stall_torque
 
 STANDARD_GRAVITY = 9.81
-_OF_STALL = 0.3  # of the stall current or the supply: what the guard allows at first
-_USUAL_STALL = 4.1  # N m, of an XM430
+_OF_STALL = 0.3  # of the stall current or the supply voltage; initial limit
+_USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 _RATES = (400, 200, 100, 50, 20)
 
 
 @dataclass(frozen=True)
 class JointAnswers:
-    """One joint. rest: angle where it hangs [rad]; swing: how far it may go from there to either side [rad]; length:
-    from this joint to the next, or to the tip [m].
+    """Answers about one joint.
+
+    rest: angle at rest [rad]. swing: allowed deviation from it to either side [rad]. length: distance from this joint
+    to the next one, or to the tip [m].
     """
 
     name: str
@@ -38,7 +40,7 @@ class JointAnswers:
 
 @dataclass(frozen=True)
 class ArmAnswers:
-    """One arm. gravity: m/s^2 in its plane. head: what the file's first lines say."""
+    """Answers about one arm; gravity: in the plane of the arm [m/s^2]; head: comment at the top of the file."""
 
     url: str
     baud: int
@@ -48,13 +50,13 @@ class ArmAnswers:
 
 
 def usual_length(model: str) -> float:
-    """Length of a link that a servo of this model usually carries [m], for who has not measured it."""
+    """Typical length [m] of a link driven by a servo of this model, as a default."""
     stall: float = stall_torque(servo_model(model))
     return float(round(0.13 * (stall / _USUAL_STALL) ** 0.4, 2))
 
 
 def arm_toml(arm: ArmAnswers) -> str:
-    """The file's text."""
+    """The text of the TOML file."""
     rate = _rate(arm)
     head = [f"# {line}" for line in arm.head.splitlines()]
     port = ["[port]", f"url = {json.dumps(arm.url)}", f"baud = {arm.baud}"]
@@ -118,12 +120,12 @@ def _joint(answers: JointAnswers) -> list[str]:
 
 
 def _spread(published: Published) -> float:
-    """A standard deviation for a published constant: half of how far the figures are apart, and never below a tenth."""
+    """Standard deviation of a published constant: half the range of published values, at least a tenth of the value."""
     return max(0.1 * published.value, (published.high - published.low) / 2)
 
 
 def _goal_limit(answers: JointAnswers) -> float:
-    """A or V: a fraction of the stall value at the nominal supply voltage."""
+    """Initial goal limit [A or V]: a fraction of the stall value at the nominal supply voltage."""
     servo = servo_model(answers.model)
     stall = servo.stalls[len(servo.stalls) // 2]
     most = _OF_STALL * (stall.voltage if servo.default_mode is Mode.PWM else stall.current)
@@ -139,7 +141,7 @@ def _rest_meaning(arm: ArmAnswers) -> str:
 
 
 def _rate(arm: ArmAnswers) -> float:
-    """The highest usual rate whose cycle leaves the bus half idle."""
+    """The highest common rate whose cycle leaves the bus at least half idle."""
     cycle = _CYCLE_BYTES * len(arm.joints) * 10 / arm.baud + 0.4e-3
     return float(next((rate for rate in _RATES if 2 * cycle < 1 / rate), _RATES[-1]))
 

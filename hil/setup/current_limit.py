@@ -1,4 +1,4 @@
-"""The ticks of Current Limit that a joint needs."""
+"""Conversion of a current limit to the ticks of the Current Limit register."""
 
 import math
 
@@ -6,5 +6,5 @@ from hil.drivers.joint import Joint
 
 
 def current_limit_ticks(joint: Joint, limit: float) -> int:
-    """The least Current Limit of the joint's servo that takes every goal within `limit` [A]."""
+    """The smallest Current Limit [ticks] with which the joint's servo accepts every goal up to `limit` [A]."""
     return math.ceil(limit / abs(joint.drive_unit(0.0)) - 1e-9)

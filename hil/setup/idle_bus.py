@@ -1,4 +1,4 @@
-"""The bus before anything moves: the servos' own limits, and a second of the real exchange with torque off."""
+"""Checks of the bus before anything moves: the servos' own limits, and one second of exchanges with torque off."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def _limits(config: Config, bus: ServoBus) -> list[str]:
         ]
         if joint.mode is Mode.CURRENT:
             own = servo.read("Current Limit") * abs(joint.drive_unit(0.0))
-            short = " : TOO LOW, goals would be refused" if own < described.goal_limit else ""
+            short = ": TOO LOW, goals would be refused" if own < described.goal_limit else ""
             parts.insert(0, f"own current limit {own:.2f} A, current_limit {described.goal_limit:g} A{short}")
         lines.append(f"{joint.title}: {'; '.join(parts)}.")
     return lines

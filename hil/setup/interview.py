@@ -1,4 +1,4 @@
-"""`hil init`: reads from the bus what it can and asks for the rest. Nothing is written to a servo."""
+"""`hil init`: reads what it can from the bus and asks for the rest. Nothing is written to a servo."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,17 +12,17 @@ from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers
 from hil.setup.scan import Found, Heard
 
 Ask = Callable[[str, str], str]
-"""Asks a question, with what an empty answer means; gives the answer."""
+"""Asks a question with a default answer; returns the answer."""
 Say = Callable[[str], None]
 
 _NAMES = ("shoulder", "elbow")
 _MOVED_TICKS = 30
 _MOST_SWING = 175.0  # degrees
-_MOST_TILT = 85.0  # degrees; beyond, an arm is as good as flat
+_MOST_TILT = 85.0  # degrees; beyond this, the arm counts as flat
 _LENGTHS_MM = (10.0, 2000.0)
 HANGING, UPRIGHT, FLAT = "hanging", "upright", "flat"
 _REST = {HANGING: -math.pi / 2, UPRIGHT: math.pi / 2, FLAT: 0.0}
-"""The first joint's angle at rest [rad]."""
+"""Angle of the first joint at rest [rad]."""
 _POSE = {
     HANGING: "Let the arm hang at rest, and press Enter",
     UPRIGHT: "Hold the arm upright and straight, and press Enter",
@@ -31,7 +31,7 @@ _POSE = {
 
 
 def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) -> ArmAnswers:
-    """The arm behind an open port, of what a scan heard on it. Raises ExperimentError where that makes no arm."""
+    """Ask about the arm at an open port, given the result of a scan. Raises ExperimentError if no arm can be formed."""
     baud, servos = _one_baud(heard)
     port.set_baud(baud)
     chosen = _choose(servos, ask, say)
@@ -72,7 +72,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
 
 
 def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
-    """The baud at which servos answered, and those that can be driven."""
+    """The baud rate at which servos answered, and those of a supported model."""
     answered = {each.baud: [found for found in each.servos if found.model in SERVO_MODELS] for each in heard}
     usable = {baud: servos for baud, servos in answered.items() if servos}
     if not usable:
@@ -108,9 +108,12 @@ def _name(number: int, found: Found, ask: Ask) -> str:
 
 
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
-    """Which way Present Position counts, seen so that the arm hangs down and points right when it is lifted."""
+    """Determine which way Present Position counts; +1 if it increases counter-clockwise.
+
+    The arm is viewed so that it hangs down and points to the right when it is lifted.
+    """
     before = servo.read("Present Position")
-    ask(f"Turn {name} by hand slightly counter-clockwise, at most a quarter turn, hold it there and press Enter", "")
+    ask(f"Turn {name} slightly counter-clockwise by hand, at most a quarter turn, hold it there and press Enter", "")
     moved = servo.read("Present Position") - before
     if abs(moved) < _MOVED_TICKS:
         say(f"{name} did not move: assuming direction = 1. Correct it in the file if the servo turns the other way.")
@@ -119,7 +122,7 @@ def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
 
 
 def _stance(ask: Ask, say: Say) -> str:
-    """Which way up the arm is."""
+    """Ask for the orientation of the arm."""
     question = "Is the arm hanging (it comes to rest by itself), upright (it would fall over) or flat (horizontal)"
     while True:
         answer = ask(question, HANGING).lower()

@@ -1,4 +1,4 @@
-"""Servos on the bus that are not the arm's: found, reported, and left alone."""
+"""Servos on the bus that are not part of the arm: found, reported, and left alone."""
 
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import WallClock
@@ -8,11 +8,11 @@ from hil.drivers.servo import Servo
 from hil.setup.scan import Found, listen
 
 _AT_ONCE_S = 0.005
-"""On a virtual bus they answer one directly after the other; real ones may each wait for the slots before theirs."""
+"""Listening time on a virtual bus [s], where replies are immediate; real servos may each wait for a time slot."""
 
 
 def others_on_the_bus(bus: ServoBus) -> list[str]:
-    """Each servo at this baud that is not one of the arm's, in words; raises PortLost."""
+    """Describe each servo at this baud rate that is not part of the arm. Raises PortLost."""
     ours = {drive.id for drive in bus.drives}
     heard = listen(bus.port) if isinstance(bus.port.clock, WallClock) else listen(bus.port, _AT_ONCE_S)
     return [_describe(bus, found) for found in heard.servos if found.id not in ours]

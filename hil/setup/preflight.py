@@ -1,4 +1,4 @@
-"""Everything that would stop an experiment, checked beforehand, with how to fix it. Torque stays off."""
+"""Checks for everything that would stop an experiment, with instructions for fixing it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _LONG_RETURN_DELAY_US = 20
 
 
 class Level(StrEnum):
-    """OK; a WARNING does not stop the experiment; a STOP does."""
+    """Severity: OK, WARNING (does not stop the experiment) or STOP (stops it)."""
 
     OK = "ok"
     WARNING = "warning"
@@ -35,7 +35,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: what was checked, where, what was found, and how to fix it if it is not as it should be."""
+    """One check: where, what was checked, what was found, and how to fix it if necessary."""
 
     level: Level
     where: str
@@ -45,7 +45,7 @@ class Finding:
 
 
 def check_arm(config: Config) -> Iterator[Finding]:
-    """Check port, servos, pose and rate, in this order; a check that cannot be made is a STOP, never an exception."""
+    """Check port, servos, pose and rate, in this order. A check that cannot be made is a STOP, not an exception."""
     fakes.register_for(config.url)
     try:
         bus = ServoBus.connect(config.bus)
@@ -86,7 +86,7 @@ def _latency_timer(bus: ServoBus) -> Finding:
 
 
 def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
-    """Servos beside the arm's: nothing is ever sent to them, but the user should know of them."""
+    """Report servos that are not part of the arm: nothing is sent to them, but the user should know about them."""
     try:
         check_quiet(bus.port)
     except BusShared as error:
@@ -98,7 +98,7 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
     try:
         found = others_on_the_bus(bus)
     except DriverError as error:
-        yield Finding(Level.WARNING, config.port.url, "others", "not asked", str(error))
+        yield Finding(Level.WARNING, config.port.url, "others", "not searched", str(error))
         return
     if found:
         fix = "They are left alone: neither their torque nor their settings are changed."
@@ -106,9 +106,9 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
 
 
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
-    """Everything about one servo; breaks off where it does not answer or is another model.
+    """Check one servo; ends early if it does not answer or is another model.
 
-    Nothing is written, but for what an earlier program left behind: that is put back.
+    Nothing is written, except to restore settings that an earlier program left behind.
     """
     where = str(joint)
     try:
@@ -143,7 +143,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
 
 
 def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding]:
-    """Settings that a killed run could not restore."""
+    """Restore settings that a killed run could not restore."""
     what = "settings from an earlier run"
     try:
         written = recover(servo, config.url)
@@ -213,8 +213,7 @@ def _startup(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: 
     armed = arms_itself(servo)
     fix = (
         "Startup Configuration switches its torque on at every power-up or reboot, even in the middle of a run. Set "
-        "that "
-        "register to 0 with DYNAMIXEL Wizard 2.0."
+        "that register to 0 with DYNAMIXEL Wizard 2.0."
     )
     return _graded(not armed, "at switch-on", "torque switches on by itself" if armed else "torque stays off", fix)
 
@@ -240,7 +239,7 @@ def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo
 
 
 def _share(joint_config: JointConfig) -> float:
-    """Of the joint's limit, what one of its servos gives [A or V]."""
+    """Share of the joint's goal limit that one of its servos provides [A or V]."""
     return joint_config.goal_limit / len(joint_config.ids)
 
 
@@ -305,7 +304,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     ticks = servo.read("Present Position")
     index = [joint.id in each.ids for each in config.joints].index(True)
     if joint.id != config.joints[index].id:
-        return Level.OK, "pose", f"the first servo's counts (ID {config.joints[index].id})", ""
+        return Level.OK, "pose", f"determined by the first servo (ID {config.joints[index].id})", ""
     angle = joint.within_turn(ticks).angle(ticks)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
@@ -336,11 +335,11 @@ _LOOKS: tuple[_Look, ...] = (
 
 
 def _goals(bus: ServoBus) -> Iterator[Finding]:
-    """Whether goals arrive: a Sync Write has no answer, so each servo's goal is read back, with torque off."""
+    """Check that goals arrive: Sync Write has no reply, so each servo's goal is read back with torque off."""
     try:
         taken = goals_taken(bus)
     except DriverError as error:
-        yield Finding(Level.STOP, "bus", "goals", "not tried", str(error))
+        yield Finding(Level.STOP, "bus", "goals", "not tested", str(error))
         return
     for joint, servo in bus.drives.items():
         if joint in taken:
@@ -353,8 +352,7 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
             continue
         fix = (
             "A goal sent by Sync Write did not arrive although reads are answered: try port.one_write = false; check "
-            "for "
-            "an adapter or hub that swallows bytes, and for a second servo with this ID."
+            "for an adapter or hub that swallows bytes, and for a second servo with this ID."
         )
         yield Finding(Level.STOP, str(joint), "goals", "not taken", fix)
 
@@ -365,8 +363,8 @@ def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
     except DriverError as error:
         yield Finding(Level.STOP, "bus", "rate", "not measured", str(error))
         return
-    for way in report.ways:
-        yield Finding(Level.OK if way.sound else Level.WARNING, "bus", way.name, str(way))
+    for mode in report.modes:
+        yield Finding(Level.OK if mode.sound else Level.WARNING, "bus", mode.name, str(mode))
     level = Level.STOP if report.fix else Level.OK
     yield Finding(level, "bus", "rate", f"{config.experiment.rate:g} Hz wanted, {report.found}", report.fix)
 

@@ -1,6 +1,6 @@
-"""Which servos are on a port: every baud rate, every ID, and how each servo is.
+"""Scan a port for servos at every baud rate and ID, and report the state of each servo.
 
-One broadcast ping per baud rate: servos answer it in the order of their IDs, so all 253 are asked at once.
+One broadcast ping per baud rate reaches all IDs at once: servos answer it in the order of their IDs.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,16 +16,17 @@ from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, VOLTAGE_UNIT
 
 _SLOT_S = 3e-3
-"""How long one ID may take to answer a broadcast ping; dynamixel-sdk allows the same."""
+"""Time slot per ID for the reply to a broadcast ping [s], the same as in dynamixel-sdk."""
 
 _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 
 class Found(NamedTuple):
-    """One servo that answered. model None: a number that no control table has. `trouble`: nothing where all is well.
+    """One servo that answered.
 
-    voltage: V. temperature: degrees C. Both None where they could not be read.
+    model: None if no control table has this model number. voltage: [V], temperature: [degrees C]; None if they could
+    not be read. trouble: description of a problem; empty if there is none.
     """
 
     baud: int
@@ -39,7 +40,7 @@ class Found(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """One baud rate: who answered, and what is wrong there as a whole."""
+    """The replies at one baud rate; trouble: description of a problem on the whole bus; empty if there is none."""
 
     baud: int
     servos: tuple[Found, ...]
@@ -47,9 +48,9 @@ class Heard(NamedTuple):
 
 
 class Asking(NamedTuple):
-    """A scan in progress: the baud it is at, the time left [s], and the servo that has just answered, if it was one.
+    """A scan in progress: current baud rate, remaining time [s], and the servo that has just answered, if any.
 
-    servo: ID, and model or model number.
+    servo: ID and model name, or "model number N".
     """
 
     baud: int
@@ -66,10 +67,10 @@ def serial_ports() -> list[tuple[str, str]]:
 
 
 def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _: None) -> Iterator[Heard]:
-    """Scan at each baud rate in turn; raises PortLost. watch: called while it waits, and with each servo that answers.
+    """Scan at each baud rate in turn. Raises PortLost.
 
-    Rates that the adapter cannot do are given with their trouble said. Over TCP, where the other end sets the baud,
-    the first alone is tried.
+    Baud rates that the adapter does not support are reported as trouble. Over TCP, where the remote end sets the baud
+    rate, only the first one is tried. watch: called while waiting, and with each servo that answers.
     """
     if not port.has_baud:
         bauds = bauds[:1]
@@ -84,19 +85,19 @@ def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _:
 
 
 def _with_more(behind_s: float, watch: Watch) -> Watch:
-    """The same watcher, told of the time beyond this baud too."""
+    """Wrap the callback so that the remaining time includes the other baud rates."""
     return lambda asking: watch(asking._replace(left_s=asking.left_s + behind_s))
 
 
 def _listening_s(port: Port, baud: int) -> float:
-    """How long one baud is listened to [s], as long as nobody answers."""
+    """Listening time at one baud rate [s] if nobody answers."""
     return _PATIENCE_S + port.latency + _STATUS_BYTES * 10 / baud
 
 
 def listen(port: Port, patience: float = _PATIENCE_S, watch: Watch = lambda _: None) -> Heard:
-    """Who answers a broadcast ping at the port's present baud within `patience` [s]; raises PortLost.
+    """Collect the replies to a broadcast ping within `patience` [s] at the port's current baud rate. Raises PortLost.
 
-    watch: called while it waits, and with each servo that answers.
+    watch: called while waiting, and with each servo that answers.
     """
     framer = Framer()
     answers = {}

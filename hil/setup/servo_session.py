@@ -1,8 +1,8 @@
 """A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
-A session holds the port. One inside another of the same arm shares it, so that the steps of a pilot write each EEPROM
-register once, and put it back once, when the outermost block is left, however that is. What a killed program left
-behind is taken for the servos' own settings, and put back at the end.
+A session holds the port. A session inside another one for the same arm shares it, so that the steps of a pilot write
+each EEPROM register only once, and restore it once, when the outermost block is left for whatever reason. If a killed
+program left saved settings behind, these count as the servos' own and are restored at the end.
 """
 
 import sys
@@ -20,7 +20,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
-from hil.drivers.shield import signals_held_back
+from hil.drivers.torque_off import signals_held_back
 from hil.errors import RunFolderError
 from hil.setup import settings_file
 from hil.setup.current_limit import current_limit_ticks
@@ -30,33 +30,34 @@ from hil.setup.settings_file import Kept
 Say = Callable[[str], None]
 
 SETTINGS_NAME = "servo_settings.json"
-"""In the run folder: a copy of what was kept."""
+"""Name of the copy of the saved settings in the run folder."""
 
 
 REBOOT_S = 0.6
-"""A servo that does not answer at the end may be booting: this long until it is asked once more [s]."""
+"""Time before a servo that does not answer at the end, and may be booting, is tried again [s]."""
 
 
 def to_stderr(text: str) -> None:
-    """Tell the user, who may be reading results from standard output."""
+    """Print a message on standard error; standard output may be reserved for results."""
     with suppress(OSError, ValueError):
         print(f"hil: {text}", file=sys.stderr)
 
 
 @dataclass
 class ServoSession:
-    """An open bus and what its servos were set to. `servo_session` makes them."""
+    """An open bus and the saved settings of its servos; created by `servo_session`."""
 
     bus: ServoBus
     _say: Say
     _kept: dict[Joint, Kept] = field(default_factory=dict)
     shared: int = 0
-    """How many blocks inside this one have used the bus."""
+    """Number of inner blocks that have used the bus."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
-        """Check who answers and that nobody holds the arm; keep the settings; raises as `ServoBus.open`.
+        """Check that the servos answer and that nobody holds the arm, then save their settings. Raises as
+        `ServoBus.open`.
 
-        Nothing is written to a servo before its settings are on the disk.
+        Nothing is written to a servo before its settings are on disk.
         """
         bus = self.bus
         bus.check_identity()
@@ -73,7 +74,7 @@ class ServoSession:
                 settings = _before(left[joint], settings)
                 self._say(
                     f"{joint.title}: an earlier run ended before it could restore its settings "
-                    f"({left[joint].since}); this one does."
+                    f"({left[joint].since}); this one will."
                 )
             changed = {"Operating Mode": int(joint.mode)}
             if joint.mode is Mode.CURRENT:
@@ -96,7 +97,7 @@ class ServoSession:
             self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
     def end(self) -> None:
-        """Restore every servo's settings; name those that cannot be restored. Never raises DriverError."""
+        """Restore every servo's settings and report those that cannot be restored. Never raises DriverError."""
         failed = self._put_back(self._kept)
         if failed:
             clock = self.bus.port.clock
@@ -109,7 +110,7 @@ class ServoSession:
             )
 
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
-        """Why it did not work, for each of these joints with which it did not."""
+        """Restore the settings of these joints; return the error of each joint that failed."""
         failed: dict[Joint, DriverError] = {}
         for joint in joints:
             try:
@@ -126,10 +127,10 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 
 @contextmanager
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
-    """The open bus with every servo in its mode and torque off, prepared for exchanges; settings put back at the end.
+    """Open the bus with every servo in its mode and torque off, prepared for exchanges; restore settings at the end.
 
-    folder: run folder that gets a copy of the settings. say: receives messages for the user.
-    Raises as `ServoBus.open`, and RunFolderError.
+    folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises as
+    `ServoBus.open`, and RunFolderError.
     """
     outer = _outermost.get()
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
@@ -153,21 +154,21 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
 
 def has_moved() -> bool:
-    """Whether the arm may hang where an earlier run of the same session has left it, held by friction."""
+    """Whether an earlier run of this session may have left the arm away from its rest pose, held by friction."""
     outer = _outermost.get()
     return outer is not None and outer.shared > 1
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:
-    """Settings of this joint's servo that a terminated program left unrestored."""
+    """Settings of this joint's servo that a terminated program left unrestored; None if there are none."""
     kept = settings_file.load(port, joint.id, joint.servo.name)
-    return kept if kept is not None and kept.is_ours_to_mend else None
+    return kept if kept is not None and kept.may_restore else None
 
 
 def recover(servo: Servo, port: str) -> list[str]:
-    """Restore settings that a terminated program left changed. Raises as `Servo.write`."""
+    """Restore settings that a terminated program left changed; return what was written. Raises as `Servo.write`."""
     kept = settings_file.load(port, servo.id, servo.table.model)
-    if kept is None or not kept.is_ours_to_mend:
+    if kept is None or not kept.may_restore:
         return []
     if servo.read("Torque Enable"):
         servo.write("Torque Enable", 0)
@@ -177,10 +178,10 @@ def recover(servo: Servo, port: str) -> list[str]:
 
 
 def _before(kept: Kept, present: dict[str, int]) -> dict[str, int]:
-    """What the servo was set to before the program that was killed; what somebody has changed since then stays.
+    """The settings before the program that was killed, except for registers that somebody has changed since.
 
-    A register that holds neither what that program set nor what it found was changed by somebody else. With another
-    Operating Mode the goals and gains belong to that mode.
+    A register that holds neither the value set by that program nor the one it found was changed by somebody else. If
+    that is the Operating Mode, goals and gains belong to the new mode and are kept.
     """
     theirs = {name for name, value in kept.changed.items() if present.get(name) not in (value, kept.settings.get(name))}
     wanted = present if "Operating Mode" in theirs else kept.settings

@@ -1,4 +1,4 @@
-"""Set up one servo: ID, baud rate, return delay. Every EEPROM write is confirmed first and read back afterwards."""
+"""Configure one servo: ID, baud rate, return delay. Every EEPROM write is confirmed first and read back afterwards."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,11 +15,11 @@ Confirm = Callable[[str], bool]
 RETURN_DELAY_UNIT_US = 2
 _ATTEMPTS = 3
 _PING_ONLY = load_control_table("XM430-W350")
-# Model Number, ID and the like stand at the same addresses in every X-series table.
+# Model Number, ID and similar registers have the same addresses in every X-series table.
 
 
 class Change(NamedTuple):
-    """One register: what it held, what it was to hold, and whether it was written (read back) or declined."""
+    """The change of one register: old and requested value, and whether it was written (and read back) or declined."""
 
     register: str
     before: int
@@ -28,7 +28,7 @@ class Change(NamedTuple):
 
 
 def open_servo(port: Port, servo_id: int) -> Servo:
-    """The servo with this ID, by whatever model it is; raises NoReply, WrongModel, WrongSetting when torque is on."""
+    """Open the servo with this ID, whatever its model. Raises NoReply, WrongModel, and WrongSetting if torque is on."""
     number = Servo(port, servo_id, _PING_ONLY, f"The servo with ID {servo_id}").ping()
     model = model_names().get(number)
     if model is None:
@@ -52,11 +52,13 @@ def set_up(
     return_delay_us: int | None = None,
     secondary_id: int | None = None,
 ) -> list[Change]:
-    """Make the changes that are asked for and differ from what is there, each after `confirm` said yes to its question.
+    """Make the requested changes that differ from the current values, each after `confirm` has agreed.
 
-    Raises ServoRefused where a register does not read back as written, WrongSetting where the new ID is taken, and
-    what `Servo.read` raises. The port is left at the baud at which the servo was last heard. A status packet lost while
-    ID or baud rate changes is not a failure: the servo is searched for at both.
+    The port is left at the baud rate at which the servo was last heard. A status packet lost while ID or baud rate
+    changes is not a failure: the servo is searched for at both the old and the new value.
+
+    Raises ServoRefused if a register does not read back as written, WrongSetting if the new ID is taken, and what
+    `Servo.read` raises.
     """
     changes = []
     if return_delay_us is not None:
@@ -121,7 +123,7 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
     question = f"{servo.title}: change its baud from {former} to {baud}? All servos on a bus must use the same one."
     if before == after:
         return Change(name, before, after, False)
-    # First whether the adapter can do it at all: a servo at a baud that nobody here speaks is lost.
+    # First check that the adapter supports this rate: otherwise the servo would become unreachable.
     port.set_baud(baud)
     try:
         taken = _answers(servo)
@@ -130,8 +132,7 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
     if taken:
         raise WrongSetting(
             f"At {baud} baud another servo answers to ID {servo.id}. Two servos with the same ID reply at once: give "
-            "one "
-            "of them another ID first."
+            "one of them another ID first."
         )
     if not confirm(question):
         return Change(name, before, after, False)
@@ -151,7 +152,7 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
 
 
 def _write_blind(servo: Servo, register: str, value: int) -> None:
-    """Write a register whose status may be lost: where the servo is then, whoever called looks for."""
+    """Write a register whose status reply may be lost; the caller checks the outcome."""
     with suppress(NoReply, WrongReply):
         servo.write_only(register, value, attempts=1)
 

@@ -1,7 +1,7 @@
-"""What servos were set to before a program touched them, in files that outlive the program.
+"""The servos' settings before a program changed them, in files that outlive the program.
 
-One file a servo, named after port, ID and model, in the user's state folder: whatever ends the program, the next one on
-that port finds it there and puts the settings back.
+There is one file per servo in the user's state folder, named after port, ID and model: however a program ends, the next
+one on that port finds the file and restores the settings.
 """
 
 import json
@@ -20,7 +20,10 @@ _LONGEST_NAME = 80
 
 @dataclass(frozen=True)
 class Kept:
-    """One servo's settings. changed: the EEPROM registers that the program sets, to what; program: its process ID."""
+    """Saved settings of one servo.
+
+    changed: the EEPROM registers that the program sets, with their values. program: its process ID.
+    """
 
     port: str
     id: int
@@ -35,8 +38,8 @@ class Kept:
         return settings_path(self.port, self.id, self.model)
 
     @property
-    def is_ours_to_mend(self) -> bool:
-        """Whether the program that wrote it is gone; or is this one."""
+    def may_restore(self) -> bool:
+        """Whether this process may restore the settings: the program that saved them has ended, or is this one."""
         if self.program == os.getpid():
             return True
         try:
@@ -45,25 +48,25 @@ class Kept:
             return True
         except OSError:
             return False
-        # Whoever has a real port has it for himself, so a program that lives has given this one up.
+        # A real port is opened exclusively, so that program no longer uses it although it is still running.
         return "://" not in self.port
 
 
 def state_folder() -> Path:
-    """Where this user's programs keep what must outlive them (XDG base directories)."""
+    """Folder for persistent state of this user's programs (XDG base directories)."""
     given = os.environ.get("XDG_STATE_HOME", "")
     base = Path(given) if given and Path(given).is_absolute() else Path.home() / ".local" / "state"
     return base / "hil" / "servos"
 
 
 def settings_path(port: str, servo_id: int, model: str) -> Path:
-    """The file of one servo."""
+    """Path of the file of one servo."""
     name = re.sub(r"[^A-Za-z0-9]+", "-", port).strip("-")[-_LONGEST_NAME:]
     return state_folder() / f"{name}_ID{servo_id}_{model}.json"
 
 
 def keep(port: str, servo_id: int, model: str, settings: dict[str, int], changed: dict[str, int]) -> Kept:
-    """Write the file of a servo, on the disk when this returns. Raises RunFolderError."""
+    """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError."""
     since = datetime.now().astimezone().isoformat(timespec="seconds")
     kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since)
     write_durably(kept.path, {"schema": SCHEMA, **asdict(kept)})
@@ -71,7 +74,7 @@ def keep(port: str, servo_id: int, model: str, settings: dict[str, int], changed
 
 
 def load(port: str, servo_id: int, model: str) -> Kept | None:
-    """What an earlier program left behind for this servo; None when there is nothing that can be read."""
+    """The settings that an earlier program left for this servo; None if there is no readable file."""
     path = settings_path(port, servo_id, model)
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -88,13 +91,13 @@ def load(port: str, servo_id: int, model: str) -> Kept | None:
 
 
 def forget(kept: Kept) -> None:
-    """Remove the file: the servo is as it was."""
+    """Remove the file, because the servo's settings have been restored."""
     with suppress(OSError):
         kept.path.unlink(missing_ok=True)
 
 
 def write_durably(path: Path, value: object) -> None:
-    """Write a JSON file whole, and have it on the disk. Raises RunFolderError."""
+    """Write a JSON file completely and flush it to disk. Raises RunFolderError."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What would go wrong with a study, said before anything runs."""
+"""Checks of a study before anything runs."""
 
 import shutil
 from pathlib import Path
@@ -8,24 +8,25 @@ import tomli_w
 from hil.config.schema import Config, parse_config
 from hil.errors import ConfigError
 from hil.study.draw import arm_path, arm_values, drawn, put, run_count
-from hil.study.schema import Study
+from hil.study.schema import ON_ARM, Study
 
 BYTES_A_ROW = 4_000
-"""Of Parquet, generously: some hundred columns."""
+"""Generous estimate of the Parquet size of one row [bytes], for about a hundred columns."""
 
 _SAMPLE_BYTES = 256
 _REPORT_BYTES = 1_500_000
 _LOOKED_AT = 32
-"""Runs whose values are put into the arm's file and checked, spread over the study."""
+"""Number of runs, spread over the study, whose values are inserted into the arm's file and checked."""
 
 
 def check_study(study: Study, out: Path) -> int:
-    """How many runs it has; raises ConfigError for a field that does not exist, a bad value, or too little disk."""
+    """Number of runs. Raises ConfigError for an unknown field, an invalid value, or insufficient disk space."""
     runs = run_count(study)
-    if study.study.task in ("identify", "dry_run"):
+    if study.study.task in ON_ARM:
         step = max(1, runs // _LOOKED_AT)
         for run in range(0, runs, step):
             config = checked_arm(study, run)
+            _check_fake(study, config)
         needed = runs * (BYTES_A_ROW + (_folder_bytes(config) if study.keep.run_folders else 0))
     else:
         if study.vary and study.study.task == "empty" and study.study.config is not None:
@@ -41,7 +42,7 @@ def check_study(study: Study, out: Path) -> int:
 
 
 def arm_toml(study: Study, run: int) -> str:
-    """The arm's file with the values of this run; raises ConfigError for a key that leads nowhere."""
+    """The arm's file with the values of this run. Raises ConfigError for a key that does not exist."""
     if study.study.config is None:
         return ""
     values = arm_values(study)
@@ -57,12 +58,23 @@ def arm_toml(study: Study, run: int) -> str:
 
 
 def checked_arm(study: Study, run: int) -> Config:
-    """The arm's configuration of this run; raises ConfigError, which names the run and its values."""
+    """The arm's configuration of this run. Raises ConfigError, whose message names the run and its values."""
     try:
         return parse_config(arm_toml(study, run), arm_path(study))
     except ConfigError as error:
         said = ", ".join(f"{key} = {value!r}" for key, value in drawn(study, run).items())
         raise ConfigError(f"{study.path}: run {run} ({said}) is not a valid arm: {error}") from error
+
+
+def _check_fake(study: Study, config: Config) -> None:
+    """Raise ConfigError for an arm that would move, unattended and by several workers at once."""
+    if study.study.task != "dry_run" and not config.url.startswith("fake://"):
+        raise ConfigError(
+            f'{study.path}: study.config: {arm_path(study).name} has port.url = "{config.port.url}", and a study moves '
+            'no real arm. Set port.url = "fake://", or record its runs one by one and use task = "estimate".'
+        )
+    if study.study.task == "fault" and config.experiment.pilot:
+        raise ConfigError(f'{study.path}: task = "fault" plays one experiment: set experiment.pilot = false.')
 
 
 def _folder_bytes(config: Config) -> int:
@@ -74,7 +86,7 @@ def _folder_bytes(config: Config) -> int:
 
 
 def _existing(path: Path) -> Path:
-    """The nearest folder above that is there."""
+    """The nearest existing parent folder."""
     for place in (path.absolute(), *path.absolute().parents):
         if place.exists():
             return place

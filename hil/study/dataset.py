@@ -1,6 +1,6 @@
-"""The rows of a study as a Parquet dataset that can be read while it grows.
+"""The rows of a study as a Parquet dataset that can be read while it is being written.
 
-DIR/rows/part-000000.parquet, ...   written whole or not at all, each row in one part only
+DIR/rows/part-000000.parquet, ...   each written completely or not at all; a row is in only one part
 DIR/study.toml                      an exact copy of the study
 DIR/about.json                      versions, seed, number of runs
 """
@@ -16,17 +16,19 @@ from hil.errors import RunFolderError
 from hil.study.work import Row
 
 _PART = "part-*.parquet"
+_WHOLE = ("run", "seed", "worker")
+"""Columns of integers."""
 
 
 class Dataset:
-    """The parts in a folder. One writer at a time."""
+    """The Parquet files in a folder; only one writer at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._next = 1 + max((_number(path) for path in folder.glob(_PART)), default=-1)
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Write one part; raises RunFolderError, for instance when the disk is full."""
+        """Write one part. Raises RunFolderError, for example if the disk is full."""
         if not rows:
             return
         path = self.folder / f"part-{self._next:06d}.parquet"
@@ -47,18 +49,18 @@ class Dataset:
         return found
 
     def table(self) -> pa.Table:
-        """All rows, in the order of their runs; columns that a part lacks are null there."""
+        """All rows in the order of their runs; columns missing in a part are null there."""
         parts = [_read(path) for path in self._parts()]
         if not parts:
             return pa.table({"run": pa.array([], pa.int64())})
         return pa.concat_tables(_alike(parts), promote_options="permissive").sort_by("run")
 
     def compact(self) -> None:
-        """One part in the order of the runs in place of many, so that every reader sees one schema."""
+        """Replace all parts by a single one in the order of the runs, so that every reader sees one schema."""
         old = self._parts()
         table = self.table()
         whole = self.folder / f"part-{self._next:06d}.parquet"
-        # Readers between these two steps see rows twice, never too few; `_parts` drops what a crash left.
+        # Between these two steps readers see rows twice, but never too few; `_parts` ignores leftovers of a crash.
         temporary = whole.with_suffix(".partial")
         marked = table.replace_schema_metadata({b"replaces": ",".join(path.name for path in old).encode()})
         pq.write_table(marked, temporary)
@@ -77,7 +79,7 @@ class Dataset:
 
 
 def _alike(parts: list[pa.Table]) -> list[pa.Table]:
-    """Columns that hold numbers in one part and text in another become text in all."""
+    """Convert columns that hold numbers in one part and text in another to text."""
     kinds: dict[str, set[pa.DataType]] = {}
     for part in parts:
         for field in part.schema:
@@ -105,7 +107,7 @@ def _read(path: Path, columns: list[str] | None = None) -> pa.Table:
 
 
 def _table(rows: Iterable[Row]) -> pa.Table:
-    """Columns in order of appearance; whole and broken numbers of one column become doubles, what differs text."""
+    """Make a table with columns in order of appearance; mixtures of integers and floats become doubles, others text."""
     rows = list(rows)
     names = list(dict.fromkeys(name for row in rows for name in row))
     return pa.table({name: _column([row.get(name) for row in rows], name) for name in names})
@@ -113,11 +115,11 @@ def _table(rows: Iterable[Row]) -> pa.Table:
 
 def _column(values: list[Any], name: str) -> pa.Array:
     kinds = {type(value) for value in values if value is not None}
-    if name == "run":
+    if name in _WHOLE:
         return pa.array(values, pa.int64())
     if kinds <= {bool}:
         return pa.array(values, pa.bool_()) if kinds else pa.nulls(len(values))
     if kinds <= {int, float}:
-        # Also where this part happens to hold whole numbers only: the next may not.
+        # Even if this part holds only integers, because the next one may not.
         return pa.array([None if value is None else float(value) for value in values], pa.float64())
     return pa.array([None if value is None else str(value) for value in values], pa.string())

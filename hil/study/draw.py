@@ -1,7 +1,6 @@
-"""What each run of a study is given: values drawn from its own random stream, put into the arm's TOML.
+"""The input of each run of a study: values drawn from its own random stream, inserted into the arm's TOML.
 
-Run number i draws from the stream (seed, i) alone, so that its values depend neither on the other runs nor on who
-works on it when.
+Run number i draws only from the stream (seed, i), so that its values do not depend on other runs or on the scheduling.
 """
 
 import tomllib
@@ -15,11 +14,12 @@ import numpy as np
 
 from hil.config.bundled import find_config
 from hil.errors import ConfigError
+from hil.fakes.description import found_beside
 from hil.study.schema import Draw, Scalar, Study
 
 
 def run_count(study: Study) -> int:
-    """How many rows the study has; raises ConfigError for a folder without recordings."""
+    """Number of rows of the study. Raises ConfigError for a folder without recordings."""
     if study.study.task == "estimate":
         return len(recordings(study))
     if study.study.runs is not None:
@@ -59,24 +59,29 @@ def _value(values: list[Scalar] | Draw, run: int, rng: np.random.Generator) -> S
         return float(rng.normal(mean, std))
     if values.integer is not None:
         return int(rng.integers(values.integer[0], values.integer[1] + 1))
-    assert values.choice is not None  # one of them is given, as Draw checks
+    assert values.choice is not None  # Draw checks that one of them is given
     return values.choice[int(rng.integers(len(values.choice)))]
 
 
 def arm_values(study: Study) -> dict[str, Any]:
-    """The arm's TOML as a dictionary; raises ConfigError."""
+    """The arm's TOML as a dictionary. Raises ConfigError."""
     path = arm_path(study)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ConfigError(f"{study.path}: study.config = {study.study.config!r}: {path}: {reason}.") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{study.path}: study.config: {path}: not valid TOML: {error}.") from error
+    for table in (values.get("arm"), values.get("fake", {}).get("chain")):
+        if isinstance(table, dict) and isinstance(table.get("urdf"), str):
+            # A run's arm is a file in another folder.
+            table["urdf"] = str(found_beside(path.parent.absolute(), table["urdf"]))
+    return values
 
 
 def arm_path(study: Study) -> Path:
-    """The arm's TOML: relative to the study's own folder, or a bundled one."""
+    """Path of the arm's TOML: relative to the study's folder, or a bundled file."""
     assert study.study.config is not None  # checked by the schema
     given = Path(study.study.config)
     beside = study.path.parent / given
@@ -84,15 +89,15 @@ def arm_path(study: Study) -> Path:
 
 
 def put(values: dict[str, Any], key: str, value: Scalar) -> None:
-    """Set `key`, such as "fake.arm.drives.0.coulomb", within `values`; raises KeyError with the part that is not there.
+    """Set `key`, such as "fake.arm.drives.0.coulomb", in `values`. Raises KeyError with the missing part of the key.
 
     Tables may be new (settings that the file leaves at their defaults; the arm's own check knows their names), entries
-    of lists may not.
+    of lists may not, except in a list that the file does not have: "fake.faults.0.kind" makes the first fault.
     """
     *parents, last = key.split(".")
     place: Any = values
-    for part in parents:
-        place = _inside(place, part)
+    for part, after in zip(parents, [*parents[1:], last], strict=True):
+        place = _inside(place, part, after)
     if isinstance(place, list):
         _inside(place, last)
         place[int(last)] = value
@@ -102,16 +107,22 @@ def put(values: dict[str, Any], key: str, value: Scalar) -> None:
         raise KeyError(last)
 
 
-def _inside(place: Any, part: str) -> Any:
+class _NewList(list[Any]):
+    """A list that the file does not have, which therefore may grow."""
+
+
+def _inside(place: Any, part: str, after: str = "") -> Any:
     if isinstance(place, dict):
-        return place.setdefault(part, {})
+        return place.setdefault(part, _NewList() if after.isdigit() else {})
+    if isinstance(place, _NewList) and part == str(len(place)):
+        place.append({})
     if isinstance(place, list) and part.isdigit() and int(part) < len(place):
         return place[int(part)]
     raise KeyError(part)
 
 
 def recordings(study: Study) -> list[Path]:
-    """The run folders that hold a recording, sorted; raises ConfigError when there is none."""
+    """The run folders that hold a recording, sorted. Raises ConfigError if there are none."""
     assert study.study.recordings is not None  # checked by the schema
     given = Path(study.study.recordings)
     beside = study.path.parent / given
@@ -123,7 +134,7 @@ def recordings(study: Study) -> list[Path]:
 
 
 def _recorded(folder: Path) -> Iterator[Path]:
-    """Run folders; the steps of a pilot within one are not arms of their own."""
+    """Yield run folders; the steps of a pilot inside one are not separate runs."""
     if (folder / "samples.npy").is_file() and (folder / "config.toml").is_file():
         yield folder
         return

@@ -1,8 +1,13 @@
-"""The workers: this machine's cores, a running Dask scheduler by its address, or a Slurm queue."""
+"""The workers of a study: local cores, a running Dask scheduler, or a Slurm queue."""
 
+import logging
 import os
+import re
+import sys
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -16,19 +21,31 @@ if TYPE_CHECKING:
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "HIL_THREADS"), "1"
 )
-"""A worker is one process with one thread: of BLAS, of numba, and of ours."""
+"""Environment that limits each worker process to one thread in BLAS, numba and hil."""
+
+_DASK: dict[str, Any] = {
+    "distributed.worker.daemon": False,
+    # Dask's own logs and profiles, which grow for hours with every task before they reach their length.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.log-length": 100,
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.admin.system-monitor.log-length": 240,
+}
+
+_ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d{1,5}")
 
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
-_MOST_DEATHS = 1000
-"""Of workers on one run, before it is given up: a machine that reboots is no fault of the run."""
+_MOST_DEATHS = 10
+"""Number of worker losses during one run before the run has failed: a machine may reboot several times, but a run that
+needs too much memory never ends."""
 
 
 @contextmanager
 def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> Iterator["Client"]:
-    """A connected Dask client. scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
+    """Connect to a Dask cluster; scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
 
-    Raises MissingExtra without Dask, ConfigError where no scheduler answers, no worker is there, or a worker runs other
+    Raises MissingExtra without Dask, and ConfigError if no scheduler answers, there is no worker, or a worker has other
     versions.
     """
     try:
@@ -36,7 +53,8 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
         from distributed import Client
     except ImportError as error:
         raise MissingExtra("hil study needs Dask: pip install 'hil[study]'.") from error
-    dask.config.set({"distributed.scheduler.allowed-failures": _MOST_DEATHS, "distributed.worker.daemon": False})
+    dask.config.set({**_DASK, "distributed.scheduler.allowed-failures": _MOST_DEATHS})
+    _silence()
     wanted = count or engine.workers or os.cpu_count() or 1
     with _cluster(engine, scheduler, wanted) as address:
         try:
@@ -51,14 +69,36 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
             yield client
 
 
+def _silence() -> None:
+    """Keep Dask's own log off the terminal: whoever asked tells what went wrong."""
+    silent = ("distributed", "tornado", "asyncio")
+    for name in [each for each in logging.root.manager.loggerDict if each.split(".")[0] in silent]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
 @contextmanager
 def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator[Any]:
-    """What a client connects to; what was started here is closed again."""
+    """Start or find a cluster; yields what a client connects to, and closes what was started here."""
     memory = f"{engine.worker_memory_gib:g}GiB"
     if scheduler is None:
-        from distributed import LocalCluster
+        with _local(count, memory) as cluster:
+            yield cluster
+    elif scheduler == "slurm":
+        from hil.study.slurm import slurm_cluster
 
-        with LocalCluster(
+        with slurm_cluster(count, memory, ONE_THREAD) as cluster:
+            yield cluster
+    else:
+        if not _ADDRESS.fullmatch(scheduler):
+            raise ConfigError(f'--scheduler {scheduler}: give its address, such as tcp://HOST:8786, or "slurm".')
+        yield scheduler
+
+
+def _local(count: int, memory: str) -> Any:
+    from distributed import LocalCluster
+
+    try:
+        return LocalCluster(
             n_workers=count,
             threads_per_worker=1,
             memory_limit=memory,
@@ -66,35 +106,49 @@ def _cluster(engine: EngineTable, scheduler: str | None, count: int) -> Iterator
             dashboard_address="127.0.0.1:0",
             host="127.0.0.1",
             silence_logs=50,
-        ) as cluster:
-            yield cluster
-    elif scheduler == "slurm":
-        try:
-            from dask_jobqueue import SLURMCluster
-        except ImportError as error:
-            raise MissingExtra("--scheduler slurm needs dask-jobqueue: pip install 'hil[slurm]'.") from error
-        prologue = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
-        with SLURMCluster(cores=1, processes=1, memory=memory, job_script_prologue=prologue) as cluster:
-            cluster.scale(count)
-            yield cluster
-    else:
-        yield scheduler
+        )
+    except RuntimeError as error:
+        raise ConfigError(
+            f"The workers did not start ({error}). A script that starts them does so below `if __name__ == "
+            '"__main__":`, since each worker imports it; with little memory, ask for fewer (--workers).'
+        ) from error
 
 
-def _versions() -> dict[str, str]:
-    """Of this process: of a worker, where Dask runs it there."""
-    return {"hil": __version__, **{name: version(name) for name in _PACKAGES}}
+@contextmanager
+def executor(scheduler: str | None = None, count: int | None = None) -> Iterator[Executor]:
+    """The same workers with the interface of concurrent.futures, for `executor=` of a dry run or an estimate.
+
+    Args:
+        scheduler: as of `workers`.
+        count: workers; one per core unless given.
+
+    Raises:
+        ConfigError, MissingExtra: as of `workers`.
+    """
+    with workers(EngineTable(), scheduler, count) as client:
+        yield client.get_executor(pure=False)
+
+
+def versions() -> dict[str, str]:
+    """Of what makes the numbers, in this process: of a worker, where Dask runs it there."""
+    return {"hil": __version__, **_package_versions()}
+
+
+@cache
+def _package_versions() -> dict[str, str]:
+    python = f"{sys.version_info.major}.{sys.version_info.minor}"
+    return {"python": python, **{name: version(name) for name in _PACKAGES}}
 
 
 def _check_versions(client: "Client", scheduler: str | None) -> None:
-    """Other versions make other numbers, so they are refused by name."""
+    """Refuse workers with other package versions, which would give different numbers."""
     try:
         client.wait_for_workers(1, timeout=600 if scheduler == "slurm" else 60)
     except TimeoutError as error:
         raise ConfigError(f"The scheduler {scheduler or 'on this machine'} has no worker.") from error
-    here = _versions()
+    here = versions()
     try:
-        everywhere = client.run(_versions)
+        everywhere = client.run(versions)
     except Exception as error:
         raise ConfigError(f"A worker cannot import hil ({error}): install hil {__version__} there.") from error
     for worker, there in everywhere.items():

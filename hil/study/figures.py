@@ -1,4 +1,4 @@
-"""What the rows of a study say: rates with their intervals, quantiles of every number."""
+"""Summary figures of a study: rates with confidence intervals, and quantiles of every number."""
 
 import math
 from collections import Counter
@@ -9,12 +9,15 @@ import pyarrow as pa
 
 _NORMAL_95 = 1.959964
 _MOST_CATEGORIES = 12
+_NO_FIGURE = ("status", "message", "where", "task", "seed", "config_sha256", "worker", "recording")
+"""Columns that tell one run from another; a study has no rate or quantile of them."""
+
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 
 
 @dataclass(frozen=True)
 class Rate:
-    """How many of how many, with the 95 % interval of the share (Wilson's, which holds for few and for all)."""
+    """A count out of a total, with the 95 % confidence interval of the fraction (Wilson's)."""
 
     count: int
     of: int
@@ -25,7 +28,7 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """E. B. Wilson, Journal of the American Statistical Association 22 (1927) 209."""
+        """Confidence interval by E. B. Wilson, Journal of the American Statistical Association 22 (1927) 209."""
         if not self.of:
             return 0.0, 1.0
         z2, n, p = _NORMAL_95**2, self.of, self.share
@@ -36,7 +39,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Spread:
-    """Quantiles of one column (hil.study.figures.QUANTILES), over `of` runs that have it."""
+    """Quantiles of one column (hil.study.figures.QUANTILES), over the `of` runs that have a value."""
 
     name: str
     of: int
@@ -45,7 +48,11 @@ class Spread:
 
 @dataclass(frozen=True)
 class Figures:
-    """Of a whole study. categories: per text column, each value's rate. failures: each message's rate."""
+    """Figures of a complete study.
+
+    done: rate of successful runs. categories: per text column, the rate of each value. failures: count of each message.
+    spreads: quantiles of each numeric column.
+    """
 
     done: Rate
     categories: dict[str, dict[str, Rate]]
@@ -54,14 +61,14 @@ class Figures:
 
 
 def figures(table: pa.Table) -> Figures:
-    """The figures of a dataset's rows (hil.study.dataset.Dataset.table)."""
+    """Compute the figures of a dataset's rows (hil.study.dataset.Dataset.table)."""
     runs = table.num_rows
     columns = {name: table.column(name).to_pylist() for name in table.column_names if name != "run"}
     status = columns.get("status", [])
     categories, spreads = {}, []
     for name, values in columns.items():
         known = [value for value in values if value is not None]
-        if name in ("status", "message", "where", "task", "config_sha256", "worker", "recording") or not known:
+        if name in _NO_FIGURE or name.endswith(".message") or not known:
             continue
         if all(isinstance(value, str | bool) for value in known):
             counted = Counter(map(str, known))
@@ -82,6 +89,6 @@ def figures(table: pa.Table) -> Figures:
 
 
 def _without_numbers(message: str) -> str:
-    """One message for all runs that failed alike."""
+    """Replace numbers in a message, so that similar failures are counted together."""
     words = message.split()
     return " ".join("…" if any(sign.isdigit() for sign in word) else word for word in words)[:160]

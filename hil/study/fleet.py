@@ -1,4 +1,4 @@
-"""Many arms of one type: how much they differ, and which one is unlike the others."""
+"""Comparison of many arms of one type: how much they differ, and which ones are outliers."""
 
 from dataclasses import dataclass
 
@@ -8,14 +8,14 @@ import pyarrow as pa
 FEWEST_ARMS = 4
 _MAD_TO_STD = 1.4826
 UNLIKE = 4.0
-"""Robust standard deviations from the fleet's median, beyond what chance among so many values explains."""
+"""Threshold for an outlier: robust standard deviations from the fleet's median."""
 
 _PREFIX, _SUFFIX = "parameters.", ".value"
 
 
 @dataclass(frozen=True)
 class FleetSpread:
-    """One parameter over the fleet: median, and spread as 1.4826 times the median absolute deviation [SI]."""
+    """One parameter over the fleet: median and robust standard deviation (1.4826 times the MAD) [SI]."""
 
     name: str
     median: float
@@ -24,7 +24,7 @@ class FleetSpread:
 
 @dataclass(frozen=True)
 class Unlike:
-    """One arm's parameter far from the fleet's. deviations: from the median, in combined standard deviations."""
+    """An outlier: a parameter of one arm; deviations: distance from the median in combined standard deviations."""
 
     recording: str
     name: str
@@ -35,7 +35,7 @@ class Unlike:
 
 @dataclass(frozen=True)
 class Fleet:
-    """What a folder of recordings says together. unlike: most striking first; empty for too few arms."""
+    """Comparison of a fleet; unlike: outliers, largest first; empty if there are too few arms."""
 
     arms: int
     spreads: tuple[FleetSpread, ...]
@@ -43,9 +43,9 @@ class Fleet:
 
 
 def fleet(table: pa.Table) -> Fleet:
-    """From the rows of a study with task = "estimate"; arms that could not be estimated are left out.
+    """Compare the rows of a study with task = "estimate"; arms that could not be estimated are ignored.
 
-    An arm's own standard error counts beside the fleet's spread, so that a poor recording is not called an unlike arm.
+    An arm's standard error is added to the fleet's spread, so that a poor recording does not count as an outlier.
     """
     names = [name[len(_PREFIX) : -len(_SUFFIX)] for name in table.column_names if _is_value(name)]
     recordings = table.column("recording").to_pylist() if "recording" in table.column_names else []

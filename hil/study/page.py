@@ -1,4 +1,4 @@
-"""A study as one HTML page that needs no network: rates, messages, quantiles with a small histogram each."""
+"""A study as one self-contained HTML page: rates, messages, and quantiles with small histograms."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +17,7 @@ _BINS = 24
 
 
 def write_page(table: pa.Table, title: str, path: Path) -> Figures:
-    """Write the page; the figures on it. Raises RunFolderError when it cannot be written."""
+    """Write the page and return the figures on it. Raises RunFolderError if it cannot be written."""
     found = figures(table)
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -40,7 +40,7 @@ def write_page(table: pa.Table, title: str, path: Path) -> Figures:
 
 
 def _histogram(table: pa.Table, name: str) -> list[float]:
-    """Heights from 0 to 1 of equally wide bins between the 1 % and the 99 % quantile."""
+    """Heights (0 to 1) of equally wide bins between the 1 % and the 99 % quantile."""
     values = np.array([float(each) for each in table.column(name).to_pylist() if each is not None])
     values = values[np.isfinite(values)]
     low, high = np.quantile(values, [0.01, 0.99])

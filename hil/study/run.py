@@ -1,27 +1,22 @@
-"""A study from its file to its rows: specifications out to the workers, rows back into the dataset."""
+"""Run a study: send specifications to the workers and write the returned rows to the dataset."""
 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hil import __version__
-from hil.errors import ConfigError, RunFolderError
-from hil.runs.run_folder import write_json
 from hil.study.checks import arm_toml, check_study
 from hil.study.dataset import Dataset
 from hil.study.draw import drawn, recordings
-from hil.study.engine import workers
+from hil.study.engine import versions, workers
+from hil.study.folder import opened
+from hil.study.jobs import run_jobs
 from hil.study.schema import Study
-from hil.study.work import Row, Spec, work
+from hil.study.work import Row, Spec, lost_row, work
 
 if TYPE_CHECKING:
     from distributed import Client
-
-_AHEAD = 8
-"""Runs given to each worker beyond the one it works on: enough that none waits, few enough that memory stays flat."""
 
 _ROWS_A_PART, _SECONDS_A_PART = 1000, 5.0
 
@@ -31,6 +26,7 @@ DEFAULT_COLUMNS = {
         *("verdict.trust", "fit.residual_rms_ticks.*", "fit.model", "validation.held_out_rms.*", "model_choice.chosen"),
     ),
     "dry_run": ("*",),
+    "fault": ("fault.*",),
     "empty": ("*",),
 }
 DEFAULT_COLUMNS["estimate"] = (*DEFAULT_COLUMNS["identify"], "recording", "config")
@@ -38,7 +34,7 @@ DEFAULT_COLUMNS["estimate"] = (*DEFAULT_COLUMNS["identify"], "recording", "confi
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """How far it is. failed: runs that ended in an error, of those done. dashboard: the engine's own page."""
+    """Progress of a study; failed: number of runs that ended in an error; dashboard: URL of Dask's dashboard."""
 
     done: int
     runs: int
@@ -59,83 +55,61 @@ def run_study(
     worker_count: int | None = None,
     watch: Watch = lambda _: None,
 ) -> Dataset:
-    """Do all runs that have no row yet. Raises ConfigError and RunFolderError before anything runs, MissingExtra."""
+    """Do all runs that have no row yet.
+
+    Raises ConfigError and RunFolderError before anything runs, MissingExtra, and SchedulerLost.
+    """
     runs = check_study(study, out)
-    dataset = _opened(study, out, runs, resume)
-    missing = sorted(set(range(runs)) - dataset.done())
-    if missing:
-        with workers(study.engine, scheduler, worker_count) as client:
-            _work_through(client, study, out, missing, dataset, runs, watch)
-    dataset.compact()
+    with opened(study, out, runs, resume=resume) as dataset:
+        missing = sorted(set(range(runs)) - dataset.done())
+        if missing:
+            with workers(study.engine, scheduler, worker_count) as client:
+                _work_through(client, study, out, missing, dataset, runs, watch)
+        dataset.compact()
     return dataset
 
 
-def _opened(study: Study, out: Path, runs: int, resume: bool) -> Dataset:
-    """The dataset in `out`, new or of the same study."""
-    rows, copy = out / "rows", out / "study.toml"
-    text = study.path.read_bytes()
-    if copy.is_file():
-        if not resume:
-            raise RunFolderError(
-                f"{out} holds a study already: go on with --resume, or name another folder with --out."
-            )
-        if copy.read_bytes() != text:
-            raise ConfigError(f"{study.path} is not the study that {out} holds ({copy} differs): it cannot be resumed.")
-    elif resume and not out.is_dir():
-        raise RunFolderError(f"{out} holds no study to resume.")
-    try:
-        rows.mkdir(parents=True, exist_ok=True)
-        copy.write_bytes(text)
-    except OSError as error:
-        raise RunFolderError(f"{out} cannot be written: {error.strerror}.") from error
-    write_json(out / "about.json", {"schema": 1, "hil": __version__, "runs": runs, "seed": study.study.seed})
-    return Dataset(rows)
-
-
 def specifications(study: Study, out: Path, numbers: list[int]) -> Iterator[Spec]:
-    """What each run is given, made as it is needed."""
+    """Yield the specification of each run, created on demand."""
     columns = tuple(study.keep.columns or DEFAULT_COLUMNS[study.study.task])
     found = recordings(study) if study.study.task == "estimate" else []
     for run in numbers:
         keep_in = str(out.absolute() / "runs" / f"{run:06d}") if study.keep.run_folders else None
         recording = str(found[run].absolute()) if found else None
-        yield Spec(run, study.study.task, arm_toml(study, run), drawn(study, run), columns, recording, keep_in)
+        yield Spec(
+            run=run,
+            task=study.study.task,
+            toml=arm_toml(study, run),
+            varied=drawn(study, run),
+            columns=columns,
+            seed=study.study.seed,
+            versions=versions(),
+            seconds=study.engine.run_seconds,
+            recording=recording,
+            keep_in=keep_in,
+        )
 
 
 def _work_through(
     client: "Client", study: Study, out: Path, numbers: list[int], dataset: Dataset, runs: int, watch: Watch
 ) -> None:
-    """Keep every worker supplied, and write rows as they come; what has come is written whatever ends this."""
-    from distributed import as_completed
-
-    waiting = specifications(study, out, numbers)
-    window = max(1, len(client.scheduler_info()["workers"])) * (1 + _AHEAD)
-    futures = as_completed(
-        [client.submit(work, spec, key=_key(spec), pure=False) for spec in islice(waiting, window)],
-        loop=client.loop,
-        with_results=True,
-    )
+    """Write the rows as they arrive; rows received are written even after an error."""
+    specs = ((spec.run, spec) for spec in specifications(study, out, numbers))
     rows: list[Row] = []
     done, failed, began, written = runs - len(numbers), _failed(dataset), time.monotonic(), time.monotonic()
-    first = done
+    first, dashboard = done, client.dashboard_link or ""
     try:
-        for future, row in futures:
+        for ended in run_jobs(client, work, specs):
+            row = ended.result or lost_row(ended.item, ended.error)
             rows.append(row)
-            future.release()
-            for spec in islice(waiting, 1):
-                futures.add(client.submit(work, spec, key=_key(spec), pure=False))
             done, failed = done + 1, failed + (row["status"] != "done")
             if len(rows) >= _ROWS_A_PART or time.monotonic() - written > _SECONDS_A_PART:
                 dataset.append(rows)
                 rows, written = [], time.monotonic()
             left = (time.monotonic() - began) / (done - first) * (runs - done)
-            watch(StudyProgress(done, runs, failed, left, client.dashboard_link or ""))
+            watch(StudyProgress(done, runs, failed, left, dashboard))
     finally:
         dataset.append(rows)
-
-
-def _key(spec: Spec) -> str:
-    return f"run-{spec.run}"
 
 
 def _failed(dataset: Dataset) -> int:

@@ -1,12 +1,16 @@
-"""One run of a study, done by a worker: from its specification to one flat row. Whatever goes wrong is a row too."""
+"""One run of a study, done by a worker: turns a specification into one flat row, even if the run fails."""
 
+import ctypes
+import io
 import os
 import shutil
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from hashlib import sha256
 from pathlib import Path
@@ -14,20 +18,28 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from hil import __version__
+from hil.study.engine import versions
 
 Cell = bool | int | float | str | None
 Row = dict[str, Cell]
 
 TIMINGS = ("seconds", "cpu_seconds", "worker")
-"""Columns that differ from machine to machine; all others are the same whoever works."""
+"""Columns that depend on the machine; all others are the same on every worker."""
+
+
+_STATE = "XDG_STATE_HOME"
+
+_ONE_AT_A_TIME = threading.Lock()
+"""A worker that was started with several threads still does one run at a time: its settings are the process's."""
 
 
 @dataclass(frozen=True)
 class Spec:
-    """What a worker needs for one run. toml: the arm's file with this run's values in it, or "".
+    """Specification of one run.
 
-    recording: the run folder to estimate, or None. keep_in: where the run folder stays, None for nowhere.
+    toml: the arm's file with this run's values in it, or "". versions: what the worker must have. seconds: processor
+    time after which the run has failed. recording: the run folder to estimate, or None. keep_in: where the run folder
+    stays, None for nowhere.
     """
 
     run: int
@@ -35,30 +47,90 @@ class Spec:
     toml: str
     varied: Mapping[str, Cell]
     columns: tuple[str, ...]
+    seed: int = 1
+    versions: Mapping[str, str] = field(default_factory=dict)
+    seconds: float = 3600.0
     recording: str | None = None
     keep_in: str | None = None
 
 
+class WrongVersions(Exception):
+    """A worker that joined later has other versions than those the study was begun with."""
+
+
+class OutOfTime(Exception):
+    """A run took more processor time than engine.run_seconds allows."""
+
+
 def work(spec: Spec) -> Row:
-    """Do the run; its row. Nothing is raised but what stops the process (KeyboardInterrupt, SystemExit)."""
-    row: Row = {"run": spec.run, "task": spec.task, "status": "done", "message": ""}
+    """Do one run and return its row. Raises only KeyboardInterrupt and SystemExit."""
+    with _ONE_AT_A_TIME:
+        row = _row_of(spec)
+        began, used = time.perf_counter(), time.process_time()
+        try:
+            _check_versions(spec)
+            with threadpool_limits(limits=1), _at_most(spec.seconds), _place(spec) as folder:
+                row |= _result(spec, folder)
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            row |= _failure(error) | {"where": f"{Path(last.filename).name}:{last.lineno}"}
+        used = time.process_time() - used
+        return row | {"seconds": time.perf_counter() - began, "cpu_seconds": used, "worker": os.getpid()}
+
+
+def lost_row(spec: Spec, error: BaseException | None) -> Row:
+    """The row of a run that never came back, because it took its workers with it."""
+    why = RuntimeError("no worker brought it to an end") if error is None else error
+    if type(error).__name__ == "KilledWorker":
+        why = MemoryError("every worker that tried it died: it needs more than engine.worker_memory_gib, or crashes")
+    return _row_of(spec) | _failure(why) | {"seconds": None, "cpu_seconds": None, "worker": None}
+
+
+def _row_of(spec: Spec) -> Row:
+    row: Row = {"run": spec.run, "task": spec.task, "status": "done", "message": "", "seed": spec.seed}
     row |= {f"vary.{key}": value for key, value in spec.varied.items()}
-    row |= {"config_sha256": sha256(spec.toml.encode()).hexdigest()[:16], "hil": __version__}
-    began, used = time.perf_counter(), time.process_time()
+    return row | {"config_sha256": sha256(spec.toml.encode()).hexdigest()[:16], **spec.versions}
+
+
+def _failure(error: BaseException) -> Row:
+    lines = f"{type(error).__name__}: {error}".splitlines()
+    return {"status": "failed", "message": lines[0][:500]}
+
+
+def _check_versions(spec: Spec) -> None:
+    here = versions() if spec.versions else {}
+    other = [f"{name} {here.get(name)}, not {wanted}" for name, wanted in spec.versions.items() if here[name] != wanted]
+    if other:
+        raise WrongVersions(f"worker on {os.uname().nodename} has {'; '.join(other)}")
+
+
+@contextmanager
+def _at_most(seconds: float) -> Iterator[None]:
+    """Raise OutOfTime in this thread once the process has used so much processor time.
+
+    Not by a signal: runs are not done in a worker's main thread. Compiled code comes to its own end first.
+    """
+    runner, over, limit = threading.get_ident(), threading.Event(), time.process_time() + seconds
+
+    def watch() -> None:
+        while not over.wait(min(1.0, max(0.01, limit - time.process_time()))):
+            if time.process_time() > limit and not over.is_set():
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(runner), ctypes.py_object(OutOfTime))
+                return
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
     try:
-        with threadpool_limits(limits=1):
-            result = dict(flat(_done(spec)))
-        row |= {name: value for name, value in result.items() if _kept(name, spec.columns)}
-    except Exception as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        row |= {"status": "failed", "message": f"{type(error).__name__}: {error}".splitlines()[0][:500]}
-        row["where"] = f"{Path(last.filename).name}:{last.lineno}"
-    row |= {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - used, "worker": os.getpid()}
-    return row
+        yield
+    except OutOfTime:
+        raise OutOfTime(f"took more than {seconds:g} s of processor time (engine.run_seconds)") from None
+    finally:
+        over.set()
+        watcher.join()
 
 
 def flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Cell]]:
-    """Names with dots and plain values of nested dictionaries; lists by number, nothing longer than a few entries."""
+    """Flatten nested dictionaries and short lists to (dotted name, plain value) pairs."""
     if isinstance(value, Mapping):
         for key, entry in value.items():
             yield from flat(entry, f"{prefix}.{key}" if prefix else str(key))
@@ -71,34 +143,77 @@ def flat(value: Any, prefix: str = "") -> Iterator[tuple[str, Cell]]:
 
 
 _MOST_ENTRIES = 8
-"""A longer list (a covariance, a spectrum) is no figure of a row."""
+"""Longest list that is flattened; longer ones (a covariance, a spectrum) are left out."""
 
 
 def _kept(name: str, columns: tuple[str, ...]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in columns)
 
 
-def _done(spec: Spec) -> Any:
+def _result(spec: Spec, folder: Path) -> Row:
+    """The columns asked for; raises what the run raises, its folder's name taken out of the words."""
+    try:
+        result = dict(flat(_done(spec, folder)))
+    except Exception as error:
+        error.args = tuple(_without(folder, each) for each in error.args)
+        raise
+    return {name: _without(folder, value) for name, value in result.items() if _kept(name, spec.columns)}
+
+
+def _without(folder: Path, value: Any) -> Any:
+    """Text that does not depend on where a worker did the run."""
+    return value.replace(f"{folder}/", "") if isinstance(value, str) else value
+
+
+def _done(spec: Spec, folder: Path) -> Any:
     if spec.task == "empty":
         return {}
     if spec.task == "estimate":
-        return _estimated(spec)
-    folder = Path(spec.keep_in) if spec.keep_in else Path(tempfile.mkdtemp(prefix="hil-study-"))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        arm = folder / "arm.toml"
-        arm.write_text(spec.toml, encoding="utf-8")
-        return _identified(arm, folder) if spec.task == "identify" else _dry_run(arm)
-    finally:
-        if spec.keep_in is None:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _identified(arm: Path, folder: Path) -> Any:
-    from hil.api.experiment import identify
-
+        return _estimated(spec, folder)
+    arm = folder / "arm.toml"
+    arm.write_text(spec.toml, encoding="utf-8")
     shutil.rmtree(folder / "run", ignore_errors=True)  # of a worker that died on it
-    return identify(arm, out=folder / "run").to_json()
+    return _on_arm(spec.task, arm, folder / "run")
+
+
+@contextmanager
+def _place(spec: Spec) -> Iterator[Path]:
+    """The folder of a run, gone afterwards unless it is to be kept; what hil keeps for its user is kept there too."""
+    with tempfile.TemporaryDirectory(prefix="hil-study-", dir=_scratch(), ignore_cleanup_errors=True) as scratch:
+        folder = Path(spec.keep_in) if spec.keep_in else Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        kept = os.environ.get(_STATE)
+        os.environ[_STATE] = str(Path(scratch) / "state")
+        try:
+            # A thousand runs' warnings are not for the terminal.
+            with redirect_stderr(io.StringIO()):
+                yield folder
+        finally:
+            os.environ.pop(_STATE, None)
+            if kept is not None:
+                os.environ[_STATE] = kept
+
+
+def _scratch() -> str | None:
+    """The worker's own folder, which Dask removes also after a worker that was killed."""
+    from distributed import get_worker
+
+    try:
+        return str(get_worker().local_directory)
+    except ValueError:
+        return None  # not on a worker
+
+
+def _on_arm(task: str, arm: Path, run: Path) -> Any:
+    if task == "identify":
+        from hil.api.experiment import identify
+
+        return identify(arm, out=run).to_json()
+    if task == "fault":
+        from hil.study.injection import inject
+
+        return inject(arm, run)
+    return _dry_run(arm)
 
 
 def _dry_run(arm: Path) -> Any:
@@ -110,17 +225,15 @@ def _dry_run(arm: Path) -> Any:
     return dry_run_json(config, dry_run(config))
 
 
-def _estimated(spec: Spec) -> Any:
+def _estimated(spec: Spec, folder: Path) -> Any:
     """Estimate a copy of the recording, so that the fleet's own folders stay as they are."""
     from hil.estimation.settled_estimate import estimate_run
     from hil.runs.run_folder import RunFolder
 
     assert spec.recording is not None  # of this task
-    source = Path(spec.recording)
-    with tempfile.TemporaryDirectory(prefix="hil-study-") as folder:
-        copy = Path(folder) / "run"
-        copy.mkdir()
-        for path in source.iterdir():
-            if path.is_file() and path.name not in ("result.json", "report.html", "period.npz"):
-                shutil.copy2(path, copy / path.name)
-        return {"recording": str(source), **estimate_run(RunFolder.open(copy)).to_json()}
+    source, copy = Path(spec.recording), folder / "run"
+    copy.mkdir()
+    for path in source.iterdir():
+        if path.is_file() and path.name not in ("result.json", "report.html", "period.npz"):
+            shutil.copy2(path, copy / path.name)
+    return {"recording": str(source), **estimate_run(RunFolder.open(copy)).to_json()}

@@ -1,4 +1,4 @@
-"""The fake arm in two forms: in virtual time behind fake://, and behind a pty in real time, with a cable to pull."""
+"""The fake arm in two forms: in virtual time through fake://, and on a pty in real time, with a cable to unplug."""
 
 import contextlib
 import os
@@ -28,7 +28,7 @@ JOINTS = (
 
 
 class ServedPty:
-    """A pty whose far end is the fake bus, served by a thread in real time. `pull` takes the far end away."""
+    """A pty whose far end is the fake bus, served by a thread in real time. `pull` removes the far end."""
 
     def __init__(self) -> None:
         self._master, slave = os.openpty()
@@ -42,7 +42,7 @@ class ServedPty:
         self._thread.start()
 
     def pull(self) -> None:
-        """Take the far end away; harmless when it is gone."""
+        """Remove the far end; has no effect if it is already gone."""
         if self._thread.is_alive():
             os.write(self._wake, b"x")
             self._thread.join()
@@ -63,7 +63,7 @@ class ServedPty:
 
 @pytest.fixture
 def served_pty() -> Iterator[Callable[[], ServedPty]]:
-    """Makes served ptys; all are gone after the test."""
+    """Return a function that serves fakes on ptys, all of which are removed after the test."""
     made = []
 
     def make() -> ServedPty:
@@ -77,7 +77,7 @@ def served_pty() -> Iterator[Callable[[], ServedPty]]:
 
 @pytest.fixture
 def fake_config() -> Callable[..., BusConfig]:
-    """The bus configuration of the fake arm in virtual time; give other settings by name."""
+    """Return the bus configuration of the fake arm in virtual time; keyword arguments override its settings."""
     fakes.register()
 
     def make(url: str = f"fake://{CONFIG}", joints: tuple[Joint, ...] = JOINTS, **settings: object) -> BusConfig:
@@ -88,7 +88,7 @@ def fake_config() -> Callable[..., BusConfig]:
 
 @pytest.fixture
 def fake_file(tmp_path: Path) -> Callable[..., str]:
-    """The URL of the fake arm with changes to its TOML, (old, new) each."""
+    """Return the URL of the fake arm with changes to its TOML, given as pairs (old, new)."""
 
     def write(*changes: tuple[str, str]) -> str:
         text = CONFIG.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Arms beyond two equal servos on a quick adapter: pairs, mixed modes, turned encoders, slow and strange adapters."""
+"""Arms beyond two equal servos on a fast adapter: pairs, mixed modes, turned encoders, slow and unusual adapters."""
 
 import math
 from collections.abc import Callable
@@ -36,7 +36,7 @@ def arm(*servos: dict[str, Any], joints: int = 2, start: tuple[float, ...] = (-1
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[ServoBus, FakeSerial]]:
-    """A prepared bus onto a described arm, and the port's other end."""
+    """Return a prepared bus onto a described arm, and the other end of its port."""
 
     def make(description: FakeArm, *joints: Joint, faults: tuple[Fault, ...] = (), **settings: Any) -> Any:
         port = open_fake(description)
@@ -83,7 +83,7 @@ def test_both_of_a_pair_are_watched(opened: Open) -> None:
             bus.check_alerts(bus.exchange([0.0, 0.0]))
         port.bus.servos[2].connected = False
         state = bus.exchange([0.0, 0.0])
-        assert state.missing == (True, True)  # in a Sync Read all behind a silent servo are silent
+        assert state.missing == (True, True)  # in a Sync Read, all servos after a silent one stay silent
         report = bus.torque_off()
         assert [str(joint) for joint, _ in report.unconfirmed] == ["joint 'shoulder' (ID 2, XM430-W350)"]
 
@@ -179,7 +179,7 @@ def test_without_an_idea_of_the_pose_present_position_is_believed(opened: Open) 
         assert bus.read_positions() == pytest.approx((math.tau - 0.1,), abs=2e-3)
 
 
-# Slow and strange adapters
+# Slow and unusual adapters
 
 
 @pytest.mark.parametrize("latency_us", [1_000.0, 16_000.0, 45_000.0, 90_000.0])

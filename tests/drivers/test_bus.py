@@ -1,4 +1,4 @@
-"""ServoBus on the fake arm in virtual time: what it prepares, what it says, what a lost reply costs."""
+"""ServoBus on the fake arm in virtual time: preparation, messages, and the effect of a lost reply."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,7 @@ File = Callable[..., str]
 
 
 def servos(bus: ServoBus) -> Any:
-    """The fake servos behind the bus, by ID."""
+    """Return the fake servos on the bus, by ID."""
     return bus.port._serial.bus.servos
 
 

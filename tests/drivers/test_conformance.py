@@ -1,7 +1,7 @@
-"""Our exchange and dynamixel-sdk's group classes: the same bytes out, the same values in, on random packets.
+"""Our exchange and dynamixel-sdk's group classes: identical requests and values for random packets.
 
-Where the SDK is known to be wrong (what it sends is never stuffed; some stuffed answers are misread; see test_packet)
-the data is left out.
+Cases in which the SDK is known to be wrong are left out: what it sends is never stuffed, and some stuffed replies are
+misread (see test_packet).
 """
 
 import struct
@@ -23,7 +23,7 @@ XM430 = load_control_table("XM430-W350")
 
 
 class Both(Port):
-    """One scripted wire for both clients: ours as a Port, the SDK's as its port handler."""
+    """A scripted wire for both clients: a Port for ours, a port handler for the SDK."""
 
     is_using = False
 
@@ -46,7 +46,7 @@ class Both(Port):
         return taken
 
     def has_input(self) -> bool:
-        return False  # the answer is there before it is asked for
+        return False  # the reply is available before the request
 
     def discard_input(self) -> None:
         pass

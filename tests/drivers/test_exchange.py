@@ -1,4 +1,4 @@
-"""The control cycle on a scripted wire: what it sends, and what it makes of good, stuffed, missing and late bytes."""
+"""The control cycle on a scripted wire: its requests, and its handling of valid, stuffed, missing and late replies."""
 
 import struct
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ XL430 = load_control_table("XL430-W250")
 
 
 class Wire(Port):
-    """A port whose answers are set beforehand and whose clock moves by the time that reads wait."""
+    """A port with scripted replies, whose clock advances by the time that reads wait."""
 
     def __init__(self, answers: Sequence[bytes] = ()) -> None:
         self.url, self.baud, self.is_open, self.latency = "scripted", 1_000_000, True, 1e-3
@@ -62,7 +62,7 @@ def answer(servo_id: int, current: int, velocity: int, position: int, error: int
 
 
 def fast_answer(*servos: tuple[int, int, bytes]) -> bytes:
-    """One packet with the parts of several servos, (ID, ERR, data) each, written out as the manual shows it."""
+    """Return one packet with the parts of several servos, (ID, ERR, data) each, encoded as in the manual."""
     length = 1 + sum(len(data) + 4 for _, _, data in servos)
     packet = HEADER + bytes((0xFE,)) + length.to_bytes(2, "little") + b"\x55"
     for servo_id, error, data in servos:
@@ -169,7 +169,7 @@ def test_a_stuffed_answer_is_understood() -> None:
 @pytest.mark.parametrize("fast", [False, True])
 def test_the_slow_registers_come_in_turn(fast: bool) -> None:
     class Echo(Wire):
-        """Answers each request with as many bytes of 7 as it asks for."""
+        """Answer each request with as many bytes of value 7 as it expects."""
 
         def write(self, data: bytes) -> None:
             super().write(data)

@@ -1,4 +1,4 @@
-"""The adapter's latency timer, on a sysfs made of files."""
+"""The adapter's latency timer, with a sysfs made of ordinary files."""
 
 import os
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_it_is_set_and_read_back(sysfs: Path) -> None:
     assert read_latency_ms(file) == 1
 
 
-@pytest.mark.skipif(os.getuid() == 0, reason="root may write everything")
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write every file")
 def test_without_permission_it_is_not_set(sysfs: Path) -> None:
     file = latency_timer("/dev/ttyUSB0", sysfs)
     assert file is not None

@@ -1,4 +1,4 @@
-"""The codec against the manual's printed packets, against dynamixel-sdk, and against noise."""
+"""The codec compared with the manual's printed packets and with dynamixel-sdk, and under noise."""
 
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
@@ -152,7 +152,7 @@ def test_no_packet_has_an_id_that_could_be_part_of_a_header(impossible: int) -> 
 
 
 class _Wire:
-    """The port that dynamixel-sdk's packet handler sends to and receives from."""
+    """The port on which dynamixel-sdk's packet handler sends and receives."""
 
     is_using = False
 

@@ -1,4 +1,4 @@
-"""The port against a real terminal device: bounded reads, and one clear error when the other end goes away."""
+"""The port on a real terminal device: bounded reads, and one clear error when the other end disappears."""
 
 import os
 import time
@@ -19,7 +19,7 @@ def pty() -> tuple[int, str]:
 
 
 def test_a_port_that_does_not_exist_is_named() -> None:
-    with pytest.raises(PortNotOpened, match=r"/dev/no-such-port.*No such file"):
+    with pytest.raises(PortNotOpened, match=r"/dev/no-such-port.*there is no such device"):
         open_port("/dev/no-such-port", 1_000_000)
 
 

@@ -1,4 +1,4 @@
-"""The driver on a terminal device in real time: experiments in small, lost replies, and cables that are pulled."""
+"""The driver on a terminal device in real time: short experiments, lost replies, and unplugged cables."""
 
 import gc
 import os
@@ -25,7 +25,7 @@ def config(pty: ServedPty) -> BusConfig:
 
 
 def patient(bus: ServoBus) -> ServoBus:
-    """The far end is a Python thread on a busy machine: what it says late is not lost."""
+    """Prepare the bus with a long reply timeout, since the far end is a Python thread on a busy machine."""
     bus.port.latency = 0.2
     bus.prepare()
     return bus
@@ -70,7 +70,7 @@ def open_files() -> int:
 
 
 def test_a_hundred_pulled_and_replugged_cables(served_pty: Serve) -> None:
-    """The same port name comes back each time, as a replugged adapter's does; each cable is pulled mid-cycle."""
+    """The same port name reappears each time, like that of a replugged adapter; each cable is unplugged mid-cycle."""
     before, causes = open_files(), set()
     for _ in range(100):
         pty = served_pty()

@@ -1,4 +1,4 @@
-"""Deadlines on a scripted clock, where every late wake-up and every stall is known."""
+"""Deadlines on a scripted clock with known late wake-ups and stalls."""
 
 from itertools import pairwise
 
@@ -24,8 +24,9 @@ def test_deadlines_are_absolute_and_none_is_missed_by_late_wake_ups() -> None:
 
 @pytest.mark.parametrize(("periods", "misses"), [(0.9, 0), (1.5, 0), (2.5, 1), (10.5, 9), (1000.5, 999)])
 def test_a_stall_is_counted_to_the_last_period(periods: float, misses: int) -> None:
-    """Work that takes 10.5 periods ends half a period after the tenth deadline behind it: that one is late, the nine
-    before it are missed.
+    """Work lasting 10.5 periods ends half a period after the tenth deadline.
+
+    The tenth deadline is then late, and the nine before it are missed.
     """
     clock = VirtualClock()
     ticks = FixedRate(clock, 1000.0)

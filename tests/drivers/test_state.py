@@ -1,4 +1,4 @@
-"""From ticks to SI units: what a reply becomes, with servos that refused or said nothing."""
+"""Conversion from ticks to SI units, including replies of servos that refused or were silent."""
 
 import math
 

@@ -1,5 +1,6 @@
-"""Torque on and off, as the emulated servos see it."""
+"""Switching torque on and off, as seen by the emulated servos."""
 
+import contextlib
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -27,7 +28,7 @@ def fake_bus(bus: ServoBus) -> Any:
 
 
 def written(bus: ServoBus, servo_id: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, float]]:
-    """What will be written to a servo: address, value, time [s]."""
+    """Record all later writes to a servo in the list returned: address, value, time [s]."""
     servo = servos(bus)[servo_id]
     write = servo.write
     seen: list[tuple[int, int, float]] = []
@@ -56,7 +57,7 @@ def test_goal_current_is_zero_and_the_watchdog_armed_before_torque_comes_on(
 
 
 def refusing(bus: ServoBus, servo_id: int, refused: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A servo that answers this write without an error, and does nothing."""
+    """A servo that answers a write without an error but ignores it."""
     servo = servos(bus)[servo_id]
     write = servo.write
 
@@ -89,13 +90,13 @@ def test_a_servo_that_keeps_its_torque_though_it_answers_is_named(
             refusing(bus, 2, (TORQUE, 0), monkeypatch)
         assert not servos(bus)[1].torque_enabled
         bus.port.clock.wait_until(bus.port.clock.now() + 0.11)
-        assert servos(bus)[2].watchdog_tripped, "it was left armed"
+        assert servos(bus)[2].watchdog_tripped, "the watchdog was left active"
 
 
 def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(
     fake_config: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While a silent servo is asked again and again, the packets feed the others' watchdogs."""
+    """While a silent servo is polled repeatedly, the packets feed the other servos' watchdogs."""
     with ServoBus.open(fake_config()) as bus:
         with pytest.raises(TorqueNotOff, match="'SHOULDER'"), bus.torque(watchdog=0.1):
             bus.exchange([0.3, 0.3])
@@ -111,7 +112,7 @@ def test_a_silent_servo_and_a_lost_packet_do_not_keep_the_other_one_waiting(
 
 @pytest.fixture
 def _interrupts() -> Iterator[None]:
-    """Ctrl-C as a program without handlers of its own feels it; a test runner's workers ignore it."""
+    """Deliver Ctrl-C as to a program without its own signal handlers; a test runner's workers ignore it."""
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, former)
@@ -120,7 +121,7 @@ def _interrupts() -> Iterator[None]:
 @pytest.mark.usefixtures("_interrupts")
 @pytest.mark.parametrize("after", [0, 1, 2, 5])
 def test_an_interrupt_while_torque_is_cut_waits_until_it_is_cut(fake_config: Make, after: int) -> None:
-    """Used as a library, without handlers that would only take note of Ctrl-C."""
+    """The driver is used as a library, without signal handlers that merely set a flag."""
     with ServoBus.open(fake_config()) as bus:
         send = bus.port.write
         left = [after]
@@ -171,3 +172,64 @@ def test_an_interrupt_before_the_shield_is_up_is_met_by_a_second_attempt(
         with pytest.raises(KeyboardInterrupt), bus.torque(watchdog=0.1):
             pass
         assert not any(servo.torque_enabled for servo in servos(bus).values())
+
+
+def refuse_everything(bus: ServoBus) -> None:
+    fake_bus(bus).faults.add(Fault(kind=FaultKind.STATUS_ERROR, at=fake_bus(bus).time, servo=2))
+
+
+def take_another_id(bus: ServoBus) -> None:
+    servo = servos(bus)[2]
+    servo.memory.set("ID", 77)
+    servo._derive()
+
+
+@pytest.mark.parametrize("happens", [refuse_everything, take_another_id])
+def test_a_servo_that_hears_and_does_not_obey_is_stopped_by_its_watchdog(
+    fake_config: Make, happens: Callable[[ServoBus], None]
+) -> None:
+    """Every question feeds its watchdog: whoever did not answer the last exchange is left in silence."""
+    with ServoBus.open(fake_config()) as bus:
+        with contextlib.suppress(TorqueNotOff), bus.torque(watchdog=0.08):
+            bus.exchange([0.3, 0.3])
+            driven = servos(bus)
+            happens(bus)
+            bus.exchange([0.3, 0.3])
+            begun = bus.port.clock.now()
+            disobedient = driven[2]
+            trip = disobedient.trip_watchdog
+            when: list[float] = []
+
+            def tripping() -> None:
+                when.append(disobedient.heard_at + disobedient.watchdog_s - begun)
+                trip()
+
+            disobedient.trip_watchdog = tripping
+        assert when and when[0] <= 0.08 + 0.015
+        assert not driven[1].torque_enabled and disobedient.watchdog_tripped
+        assert bus.torque_off_report is not None
+        assert [joint.id for joint, _ in bus.torque_off_report.unconfirmed] == [2]
+
+
+def test_torque_off_that_meets_a_reply_on_the_wire_is_sent_again(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        with contextlib.suppress(TorqueNotOff), bus.torque(watchdog=0.08):
+            bus.exchange([0.3, 0.3])
+            driven = servos(bus)
+            fake_bus(bus).faults.add(Fault(kind=FaultKind.LOST_REPLY, at=fake_bus(bus).time))
+            bus.exchange([0.3, 0.3])
+            begun = bus.port.clock.now()
+            seen = [written(bus, servo_id, pytest.MonkeyPatch()) for servo_id in (1, 2)]
+            lost = Fault(kind=FaultKind.LOST_INSTRUCTION, at=fake_bus(bus).time, duration=2e-3)
+            fake_bus(bus).faults.add(lost)
+        for each in seen:
+            assert next(time for address, value, time in each if (address, value) == (TORQUE, 0)) - begun < 0.01
+        assert not any(servo.torque_enabled for servo in driven.values())
+
+
+def test_all_servos_confirmed_takes_no_silence(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        with bus.torque(watchdog=0.08):
+            bus.exchange([0.3, 0.3])
+            begun = bus.port.clock.now()
+        assert bus.port.clock.now() - begun < 0.03

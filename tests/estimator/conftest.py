@@ -1,14 +1,14 @@
-"""Settled periods of arms that the estimator does not know, recorded as a bus would: held and rounded."""
+"""Settled periods of arms simulated independently of the estimator, with held commands and rounded positions."""
 
 from collections.abc import Callable
 
 import pytest
 
-from benchmarks import recorded_arm
-from benchmarks.recorded_arm import servo_arm
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import Multisine
 from hil.fakes.plants.arm import Arm
+from tests.support import recorded_arm
+from tests.support.recorded_arm import servo_arm
 
 IDEAL = {"coulomb_width": 0.05}
 STICKING = {"current_lag": 1e-3, "stribeck_rise": 0.4, "stribeck_velocity": 0.15}
@@ -17,19 +17,19 @@ Recorder = Callable[[Arm, Multisine], SettledPeriod]
 
 
 def recorded_period(arm: Arm, multisine: Multisine) -> SettledPeriod:
-    """One settled period, rounded by the encoder."""
+    """Return one settled period, rounded by the encoder."""
     return recorded_arm.record(arm, multisine).rounded()
 
 
 @pytest.fixture(scope="session")
 def ideal_arm() -> Arm:
-    """Friction is what the estimator's plainest model has."""
+    """Return a period of an arm with the friction of the estimator's simplest model."""
     return servo_arm(IDEAL)
 
 
 @pytest.fixture(scope="session")
 def sticking_arm() -> Arm:
-    """Friction sticks, rises at standstill, and the current lags."""
+    """Return a period of an arm with stiction, Stribeck friction and a lagging current."""
     return servo_arm(STICKING)
 
 

@@ -1,4 +1,4 @@
-"""BLAS on one thread while the estimator works."""
+"""BLAS is limited to one thread while the estimator works."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The cache of compiled loops notices every source that is compiled into them."""
+"""The cache of compiled loops is invalidated by a change in any of their source files."""
 
 from pathlib import Path
 

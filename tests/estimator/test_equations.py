@@ -1,4 +1,4 @@
-"""Arm model, Fourier lines, held command and compiled simulation, each against another derivation."""
+"""Arm model, Fourier lines, held command and compiled simulation, each compared with an independent derivation."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def test_the_cut_off_finds_where_signal_meets_noise(last: int) -> None:
 
 @given(arrays(float, (1, 16), elements=small), st.floats(-2e-3, 1.2e-2))
 def test_held_lines_are_those_of_the_staircase(command: np.ndarray, delay: float) -> None:
-    """Against the integral of the staircase itself, piece by piece."""
+    """Compare with the exact integral of the staircase, piece by piece."""
     rate, samples = 100.0, 16
     edges = np.arange(samples) / rate + delay
     for k in range(1, 7):
@@ -96,7 +96,7 @@ def test_held_lines_are_those_of_the_staircase(command: np.ndarray, delay: float
 def test_motor_torque_is_the_mean_of_the_late_command(
     command: np.ndarray, sample: float, delay: float, lag: float
 ) -> None:
-    """Against a lag stepped a thousand times a sample until it is periodic."""
+    """Compare with a lag integrated in a thousand steps per sample until it is periodic."""
     rate, steps, fine = 400.0, 3, 999
     means = motor_torque(command, rate, sample, steps, delay=delay, lag=lag)
     t = (np.arange(12 * fine) + 0.5) / (rate * fine) + sample - delay
@@ -127,7 +127,7 @@ def test_every_coordinate_is_a_physical_arm(x: np.ndarray) -> None:
 
 
 def test_simulation_obeys_inverse_dynamics() -> None:
-    """Torques that inverse dynamics asks for along a chosen motion bring that motion about."""
+    """The torques that inverse dynamics computes for a motion produce that motion."""
     names = base_names(2)
     theta = np.array([0.018, 0.0033, 0.0028, 0.01, 0.55, 0.22, 0.045, 0.04, 0.055, 0.05, 0.004, -0.003])
     width, rate, steps, samples = 0.2, 400.0, 8, 400

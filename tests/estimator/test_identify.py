@@ -1,4 +1,4 @@
-"""End to end: arms the estimator did not write, their positions rounded, identified from one period."""
+"""End to end: independently simulated arms with rounded positions, identified from one period."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +20,7 @@ Wave = Callable[..., Multisine]
 
 
 def errors(estimate: Estimate, arm: Arm) -> dict[str, float]:
-    """Relative errors of the base parameters."""
+    """Return the relative errors of the base parameters."""
     found = estimate.parameters
     return {name: found[name] / true - 1.0 for name, true in base_parameters(arm).items()}
 
@@ -39,7 +39,7 @@ def offsets_in_std(estimate: Estimate, arm: Arm) -> list[float]:
 
 
 def held_out_error(estimate: Estimate, period: SettledPeriod) -> np.ndarray:
-    """RMS of the free prediction's error over the RMS of the motion, each joint."""
+    """Return the RMS of the free prediction's error relative to that of the motion, per joint."""
     predicted = predict(estimate, period.torque, period.rate, period.command_to_sample)
     return np.asarray(np.sqrt(np.mean((predicted - period.position) ** 2, axis=1)) / period.position.std(axis=1))
 
@@ -158,7 +158,7 @@ def test_what_is_no_settled_period_is_refused(ideal_period: SettledPeriod) -> No
 
 
 def test_a_motion_that_tells_nothing_apart_is_refused(ideal_period: SettledPeriod) -> None:
-    """Both joints on one small cosine: gravity, inertia and offset cannot be told apart."""
+    """With both joints on one small cosine, gravity, inertia and offset cannot be separated."""
     t = 2.0 * np.pi * np.arange(400) / 400
     wave = 0.01 * np.stack((np.cos(t), np.cos(t)))
     with pytest.raises(UnidentifiableError, match="excite more lines"):

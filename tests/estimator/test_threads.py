@@ -1,4 +1,4 @@
-"""How many threads work is spread over."""
+"""The number of threads used for independent work."""
 
 import os
 

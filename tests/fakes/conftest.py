@@ -9,7 +9,7 @@ from hil.drivers.packet import Framer, Instruction, Packet, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 # A busy machine is no failure; the fixtures used with @given only build benches, so they may be shared.
 settings.register_profile("no deadline", deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -19,7 +19,7 @@ XM430 = load_model("XM430-W350")
 
 
 class FreeInertia:
-    """One free inertia per joint, turned by its motor without lag; keeps what it was told."""
+    """One free inertia per joint, driven by its motor without lag; records the commands."""
 
     def __init__(self, joints: int, acceleration_per_ampere: float = 50.0) -> None:
         self.joints = joints
@@ -29,7 +29,7 @@ class FreeInertia:
         self.velocity = [0.0] * joints
         self.current = [0.0] * joints
         self.told: list[tuple[float, list[float]]] = []
-        """Every advance: until when [s], with which currents [A]."""
+        """Record of every advance: until when [s], with which currents [A]."""
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         step = until - self.time
@@ -47,33 +47,33 @@ class FreeInertia:
 class Bench:
     """A host on a bus of fake servos with IDs 1, 2, ..."""
 
-    def __init__(self, *servos: Servo, adapter_latency_us: float = 0.0) -> None:
+    def __init__(self, *servos: EmulatedServo, adapter_latency_us: float = 0.0) -> None:
         self.clock = VirtualClock()
         self.plant = FreeInertia(len(servos))
         self.bus = FakeBus(servos, self.plant, self.clock, adapter_latency_us=adapter_latency_us)
 
-    def servo(self, servo_id: int = 1) -> Servo:
+    def servo(self, servo_id: int = 1) -> EmulatedServo:
         return self.bus.servos[servo_id]
 
     def exchange(self, raw: bytes, timeout_s: float = 0.01) -> list[Packet]:
-        """Send bytes; every packet that comes back within the timeout."""
+        """Send bytes; return every packet received within the timeout."""
         self.bus.write(raw)
         return list(Framer().feed(self.bus.read(10_000, timeout_s)))
 
     def ask(self, servo_id: int, instruction: int, body: bytes = b"") -> Packet:
-        """Send one instruction and expect exactly one status, from this servo."""
+        """Send one instruction and return the single status expected from this servo."""
         (status,) = self.exchange(encode(servo_id, instruction, body))
         assert status.is_status
         assert status.id == servo_id
         return status
 
     def write(self, servo_id: int, address: int, value: int, size: int = 1) -> int:
-        """Write one register; the status's ERR byte."""
+        """Write one register; return the ERR byte of the status."""
         data = value.to_bytes(size, "little", signed=value < 0)
         return self.ask(servo_id, Instruction.WRITE, address.to_bytes(2, "little") + data).error
 
     def read(self, servo_id: int, address: int, size: int, *, signed: bool = False) -> int:
-        """Read one register that must be readable."""
+        """Read one register, which must be readable."""
         body = address.to_bytes(2, "little") + size.to_bytes(2, "little")
         status = self.ask(servo_id, Instruction.READ, body)
         assert status.error == 0
@@ -81,7 +81,7 @@ class Bench:
         return int.from_bytes(status.data, "little", signed=signed)
 
     def arm(self, servo_id: int = 1, watchdog: int = 0, goal_ticks: int = 0) -> None:
-        """Current mode, no goal, watchdog as asked, torque on, then the goal."""
+        """Set current mode and the watchdog, switch torque on with a zero goal, then write the goal."""
         assert self.write(servo_id, 11, 0) == 0
         assert self.write(servo_id, 102, 0, 2) == 0
         assert self.write(servo_id, 98, watchdog) == 0
@@ -94,11 +94,11 @@ class Bench:
 
 @pytest.fixture
 def make_bench() -> Callable[..., Bench]:
-    """Builds a bench from servo settings, one dict each; without any, two XM430-W350 as they should be."""
+    """Return a function that builds a bench from servo settings, one dict each; by default two standard XM430-W350."""
 
     def make(*settings: dict[str, object], adapter_latency_us: float = 0.0) -> Bench:
         servos = [
-            Servo(**({"model": XM430, "servo_id": number} | chosen))  # type: ignore[arg-type]
+            EmulatedServo(**({"model": XM430, "servo_id": number} | chosen))  # type: ignore[arg-type]
             for number, chosen in enumerate(settings or ({}, {}), start=1)
         ]
         return Bench(*servos, adapter_latency_us=adapter_latency_us)

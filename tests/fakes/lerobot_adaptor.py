@@ -1,7 +1,8 @@
-"""LeRobot's mock of Dynamixel motors, played by the fake bus, for LeRobot's own `tests/motors/test_dynamixel.py`.
+"""LeRobot's mock of Dynamixel motors, replaced by the fake bus, for LeRobot's own `tests/motors/test_dynamixel.py`.
 
-That file builds "stubs": a packet and the answer that is to come to it. Here a stub sets the fake servos so that they
-would give that answer, and counts the packets. What no servo would do is left as a servo does it, and the test fails.
+That file creates "stubs": a packet and the expected reply. Here a stub sets the fake servos so that they give that
+reply, and counts the packets. Where no real servo would give the expected reply, the fake behaves like a real servo,
+and the test fails.
 """
 
 import itertools
@@ -14,7 +15,7 @@ from hil.drivers.packet import Packet
 from hil.fakes.bus.faults import Fault
 from hil.fakes.description import FakeArm
 from hil.fakes.pty_server import PtyServer
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 
 MODELS = {1: "XL430-W250", 2: "XM540-W270", 3: "XL330-M077"}
 """The servos of LeRobot's tests, by ID."""
@@ -29,7 +30,7 @@ _PRESENT_POSITION = 132
 
 
 class Stub:
-    """One expected packet: whether, and how often, it came."""
+    """One expected packet: whether it arrived, and how often."""
 
     def __init__(self, motors: "MockMotors", matches: Callable[[Packet], bool]) -> None:
         self._motors = motors
@@ -136,7 +137,7 @@ class MockMotors:
     def build_sequential_sync_read_stub(
         self, address: int, length: int, ids_values: Mapping[int, Sequence[int]]
     ) -> str:
-        """Each read finds the next value: the servos' joints are moved before it."""
+        """Return the next value on each read, by moving the servos' joints beforehand."""
         turn = itertools.count()
         receive, asked = self._bus._instructions.receive, self._is_sync_read(address)
 
@@ -158,7 +159,7 @@ class MockMotors:
             body += bytes((servo_id,)) + value.to_bytes(length, "little")
         return self._stub(lambda packet: packet.instruction == 0x83 and packet.body == body)
 
-    # How a servo comes to give that answer
+    # Setting up a servo to give that answer
 
     def _stub(self, matches: Callable[[Packet], bool]) -> str:
         name = f"stub_{next(self._names)}"
@@ -177,7 +178,7 @@ class MockMotors:
             self._bus.faults.add(Fault(kind="status_error", servo=servo_id, amount=float(error)))
 
     def _hold(self, servo_id: int, address: int, length: int, value: int) -> None:
-        """Have a servo's registers hold a value: where it stands, for Present Position."""
+        """Set a servo's registers to a value; for Present Position, move the joint."""
         servo = next(each for each in self._bus._servos if each.id == servo_id)
         if address == _PRESENT_POSITION:
             self._stand(servo, value)
@@ -186,7 +187,7 @@ class MockMotors:
             servo.memory.data[address : address + length] = (value % (1 << 8 * length)).to_bytes(length, "little")
             servo._derive()
 
-    def _stand(self, servo: Servo, ticks: int) -> None:
+    def _stand(self, servo: EmulatedServo, ticks: int) -> None:
         joint = list(self._bus._servos).index(servo)
         plant: Any = self._bus.plant
         plant = getattr(plant, "_plant", plant)

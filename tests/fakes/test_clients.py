@@ -1,6 +1,6 @@
-"""Independent clients in this process, the fake arm in another one, a terminal between them, in real time.
+"""Independent clients in this process, the fake arm in another one, connected by a terminal in real time.
 
-Each client is let loose with what it has; where it is known to be wrong, that is named and left out.
+Each client is run with everything it supports; known client bugs are named and left out.
 """
 
 import os
@@ -25,7 +25,7 @@ WHY = 'needs the extra "clients": pip install hil[clients]'
 
 @pytest.fixture
 def device(tmp_path: Path) -> Iterator[str]:
-    """The path of a terminal behind which `hil fake` serves two XM430-W350 with IDs 1 and 2 at 1 Mbaud."""
+    """Return the path of a terminal on which `hil fake` serves two XM430-W350 with IDs 1 and 2 at 1 MBd."""
     link = tmp_path / "arm"
     command = [sys.executable, "-m", "hil", "fake", str(CONFIG), "--pty", "--link", str(link), "--quiet"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -46,7 +46,7 @@ def device(tmp_path: Path) -> Iterator[str]:
 
 
 class Sdk:
-    """dynamixel-sdk on its own port, each call tried again when a busy machine made it miss its 34 ms."""
+    """dynamixel-sdk on its own port; calls are repeated if a busy machine made it miss its 34 ms."""
 
     def __init__(self, device: str) -> None:
         self.port = sdk.PortHandler(device)
@@ -55,7 +55,7 @@ class Sdk:
         assert self.port.setBaudRate(1_000_000)
 
     def __call__(self, call: str, *args: Any) -> Any:
-        """The call's results without the communication result, which must be success."""
+        """Return the call's results without the communication result, which must be success."""
         for _ in range(5):
             outcome = getattr(self.handler, call)(self.port, *args)
             results = outcome if isinstance(outcome, tuple) else (outcome,)
@@ -104,7 +104,7 @@ def test_sdk_single_servo_calls(ask: Sdk) -> None:
 
 
 def test_sdk_stuffed_data_comes_back(ask: Sdk) -> None:
-    """It does not stuff what it sends; what comes back is stuffed, and it knows how to unstuff."""
+    """The SDK does not stuff what it sends; replies are stuffed, and it can unstuff them."""
     assert ask("write1ByteTxRx", 1, 11, 4) == 0
     assert ask("write4ByteTxRx", 1, 116, 0xFFFD_FFFF) == 0
     assert ask("read4ByteTxRx", 1, 116) == (0xFFFD_FFFF, 0)
@@ -190,7 +190,7 @@ def test_rustypot(device: str) -> None:
 
 
 def test_dynamixel_python(device: str) -> None:
-    """It does not stuff what it sends, with a CRC that fits stuffed data: writes of FF FF FD are left out."""
+    """The client does not stuff what it sends, but its CRC is for stuffed data: writes of FF FF FD are left out."""
     dxl2 = pytest.importorskip("dxl2", reason=WHY)
     bus = dxl2.v2.MotorBus(device, 1_000_000, timeout=0.3)
     bus.connect()

@@ -1,4 +1,4 @@
-"""The [fake] table: read as written, and wrong in ways that are said."""
+"""The [fake] table: valid tables are read as written, and invalid ones yield an error message."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
-"""LeRobot's own tests of its Dynamixel bus, against the fake bus; skipped where LeRobot or its tests are not installed.
+"""LeRobot's own tests of its Dynamixel bus on the fake bus; skipped if LeRobot or its tests are not installed.
 
-LeRobot's wheel holds no tests: `LEROBOT_TESTS` names the folder of its tests, e.g. in a checkout.
+LeRobot's wheel contains no tests: `LEROBOT_TESTS` names the folder of its tests, e.g. in a checkout.
 """
 
 import os
@@ -22,7 +22,7 @@ NO_SERVO_WOULD = (
     "test__read_error[True]",  # a status with an error and data: servos send none then,
     "test__read_error[False]",  # which dynamixel-sdk 4.1 answers with an IndexError
 )
-"""What asks of a servo what none does."""
+"""Tests that expect something that no real servo does."""
 
 CONFTEST = f"""
 import importlib.util, sys, types

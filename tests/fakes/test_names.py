@@ -1,4 +1,4 @@
-"""Arms by name, wherever an arm is asked for."""
+"""Arms by name, wherever an arm can be given."""
 
 import sys
 from pathlib import Path

@@ -66,7 +66,7 @@ def test_read_waits_for_the_timeout_only(port: FakeSerial) -> None:
 def test_read_without_timeout_never_hangs(port: FakeSerial) -> None:
     port.timeout = None
     port.write(PING)
-    with pytest.raises(serial.SerialException, match="would wait for ever: 14 are there"):
+    with pytest.raises(serial.SerialException, match="would block forever: 14 have arrived"):
         port.read(15)
     assert port.read(14) == PONG
 
@@ -135,7 +135,7 @@ def test_port_that_was_never_opened() -> None:
 @pytest.mark.parametrize(
     ("url", "said"),
     [
-        ("fake://", "names no file"),
+        ("fake://", "does not name a file"),
         ("fake:///nowhere/arm.toml", "cannot be read"),
         (f"fake://{Path(__file__)}", "is not TOML"),
     ],
@@ -239,7 +239,7 @@ def test_sdk_writes_groups(sdk: Sdk) -> None:
 
 
 def test_sdk_sends_a_header_in_its_data_unstuffed_and_is_understood(sdk: Sdk) -> None:
-    """dynamixel-sdk 4.1.0 does not stuff. Its length and CRC fit what it sends, so the bytes are taken as they are."""
+    """dynamixel-sdk 4.1.0 does not stuff; its length and CRC match what it sends, so the bytes are accepted."""
     handler, port, fake = sdk
     assert handler.write1ByteTxRx(port, 1, 11, 4) == (COMM_SUCCESS, 0)
     assert handler.write4ByteTxRx(port, 1, 116, 0xFF_FD_FF_FF) == (COMM_SUCCESS, 0)

@@ -1,4 +1,4 @@
-"""The fake arm on a terminal: baud, link, cable, clocks; `hil fake` and what it says when it cannot."""
+"""The fake arm on a terminal: baud rate, link, cable, clocks; `hil fake` and its error messages."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ PONG = encode_status(1, 0, b"\xfc\x03\x30")
 
 @pytest.fixture
 def serve() -> Callable[..., PtyServer]:
-    """Starts servers in threads; ends them after the test."""
+    """Return a function that starts servers in threads and stops them after the test."""
     running: list[tuple[PtyServer, Thread]] = []
 
     def start(*faults: Fault, link: Path | None = None) -> PtyServer:
@@ -111,7 +111,7 @@ def test_a_link_that_exists_or_cannot_be_made(tmp_path: Path) -> None:
     descriptors = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
     with pytest.raises(LinkError, match="arm exists already; remove it or choose another"):
         PtyServer(load_fake(CONFIG), taken)
-    with pytest.raises(LinkError, match="cannot be made: No such file or directory"):
+    with pytest.raises(LinkError, match="cannot be created: No such file or directory"):
         PtyServer(load_fake(CONFIG), tmp_path / "nowhere" / "arm")
     assert taken.read_text() == "mine"
     assert len(os.listdir("/proc/self/fd")) == descriptors  # noqa: PTH208

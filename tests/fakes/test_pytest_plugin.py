@@ -1,4 +1,4 @@
-"""The plugin as somebody else's tests use it: in another pytest, with nothing but the installed package."""
+"""The plugin as other projects' tests use it: in another pytest process, with only the installed package."""
 
 import os
 import subprocess

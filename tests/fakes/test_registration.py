@@ -1,4 +1,4 @@
-"""The URL fake:// is taught to pyserial only where a fake is opened."""
+"""The URL fake:// is only registered with pyserial when a fake is opened."""
 
 from collections.abc import Iterator
 

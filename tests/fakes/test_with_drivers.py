@@ -1,4 +1,4 @@
-"""The drivers on the fake bus, as the experiment uses them; what happened is asked of the fake servos themselves."""
+"""The drivers on the fake bus, used as in an experiment; the fake servos are queried for the outcome."""
 
 from collections.abc import Iterator
 from pathlib import Path

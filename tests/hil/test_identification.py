@@ -1,6 +1,6 @@
-"""The whole way on real bytes: both fake arms come back out of their recordings as they were described.
+"""Complete identifications on the fake bus: both fake arms are recovered from their recordings.
 
-The limits are what the tool promises, not what it happens to reach; benchmarks/identify.py prints the latter.
+The tolerances are what hil promises, not what it typically reaches; benchmarks/identify.py prints the latter.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ FRICTION = ("viscous_1", "viscous_2", "coulomb_1", "coulomb_2")
 
 
 class Identified(NamedTuple):
-    """A result, and how far each joint swung [degrees]."""
+    """A result, and the range of motion of each joint [degrees]."""
 
     result: SettledResult
     swing: list[float]

@@ -1,4 +1,4 @@
-"""The identified arm as a model: its equations against the estimator's, its speed, and files that are not right."""
+"""The identified arm as a model: agreement with the estimator's equations, speed, and damaged files."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ def test_it_has_the_estimators_equations(identified: Path) -> None:
 
 
 def full(model: ArmModel) -> ArmModel:
-    """With every term of friction."""
+    """The model with every friction term."""
     more = {"coulomb_width": 0.01, "stribeck_rise": 0.4, "stribeck_velocity": 0.15, "load": 0.05}
     terms = {f"{term}_{joint}": value for term, value in more.items() for joint in (1, 2)}
     return dataclasses.replace(model, values={**model.values, **terms})
@@ -108,7 +108,7 @@ def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, 
     cases = {
         good[: len(good) // 2]: "incomplete or damaged",
         "[]": "it has no schema",
-        json.dumps({**json.loads(good), "schema": 2}): "schema 2 is not 1.* a newer hil",
+        json.dumps({**json.loads(good), "schema": 2}): "schema is 2, but .* a newer version",
         json.dumps(result): "it has no 'arm'",
         good.replace('"gravity_2"', '"gravity_9"'): "lacks gravity_2",
         good.replace(

@@ -1,4 +1,4 @@
-"""Arms driven by voltage: what their configuration says, and what is played."""
+"""Voltage-driven arms: their configuration and experiment."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.dry_run import is_within, run_on
 from hil.config.schema import Config, load_config
 from hil.drivers.servo_model import Mode
 from hil.dry_run.amplitude import Amplitude
@@ -18,6 +17,8 @@ from hil.experiment.run import run_experiment
 from hil.fakes.servo.registers import load_model
 from hil.plan.plan import make_plan
 from hil.runs.run_folder import RunFolder
+from tests.support.dry_runs import is_within, run_on
+from tests.support.edits import replaced
 
 ArmFile = Callable[..., Path]
 
@@ -68,7 +69,7 @@ def test_a_dry_run_knows_what_turning_motors_generate(arm_file: ArmFile, tmp_pat
     foreseen = predict(config, plan, prior_ensemble(config, 48))
     seen = run_on(config, Amplitude(plan, plan.segments[0].peak_torque, foreseen), tmp_path)
     assert seen is not None and is_within(config, seen, foreseen.quantile)
-    # Without back-EMF the elbow would be foreseen to turn several times as fast.
+    # Without back-EMF, the predicted speed of the elbow would be several times higher.
     assert (foreseen.median[2] < 2.0 * seen[2]).all()
     assert quantities_of(config)[3] == ("voltage", "V") and foreseen.limits[3].tolist() == [8.0, 8.0]
 
@@ -107,17 +108,16 @@ def test_an_arm_driven_by_voltage_is_identified(arm_file: ArmFile, tmp_path: Pat
     motor = load_model("XL430-W250")
     path = by_voltage(arm_file)
     text = path.read_text(encoding="utf-8")
-    for old, new in (
+    text = replaced(
+        text,
         ("torque_per_volt = 0.125", f"torque_per_volt = {1.80 / motor.resistance_ohm}"),
         ("torque_per_volt = 0.125", f"torque_per_volt = {1.80 / motor.resistance_ohm}"),
         ("rate = 400.0 ", "rate = 200.0 "),
         ("period = 2.0 ", "period = 6.0 "),
         ("band = [0.5, 6.0]", "band = [0.17, 6.0]"),
-        # Back-EMF damps so strongly that the arm creeps into its periodic motion.
+        # Back-EMF damps so strongly that the arm approaches its periodic motion slowly.
         ("[experiment]\n", "[experiment]\nheld_out = false\nmax_settling_periods = 8\n"),
-    ):
-        assert old in text
-        text = text.replace(old, new, 1)
+    )
     path.write_text(text, encoding="utf-8")
     config = load_config(path)
     run = RunFolder.create(tmp_path / "run", config)

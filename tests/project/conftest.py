@@ -1,4 +1,4 @@
-"""The wheel as `pip` would build it, once for all tests of the project."""
+"""The wheel as built by `pip`, shared by all tests of the project."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""docs/architecture.md against the code: files and functions exist, imports are as said, and the steps work."""
+"""docs/architecture.md agrees with the code: files and functions exist, imports are as stated, and the steps work."""
 
 import ast
 import os
@@ -53,13 +53,13 @@ def test_the_import_table_is_what_the_linter_holds() -> None:
         allowed = set(re.findall(r"`(hil\.\w+)`", said)) | {package}
         everything = {name for name in others if _is_code(name)}
         free = everything - forbidden[package] - {package}
-        # A leaf without imports of its own needs no contract; what is allowed must not be forbidden.
+        # A leaf without imports needs no contract; no allowed import may be forbidden.
         assert not allowed & forbidden[package]
         assert free <= allowed | LEAVES, f"{package} may import {sorted(free - allowed - LEAVES)} too"
 
 
 LEAVES = {"hil.toml_errors", "hil.description"}
-"""Modules that import nothing of hil: who imports them imports nothing else."""
+"""Modules that import nothing else of hil."""
 
 
 def _is_code(name: str) -> bool:
@@ -73,7 +73,7 @@ def test_leaves_import_nothing_of_hil() -> None:
 
 
 def blocks(title: str) -> list[tuple[str, str]]:
-    """The code of a section: what file, and the text."""
+    """The code blocks of a section: file name and text."""
     found: list[tuple[str, str]] = re.findall(r'^```\w+ title="(.*?)"\n(.*?)^```', section(title), re.M | re.S)
     assert found
     return found
@@ -91,7 +91,7 @@ def copy(tmp_path: Path) -> Path:
 
 
 def follow(copy: Path, title: str) -> set[str]:
-    """Do what a section says; the files that it touches."""
+    """Carry out the steps of a section; return the changed files."""
     touched = set()
     for name, text in blocks(title):
         file = name.removesuffix(" (new file)")
@@ -109,7 +109,7 @@ def follow(copy: Path, title: str) -> set[str]:
 
 
 def run(copy: Path, code: str) -> None:
-    """`code` in a fresh interpreter that imports the copy."""
+    """Run `code` in a fresh interpreter that imports the copy."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     code = f"import hil; assert hil.__file__.startswith({str(copy)!r}), hil.__file__\n{code}"
     done = subprocess.run(
@@ -138,7 +138,7 @@ assert load_model("XD430-T210").operating_modes
 
 
 def test_a_friction_term_as_described(copy: Path) -> None:
-    """Derivatives as differences say, a simulated arm's term found again, and known to all who use a model."""
+    """The new term has correct derivatives, is identified from a simulated arm, and is known everywhere."""
     touched = follow(copy, "A friction term")
     equations = {"estimator/simulation/arm.py", "estimator/simulation/sensitivity.py", "hil/arm_model.py"}
     assert touched == {"estimator/models/terms.py", *equations, "hil/config/experiment.py"}
@@ -207,11 +207,11 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.faults import parse_fault
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 class Still:
     joints, position, velocity, current = 1, (0.0,), (0.0,), (0.0,)
     def advance(self, until, current): pass
-servo = Servo(load_model("XM430-W350"), 1)
+servo = EmulatedServo(load_model("XM430-W350"), 1)
 clock = VirtualClock()
 bus = FakeBus([servo], Still(), clock)
 clock.wait_until(clock.now() + 1.0)

@@ -1,4 +1,4 @@
-"""The scripts behind the printed figures still start: each one's --help imports all that it measures."""
+"""All benchmark scripts start: their --help imports everything they use."""
 
 import subprocess
 import sys
@@ -14,9 +14,8 @@ SHARED = (
     "machine",
     "pty",
     "population_arms",
+    "population_others",
     "client_calls",
-    "recorded_arm",
-    "short_experiment",
 )
 SCRIPTS = sorted(path.stem for path in BENCHMARKS.glob("*.py") if path.stem not in SHARED)
 

@@ -1,4 +1,4 @@
-"""An installed wheel beside a stranger's own packages `drivers`, `estimator` and `fakes`: each finds its own."""
+"""An installed wheel next to a user's own packages `drivers`, `estimator` and `fakes`: imports do not collide."""
 
 import os
 import subprocess
@@ -29,7 +29,7 @@ def test_the_fixture_works(fake_arm):
 
 @pytest.fixture(scope="module", params=["unpacked", pytest.param("installed", marks=pytest.mark.slow)])
 def environment(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """bin/ of a fresh environment that holds the wheel: unpacked beside borrowed dependencies, or installed by pip."""
+    """bin/ of a fresh environment with the wheel: unpacked next to borrowed dependencies, or installed by pip."""
     folder = tmp_path_factory.mktemp("environment")
     binaries = folder / "bin"
     if request.param == "installed":
@@ -52,14 +52,14 @@ def environment(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: p
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A stranger's project: two packages, a module, and tests of their own."""
+    """A user's project with its own packages, module and tests."""
     for name in ("drivers", "fakes"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text('OWNER = "stranger"\n', encoding="utf-8")
     (tmp_path / "estimator.py").write_text('OWNER = "stranger"\n', encoding="utf-8")
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_theirs.py").write_text(THEIR_TESTS, encoding="utf-8")
-    (tmp_path / "conftest.py").touch()  # plain pytest puts its folder on the path
+    (tmp_path / "conftest.py").touch()  # plain pytest adds the folder of a conftest.py to the path
     return tmp_path
 
 

@@ -1,4 +1,4 @@
-"""Every command in the README and the docs, run as a reader would, on the fake bus; and what they say of the code."""
+"""Every command in the README and the docs is run on the fake bus, and statements about the code are checked."""
 
 import ast
 import os
@@ -27,7 +27,7 @@ RUN_ELSEWHERE = {
     ".venv/bin/python": "test_packaging, CI",
     "mkdocs": "test_the_site_builds",
 }
-"""Commands that these tests do not run as they stand, and why or where they are run."""
+"""Commands that these tests do not run unchanged, with the reason or the test that runs them."""
 
 
 def commands(document: Path) -> Iterator[str]:
@@ -43,14 +43,14 @@ def commands(document: Path) -> Iterator[str]:
 
 @pytest.fixture
 def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that looks like a checkout, with the fake arms' periods cut short, and a finished run."""
+    """A folder like a checkout, with short periods for the fake arms, and a finished run."""
     here = tmp_path / "place"
     (here / "configs").mkdir(parents=True)
     for path in (ROOT / "configs").glob("*.toml"):
         text = path.read_text(encoding="utf-8")
         if path.stem.startswith("fake"):
             text = cut_short(text)
-            (here / path.stem).write_text(text, encoding="utf-8")  # found before the bundled one of that name
+            (here / path.stem).write_text(text, encoding="utf-8")  # takes precedence over the bundled file of that name
         (here / "configs" / path.name).write_text(text, encoding="utf-8")
     new = text_of_new_servos((here / "configs" / "fake_two_link.toml").read_text(encoding="utf-8"))
     (here / "configs" / "new.toml").write_text(new, encoding="utf-8")
@@ -65,7 +65,7 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def text_of_new_servos(text: str) -> str:
-    """The same arm with servos as they come from the factory, at 57600 baud, and with ID 2 still free."""
+    """The same arm with factory-new servos at 57600 baud, and with ID 2 unused."""
     new = text.replace("[[fake.servos]]\n", "[[fake.servos]]\nbaud = 57600\n")
     return new.replace("baud = 57600\nid = 2", "baud = 57600\nid = 9")
 
@@ -77,7 +77,9 @@ def cut_short(text: str) -> str:
 
 
 def as_here(command: str) -> list[str]:
-    """The command's words for the fake bus: a real port becomes the fake arm, a question is answered with yes."""
+    """The command's arguments for the fake bus: a real port is replaced by the fake arm, and questions are answered
+    yes.
+    """
     words = shlex.split(re.sub(r" > \S+$", "", command))
     port = "configs/new.toml" if "57600" in words else "configs/fake_two_link.toml"
     words = [re.sub(r"^/dev/tty\w+$", port, word) for word in words]
@@ -112,13 +114,13 @@ def test_commands_run(document: Path, place: Path, capsys: pytest.CaptureFixture
             command_line = [sys.executable, *words[1:], "runs/finished"]
             subprocess.run(command_line, check=True, capture_output=True, env=environment)
         elif words[0] == "python":
-            ast.parse((ROOT / words[1]).read_text(encoding="utf-8"))  # a benchmark: run by hand, it takes minutes
+            ast.parse((ROOT / words[1]).read_text(encoding="utf-8"))  # a benchmark, which takes minutes
         else:
             assert words[0] in RUN_ELSEWHERE, f"{document.name}: nothing runs {command!r}"
 
 
 def serve(words: list[str]) -> None:
-    """A command that goes on until it is stopped must still be there after a moment, and end when asked to."""
+    """A command that runs until stopped must still be running after a moment, and end on request."""
     with subprocess.Popen([sys.executable, "-m", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
         try:
             process.wait(timeout=2)

@@ -1,4 +1,4 @@
-"""The examples, on the realistic fake arm: what they print must show that the model helps."""
+"""The examples on the realistic fake arm: their output must show that the model helps."""
 
 import re
 import subprocess

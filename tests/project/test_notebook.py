@@ -1,4 +1,4 @@
-"""The notebook in examples/: its cells run without Jupyter, and give what it shows."""
+"""The notebook in examples/: its cells run without Jupyter and reproduce the stored output."""
 
 import ast
 import json
@@ -23,7 +23,7 @@ def code_cells() -> list[dict[str, Any]]:
 
 
 def run(source: str, names: dict[str, Any]) -> Any:
-    """Run a cell; the value of its last line where that is an expression."""
+    """Run a cell; return the value of its last line if that is an expression."""
     tree = ast.parse(source)
     last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
     exec(compile(tree, str(NOTEBOOK), "exec"), names)
@@ -31,7 +31,7 @@ def run(source: str, names: dict[str, Any]) -> Any:
 
 
 def nothing() -> None:
-    """What a value without such a method shows."""
+    """The output for a value without such a method."""
 
 
 def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,7 +50,7 @@ def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytes
 
 
 def test_the_values_it_shows_are_those_of_the_fake_arm() -> None:
-    """Within what any estimator of this project must reach; error bars may change with the estimator."""
+    """Tolerances that any version of the estimator must meet, because its error bars may change."""
     shown = next(text for text in texts() if "trust it: yes" in text)
     truth = load_config(bundled_configs()["fake_two_link"]).fake
     assert truth is not None

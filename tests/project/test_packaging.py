@@ -1,4 +1,4 @@
-"""The wheel as a stranger gets it: small, whole, and running without a checkout; imports that stay quick."""
+"""The wheel as users get it: small, complete, and working without a checkout; imports stay fast."""
 
 import os
 import re
@@ -29,7 +29,7 @@ def test_the_wheel_is_small_and_whole(wheel: Path) -> None:
 
 
 def test_the_wheel_of_the_sdist_is_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
-    """The links hil/drivers -> ../drivers are not followed there: the sdist holds what they point to."""
+    """The links hil/drivers -> ../drivers are not followed: the sdist contains their targets."""
     with tarfile.open(build("sdist", ROOT, tmp_path / "sdist")) as sdist:
         assert not [member.name for member in sdist if member.issym()]
         sdist.extractall(tmp_path / "source", filter="data")
@@ -75,7 +75,7 @@ def test_a_bare_name_is_a_file_first_and_a_bundled_arm_second(tmp_path: Path, mo
 
 
 def test_import_and_help_load_nothing_heavy() -> None:
-    """What keeps `import hil` under 0.1 s and `hil --help` under 0.3 s of processor time."""
+    """Slow imports would break the limits of 0.1 s for `import hil` and 0.3 s of processor time for `hil --help`."""
     heavy = "{'numpy', 'scipy', 'numba', 'pydantic', 'serial', 'dynamixel_sdk', 'rich', 'jinja2', 'matplotlib'}"
     for code in ("import sys, hil", "import sys, hil.cli.app", "import sys, hil.fakes.pytest_plugin"):
         check = f"{code}; loaded = {heavy} & set(sys.modules); assert not loaded, loaded"

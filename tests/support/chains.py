@@ -1,4 +1,4 @@
-"""Serial arms drawn at random, as URDF text."""
+"""Randomly drawn serial arms, as URDF text."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from hil.estimator.chain.geometry import Chain
 
 
 def random_urdf(joints: int, seed: int) -> str:
-    """An arm of links with any shape, axis along any direction, and a piece fixed to its last link."""
+    """An arm with links of any shape, axes in any direction, and a part fixed to its last link."""
     rng = np.random.default_rng(seed)
     parts = ['<robot name="random"><link name="base"/>']
     for joint in range(joints):
@@ -27,7 +27,7 @@ def random_urdf(joints: int, seed: int) -> str:
 
 
 def random_chain(joints: int, seed: int) -> Chain:
-    """Joints that point anywhere, gravity too."""
+    """A chain with joint axes and gravity in random directions."""
     rng = np.random.default_rng(seed)
     axis = rng.standard_normal((joints, 3))
     rotation = np.stack([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(joints)])
@@ -41,7 +41,7 @@ def random_chain(joints: int, seed: int) -> Chain:
 
 
 def random_parameters(joints: int, seed: int) -> np.ndarray:
-    """All parameters of links that have mass everywhere, armatures among them (11 joints,)."""
+    """All inertial parameters of random links with positive mass, including armatures (11 joints,)."""
     rng = np.random.default_rng(seed)
     table = np.empty((joints, TERMS))
     for row in table:

@@ -1,4 +1,4 @@
-"""The `hil` command as the tests call it."""
+"""The `hil` command as called by the tests."""
 
 import sys
 
@@ -8,7 +8,7 @@ from hil.cli.app import main
 
 
 def hil(*arguments: object) -> int:
-    """Run the command in this process; its exit code. The caller's fixtures put sys.argv back."""
+    """Run the command in this process and return its exit code. The caller's fixtures restore sys.argv."""
     sys.argv = ["hil", *map(str, arguments)]
     with pytest.raises(SystemExit) as caught:
         main()

@@ -1,4 +1,4 @@
-"""What stands between bus and plant: when current last flowed, how far the joints went, and a motor turned round."""
+"""A plant wrapper that records current and motion, and can reverse a motor."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass
 class Spy:
-    """live_until: when current last flowed [s]; low, high: how far joints went [rad]; turned: a motor turned round."""
+    """live_until: time of the last current [s]; low, high: extreme positions [rad]; turned: reversed motors."""
 
     live_until: float = 0.0
     low: list[float] = field(default_factory=lambda: [np.inf, np.inf])
@@ -18,7 +18,7 @@ class Spy:
 
 
 class SpiedPlant:
-    """A plant that tells a spy what flows and how far it goes; a motor turned round feels the opposite current."""
+    """A plant that reports current and motion to a spy; a reversed motor gets the opposite current."""
 
     def __init__(self, plant: Any, spy: Spy) -> None:
         self._plant = plant
@@ -52,7 +52,7 @@ class SpiedPlant:
 
 
 def call_at(port: Any, when: float, action: Callable[[], None]) -> None:
-    """Do it once, in the first wait that ends after `when` on the port's clock."""
+    """Call `action` once, in the first wait that ends after `when` on the port's clock."""
     clock = port.clock
     wait = clock.wait_until
     todo = [action]

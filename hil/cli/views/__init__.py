@@ -1,1 +1,1 @@
-"""What a person sees in the terminal: progress, servos, results."""
+"""Terminal output: progress, servos, results."""

@@ -1,4 +1,4 @@
-"""The live display of a running experiment: each joint between its limits, the stream's lateness, heat and supply."""
+"""The live display of a running experiment: each joint between its limits, timing, temperature and voltage."""
 
 import math
 
@@ -9,12 +9,12 @@ from rich.text import Text
 from hil.config.schema import Config
 from hil.experiment.stream import Progress
 
-_NARROW = 100  # columns below which the gauges are short
-_NEAR = 0.85  # of a limit from which a value is shown in yellow
+_NARROW = 100  # terminal width below which short gauges are drawn
+_NEAR = 0.85  # fraction of a limit above which a value is shown in yellow
 
 
 class LiveView:
-    """Keeps values that the latest sample does not include: earliest write, last temperatures and voltages."""
+    """Draws progress reports; stores values that are not in every sample: earliest write, temperatures and voltages."""
 
     def __init__(self, config: Config, columns: int) -> None:
         self._joints = config.joints
@@ -26,7 +26,7 @@ class LiveView:
         self._supply = [math.nan] * len(config.joints)
 
     def draw(self, progress: Progress) -> Group:
-        """The display for one progress report."""
+        """Render the display for one progress report."""
         self._keep(progress)
         table = Table.grid(padding=(0, 1))
         state = progress.state
@@ -45,7 +45,7 @@ class LiveView:
 
     def _keep(self, progress: Progress) -> None:
         state = progress.state
-        # Deadlines are a fixed time apart, so the earliest write seen is nearest to its own.
+        # Deadlines are evenly spaced, so the earliest write relative to its deadline serves as the reference.
         phase = state.time_before_write - progress.taken / self._rate
         self._earliest = min(self._earliest, phase)
         self._latest = max(self._latest, phase - self._earliest)
@@ -65,7 +65,7 @@ class LiveView:
         return f"{heat:.0f} °C {supply:.1f} V" if math.isfinite(heat) and math.isfinite(supply) else ""
 
     def _gauge(self, value: float, low: float, high: float) -> tuple[Text, Text]:
-        """The value and a gauge of its place between its limits; yellow near a limit."""
+        """The value, and a gauge that shows its position between its limits; yellow near a limit."""
         if not low <= value <= high:
             return Text(f"{value:+7.2f}", style="red"), Text("─" * self._gauge_width, style="red")
         share = (value - low) / (high - low)

@@ -1,30 +1,33 @@
-"""A result as a table in the terminal: parameter, unit, value, standard error; on a fake arm the truth too."""
+"""Print a result in the terminal: parameter, unit, value, standard error and, for a fake arm, the true value."""
 
+import math
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.cli.printing import print_table, say
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
+from hil.estimator.models.terms import joint_of, term_of
 from hil.results.parts import Quantity
 from hil.results.result import SettledResult, ShootingResult
 
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
-    """The table, the fit and what to do next."""
-    console.print(_parameters(result))
+    """Print the parameter table, the quality of the fit, the verdict and the next commands."""
+    print_table(console, _parameters(result))
     physical = [] if result.physical is None else physical_lines(result.physical)
     told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
     told = (*told, *_torque_constants(result, config), *physical)
     for line in (*told, *_next(result, run)):
-        console.print(line, soft_wrap=True, markup=False)
+        say(console, line)
 
 
-def print_shooting_result(result: ShootingResult) -> None:
-    """A result of multiple shooting."""
+def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
+    """A result of multiple shooting. run: the folder it is in."""
     print(f"{result.joints}-joint arm, {result.config}")
     for name, entry in result.quantities.items():
         print(f"{name:22s} {entry.unit:10s} {entry.value:12.5g} {entry.std:9.1e}")
@@ -33,22 +36,30 @@ def print_shooting_result(result: ShootingResult) -> None:
         shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(found.zero, found.std, strict=True))
         print(f"Encoder zeros of {found.recording or result.config}: {shown} rad.")
     print(f"{result.method}.")
-    print(f"Residual {rms} mrad RMS over {result.fit.segments} segments.")
-    for warning in result.warnings:
-        print(f"Warning: {warning}")
+    steps = ", ".join(f"{value:.3g}" for value in result.fit.residual_rms_ticks)
+    counted = f", {steps} encoder steps" if steps else ""
+    print(f"Residual {rms} mrad RMS{counted} over {result.fit.segments} segments.")
     if result.model_choice is not None:
         choice = result.model_choice
-        print(
-            f"Chosen by cross-validation on held-out segments: {choice.chosen}, error {choice.error_divided_by:.2f} "
-            "times smaller."
-        )
+        times = f"error {choice.error_divided_by:.3g} times smaller than with the plainest model"
+        print(f"Chosen on held-out segments: {choice.chosen}, {times}.")
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
+    for note in result.notes:
+        print(f"Note: {note}")
+    for warning in result.warnings:
+        print(f"Warning: {warning}")
+    if result.verdict is not None:
+        print(f"Trust this model: {result.verdict.trust}. " + " ".join(result.verdict.sentences))
+    if run is not None:
+        print(f"Run folder: {run}, report: {run / 'report.html'}")
+        if result.recordings:
+            print(f"To use it elsewhere: hil export {run} --format mjcf")
 
 
 def _parameters(result: SettledResult) -> Table:
     truth = result.truth
-    # Narrow enough for 80 columns, so that no figure is cut.
+    # Narrow enough for 80 columns, so that no number is truncated.
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.title, table.title_justify, table.title_style = (
         f"{result.joints}-joint arm, {escape(str(result.config))}",
@@ -60,7 +71,9 @@ def _parameters(result: SettledResult) -> Table:
     for heading in ("value", "std", *(("truth", "error %", "in std.") if truth else ())):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, entry in result.parameters.items():
-        table.add_row(escape(name), escape(entry.unit), *_numbers(entry, truth.get(name) if truth else None))
+        counted = math.hypot(entry.std, _constant_std(result, name) * abs(entry.value))
+        shown = _numbers(entry, truth.get(name) if truth else None, counted)
+        table.add_row(escape(name), escape(entry.unit), *shown)
     table.add_row()
     for name, entry in result.extra.items():
         table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
@@ -68,13 +81,23 @@ def _parameters(result: SettledResult) -> Table:
     return table
 
 
-def _numbers(entry: Quantity, truth: float | None) -> list[str]:
+def _constant_std(result: SettledResult, name: str) -> float:
+    """Relative standard error of the joint's torque constant, with which the parameter scales; 0 where it does not."""
+    joint = joint_of(name) or 1
+    if not term_of(name).of_torque or joint > len(result.arm.joints):
+        return 0.0
+    facts = result.arm.joints[joint - 1]
+    return facts.torque_per_goal_std / facts.torque_per_goal if facts.torque_per_goal else 0.0
+
+
+def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
+    """counted: standard error that an error is held against, with the torque constant's."""
     value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
         error = value - truth
         percent = f"{100 * error / truth:+.3f}" if truth else "-"
-        cells += [f"{truth:.5g}", percent, f"{error / std:+.1f}" if std > 0 else "-"]
+        cells += [f"{truth:.5g}", percent, f"{error / counted:+.1f}" if counted > 0 else "-"]
     return cells
 
 
@@ -98,8 +121,8 @@ def _choice(result: SettledResult) -> list[str]:
     tried = ", ".join(trial.model for trial in choice.tried)
     gained, cost = choice.error_divided_by, choice.standard_errors_times
     return [
-        f"Chosen of {tried}: {choice.chosen}. Compared with the first, it predicts {gained:.3g} times better and makes "
-        f"the standard errors {cost:.3g} times larger."
+        f"Model chosen from {tried}: {choice.chosen}. Compared with the first, its prediction error is {gained:.3g} "
+        f"times smaller and its standard errors are {cost:.3g} times larger."
     ]
 
 

@@ -1,4 +1,4 @@
-"""What scan, check and setup print, as tables for people and as plain values for JSON."""
+"""Output of scan, check and setup: tables for the terminal and plain values for JSON."""
 
 import json
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.STOP: "red"}
 
 
 def print_ports(ports: Sequence[tuple[str, str]], json_only: bool) -> None:
-    """The machine's serial ports, and the next command to type."""
+    """Print the machine's serial ports and the next command to type."""
     if json_only:
         print(json.dumps({"ports": [{"device": device, "description": text} for device, text in ports]}))
         return
@@ -30,7 +30,7 @@ def print_ports(ports: Sequence[tuple[str, str]], json_only: bool) -> None:
 
 
 def scanned(heard: Sequence[Heard]) -> dict[str, Any]:
-    """A scan as plain values."""
+    """A scan as plain values for JSON."""
     return {
         "servos": [servo._asdict() for each in heard for servo in each.servos],
         "trouble": [{"baud": each.baud, "trouble": each.trouble} for each in heard if each.trouble],
@@ -62,7 +62,7 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
 
 
 def print_findings(findings: Sequence[Finding], config: Path) -> None:
-    """One line for each finding, with its fix below it, and whether an experiment can start."""
+    """Print one line per finding, with its fix below it, and whether an experiment can start."""
     console = Console(highlight=False, soft_wrap=True)
     former = None
     for finding in findings:
@@ -83,7 +83,7 @@ def print_findings(findings: Sequence[Finding], config: Path) -> None:
 
 
 def changed(changes: Sequence[Change]) -> dict[str, Any]:
-    """What setup did as plain values."""
+    """The changes made by setup as plain values for JSON."""
     return {"changes": [change._asdict() for change in changes]}
 
 

@@ -1,1 +1,1 @@
-"""Recordings that hold no settled period: CSV files, and runs that were cut short."""
+"""Recordings without a settled period: CSV files, and runs that were cut short."""

@@ -1,57 +1,51 @@
-"""Estimates from recordings that hold no settled period: CSV files, and runs that were cut short."""
+"""Estimates from recordings that hold no settled period: other tools' files, and runs that were cut short."""
 
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.config.chain import only_planar
-from hil.config.csv_columns import load_csv_config
 from hil.config.experiment import ModelConfig
 from hil.errors import ConfigError
 from hil.estimation.model_from_config import wanted_model
-from hil.estimation.physical import physical_of
-from hil.estimation.result_checks import describe_segment_choice
+from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.settled_warnings import clipping_warnings
-from hil.estimation.unsettled.csv_recording import read_csv
-from hil.estimation.unsettled.warnings import any_warnings
+from hil.estimation.unsettled.plausibility import implausible, undetermined
+from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
+from hil.estimator.errors import RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
-from hil.estimator.selection.unsettled import choose_by_shooting
-from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Zeros
+from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
+from hil.estimator.selection.segments import considered, missing_terms, predicted_positions
+from hil.estimator.selection.unsettled import SegmentChoice, choose_by_shooting, held_out_error
+from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Zeros
 from hil.results.result import ShootingResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
 log = logging.getLogger(__name__)
 
-START_CUTOFF = 8.0  # Hz, of the inverse dynamics that start the likelihood
+START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the likelihood: the first that can be used
 START_WIDTH = 0.05  # rad/s
+NOT_HERE = ("ripple", "encoder", "lags")
 
 
-def estimate_csv(paths: Sequence[Path], config_path: Path) -> ShootingResult:
-    """The result of one or more CSV files of the same arm, recorded apart. Raises HilError, EstimationError."""
-    config = load_csv_config(config_path)
-    columns = config.columns
-    recordings = [read_csv(path, columns) for path in paths]
-    zeros = (columns.zeros_unknown or config.model.zeros) and config.arm.gravity > 0.0
-    result = _estimate(recordings, config.model, columns.segment, zeros, str(config_path))
-    names = tuple(map(str, paths))
-    result = replace(result, recordings=names)
-    if result.zeros is not None:
-        named = zip(names, result.zeros, strict=True)
-        result = replace(result, zeros=tuple(replace(found, recording=name) for name, found in named))
-    if config.known is not None:
-        result = replace(result, physical=physical_of(result, config.known.quantities(), config.arm.gravity))
-    return result
+@dataclass(frozen=True)
+class Estimated:
+    """result: without what the caller adds. predicted: of each recording (joints, samples) [rad], NaN where none is."""
+
+    result: ShootingResult
+    predicted: tuple[NDArray[np.float64], ...]
+    estimate: ShootingEstimate
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
-    """The result of all samples of a run whose motion never became periodic, or that was stopped before it did."""
+    """Estimate from all samples of a run that never became periodic or was stopped before it did."""
     config, facts = run.load_config(), run.load_facts()
     only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
@@ -64,57 +58,102 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
         between="held",
         command_to_sample=facts.command_to_sample,
     )
-    result = _estimate([recording], config.model, 1.0, config.model.zeros, facts.config)
+    zeros = config.model.zeros
+    result = estimate_any([recording], config.model, 1.0, zeros, facts.config, config.arm.gravity).result
     result = replace(result, warnings=(*result.warnings, *clipping_warnings(config, samples)))
     run.write_result(result)
     return result
 
 
-def _estimate(
-    recordings: Sequence[Recording], wanted: ModelConfig, segment: float, zeros: bool, shown_path: str
-) -> ShootingResult:
-    if wanted.ripple:
-        raise ConfigError(
-            "model.ripple needs a settled period to find its cycles per turn: remove it for unsettled data."
-        )
+def estimate_any(
+    recordings: Sequence[Recording],
+    wanted: ModelConfig,
+    segment: float,
+    zeros: bool,
+    shown_path: str,
+    gravity: float,
+    stepped: Sequence[bool] = (),
+) -> Estimated:
+    """The estimate, its checks and its verdict. stepped: whether each joint's encoder step is known; by default it is.
+
+    Raises ConfigError, EstimationError.
+    """
+    refused = [option for option in NOT_HERE if getattr(wanted, option)]
+    if refused:
+        raise ConfigError(f"model.{refused[0]} needs a settled period: remove it for unsettled data.")
     began = time.perf_counter()
-    start = fit_inverse_dynamics(recordings, START_CUTOFF, START_WIDTH).value
-    choice = None
+    start = _start(recordings)
+    estimate, choice, held_out = _fitted(recordings, wanted, start, segment, zeros)
+    estimate = considered(recordings, estimate)
+    found = doubts_of(recordings, estimate)
+    odd = (*implausible(recordings, estimate, gravity), *undetermined(estimate))
+    verdict = judge_segments(
+        recordings,
+        estimate,
+        SegmentEvidence(held_out, missing_terms(recordings, estimate), odd, bool(found.faults), bool(found.doubts)),
+    )
+    result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
+    result = replace(
+        result,
+        validation=Validation(
+            held_out_rms=None if held_out is None else tuple(held_out.tolist()),
+            residual_over_floor=tuple(estimate.residual_over_noise.tolist()),
+        ),
+        verdict=describe_verdict(verdict),
+        warnings=(*found.faults, *found.doubts, *found.warnings),
+        model_choice=None if choice is None else describe_segment_choice(choice),
+    )
+    log.info("%s: %s, trust this model: %s", shown_path, result.method, verdict.trust)
+    for warning in result.warnings:
+        log.warning("%s: %s", shown_path, warning)
+    return Estimated(result, predicted_positions(recordings, estimate), estimate)
+
+
+def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:
+    """Base parameters by inverse dynamics, filtered as lightly as the recordings' rate and length allow."""
+    for cutoff in START_CUTOFFS[:-1]:
+        try:
+            return fit_inverse_dynamics(recordings, cutoff, START_WIDTH).value
+        except RecordingError:
+            continue
+    return fit_inverse_dynamics(recordings, START_CUTOFFS[-1], START_WIDTH).value
+
+
+def _fitted(
+    recordings: Sequence[Recording], wanted: ModelConfig, start: NDArray[np.float64], segment: float, zeros: bool
+) -> tuple[ShootingEstimate, SegmentChoice | None, NDArray[np.float64] | None]:
     if wanted.friction == "auto":
         choice = choose_by_shooting(
             recordings, wanted.drive, start, length=segment, zeros=zeros, torque_scale=wanted.torque_scale
         )
-        estimate = choice.estimate
-    else:
-        # The encoders' zeros are each recording's own here.
-        model = wanted_model(wanted, recordings[0].joints).without("zeros")
-        estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
-    result = make_shooting_result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3))
-    result = replace(result, warnings=tuple(any_warnings(recordings, estimate)))
-    log.info("%s: %s", shown_path, result.method)
-    for warning in result.warnings:
-        log.warning("%s: %s", shown_path, warning)
-    return result if choice is None else replace(result, model_choice=describe_segment_choice(choice))
+        return choice.estimate, choice, choice.chosen.held_out
+    # The encoders' zeros are each recording's own here.
+    model = wanted_model(wanted, recordings[0].joints).without("zeros")
+    estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
+    return estimate, None, held_out_error(recordings, estimate, start)
 
 
-def make_shooting_result(
-    estimate: ShootingEstimate, recordings: Sequence[Recording], shown_path: str, seconds: float
+def _result(
+    estimate: ShootingEstimate,
+    recordings: Sequence[Recording],
+    shown_path: str,
+    seconds: float,
+    stepped: Sequence[bool],
 ) -> ShootingResult:
-    """The result of multiple shooting. shown_path: the configuration's path. seconds: how long the estimation took."""
     base = len(estimate.model.base_names)
     entries = [
         (name, Quantity(float(value), float(std), unit))
         for name, value, std, unit in zip(estimate.names, estimate.value, estimate.std, estimate.units, strict=True)
     ]
     steps = np.max([recording.position_step for recording in recordings], axis=0)
+    in_steps = tuple((estimate.residual_rms / steps).tolist()) if all(stepped) else ()
     zeros = tuple(
         Zeros(zero=tuple(zero.tolist()), std=tuple(std.tolist()))
         for zero, std in zip(estimate.zeros, estimate.zeros_std, strict=True)
     )
     return ShootingResult(
         method=f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
-        f"initial states; {estimate.model.description}; standard errors robust "
-        "against model error",
+        f"initial states; {estimate.model.description}; standard errors robust against model error",
         config=shown_path,
         joints=estimate.model.joints,
         parameters=dict(entries[:base]),
@@ -122,7 +161,7 @@ def make_shooting_result(
         covariance=Covariance(tuple(estimate.names), tuple(map(tuple, estimate.covariance.tolist()))),
         fit=ShootingFit(
             residual_rms_rad=tuple(estimate.residual_rms.tolist()),
-            residual_rms_ticks=tuple((estimate.residual_rms / steps).tolist()),
+            residual_rms_ticks=in_steps,
             samples=int(sum(recording.time.size for recording in recordings)),
             segments=estimate.segments,
         ),

@@ -1,6 +1,7 @@
-"""Warnings about an estimate from unsettled data, each with the joint and the remedy."""
+"""Warnings about an estimate from unsettled data, each with the joint and a remedy."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,29 +10,38 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 
 LEAST_SWING = 30.0  # encoder steps
-LOST = 0.01  # of the samples
+LOST = 0.01  # fraction of the samples
 MANY_TURNS = 2.0
-FLAT = 0.05  # of the samples at the very largest torque: a sine has fewer
-LEFT = 0.1  # residual over the motion's RMS
-WEAK, UNSEEN = 0.5, 10.0  # standard error over value
+FLAT = 0.05  # fraction of samples at the largest torque; a sine has fewer
+LEFT = 0.1  # RMS residual relative to the motion's RMS
+WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 
-def any_warnings(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[str]:
-    """One sentence per warning."""
-    found = _signs(recordings)
+@dataclass(frozen=True)
+class Doubts:
+    """Sentences. faults: the estimate is of no use; doubts: it may be wrong; warnings: worth knowing."""
+
+    faults: tuple[str, ...]
+    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Doubts:
+    """What looks wrong in the recordings, or in how the estimate explains them."""
+    faults, doubts, warnings = _signs(recordings), [], []
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
-        found += _motion(recordings, joint, name)
-        found += _flat(recordings, joint, name)
+        warnings += _motion(recordings, joint, name)
+        doubts += _turns(recordings, joint, name)
+        warnings += _flat(recordings, joint, name)
         motion = float(np.sqrt(np.mean([np.var(each.filled()[joint]) for each in recordings])))
         left = float(estimate.residual_rms[joint]) / motion
         if left > LEFT:
-            found.append(
+            faults.append(
                 f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
-                "check the "
-                "units, signs and zero of position and torque; then try shorter segments."
+                "check the units, signs and zero of position and torque; then try shorter segments."
             )
-    return [*found, *_weak(estimate)]
+    return Doubts(tuple(faults), tuple(doubts), (*warnings, *_weak(estimate)))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
@@ -41,8 +51,8 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     columns = " and ".join(suspicion.signs.reversed_columns)
     negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
     return [
-        f"The sign of {columns} seems to be reversed: with it reversed, inverse dynamics leaves "
-        f"{100 * suspicion.residual:.2g} % of the torque unexplained, as given {100 * suspicion.residual_given:.2g} %"
+        f"The sign of {columns} seems to be reversed: with the sign changed, inverse dynamics leaves "
+        f"{100 * suspicion.residual:.2g} % of the torque unexplained instead of {100 * suspicion.residual_given:.2g} %"
         f"{negative}. Correct the sign in the file, or exchange the columns."
     ]
 
@@ -53,19 +63,23 @@ def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]
     steps = swing / max(float(each.position_step[joint]) for each in recordings)
     if steps < LEAST_SWING:
         found.append(
-            f"{name} moved by {steps:.0f} encoder steps only: rounding dominates its parameters; drive it harder."
+            f"{name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; drive it harder."
         )
-    turns = swing / (2.0 * np.pi)
-    if turns > MANY_TURNS:
-        found.append(f"{name} moved over {turns:.0f} turns: if it did not, its positions are not in the stated unit.")
     lost = 1.0 - float(np.mean(np.concatenate([np.isfinite(each.position[joint]) for each in recordings])))
     if lost > LOST:
         found.append(f"{name}: {100 * lost:.1f} % of its positions are missing.")
     return found
 
 
+def _turns(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
+    turns = max(float(np.ptp(each.filled()[joint])) for each in recordings) / (2.0 * np.pi)
+    if turns <= MANY_TURNS:
+        return []
+    return [f"{name} moved over {turns:.0f} turns: if it did not, its positions are not in the stated unit."]
+
+
 def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
-    """A measured torque that stays at its largest value was cut off there; a command may."""
+    """Detect a measured torque that was clipped at its largest value; a commanded torque may stay constant."""
     for each in recordings:
         size = np.abs(each.torque[joint])
         at_most = float(np.mean(size > 0.9999 * size.max()))

@@ -1,1 +1,1 @@
-"""The report's sections, one per module. Each gives a Section, or None where the run does not hold what it shows."""
+"""The report's sections, one per module. Each returns a Section, or None if the run lacks the data."""

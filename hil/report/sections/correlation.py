@@ -1,20 +1,26 @@
-"""Which parameters the data hardly separate."""
+"""Section on parameters that the data hardly separate."""
 
 import numpy as np
 
 from hil.report.chart import Array, Matrix
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
+from hil.results.result import Result
 
 STRONG = 0.9
 
 
 def correlation(data: RunData) -> Section | None:
     """Present if the result has parameters."""
-    names = data.result.covariance.names
+    return correlation_of(data.result)
+
+
+def correlation_of(result: Result) -> Section | None:
+    """Of any result."""
+    names = result.covariance.names
     if not names:
         return None
-    values = correlations(data.result.covariance.array())
+    values = correlations(result.covariance.array())
     strong = sorted(
         (
             (float(values[row, column]), names[row], names[column])

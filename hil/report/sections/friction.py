@@ -1,4 +1,4 @@
-"""Friction against speed: the model's curve with its interval, and the torque that the measured motion leaves to it."""
+"""Section on friction versus speed: the model's curve with its interval, and the torque left by the measured motion."""
 
 import numpy as np
 
@@ -7,37 +7,37 @@ from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.report.chart import BLUE, GREY, Array, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
+from hil.results.parts import Covariance
 from hil.runs.period_file import PlayedPeriod
 
-_CURVE = 401  # speeds on the curve
+_CURVE = 401  # points on the curve
 _DOTS = 700
-_DRAWS = 200  # of the parameters, for the interval
+_DRAWS = 200  # parameter draws for the interval
 
 
 def friction(data: RunData) -> Section | None:
-    """Present if the run has its settled period."""
+    """The section; None if the run has no settled period."""
     if data.fitted is None:
         return None
     speed, torque = _left_to_friction(data.model, data.fitted)
     pictures = [_curve(data, joint, name, speed[joint], torque[joint]) for joint, name in enumerate(data.names)]
     words = (
         "Dots: commanded torque minus the model's inertia and gravity torque for the measured motion. They scatter "
-        "because "
-        "the acceleration is derived from a quantised position, and near standstill because static friction takes any "
-        "value that holds the joint.",
+        "because the acceleration is derived from a quantised position, and near standstill because static "
+        "friction takes any value that holds the joint.",
     )
     return Section("friction", "Friction", words, pictures=tuple(pictures))
 
 
 def _left_to_friction(model: ArmModel, period: PlayedPeriod) -> tuple[Array, Array]:
-    """Speeds [rad/s] and torques [N m] (joints, dots), from the lines of the measured motion."""
+    """Speeds [rad/s] and friction torques [N m], both (joints, dots), from the Fourier lines of the measured motion."""
     filled = np.where(np.isfinite(period.position), period.position, period.predicted)
     lines = lines_of(filled)
     samples = filled.shape[1]
     motion = motion_of(lines, cut_off(lines), 2 * np.pi * period.rate / samples, samples)
     rigid = model.rigid_body_torque(motion.position.T, motion.velocity.T, motion.acceleration.T).T
     offset = np.array([[model.values[f"offset_{joint + 1}"]] for joint in range(len(filled))])
-    # The command is held: at the middle between two commands the mean of both is in force.
+    # Commands are held until the next one: the torque effective at a sample is the mean of two successive ones.
     scale = np.array([[model.torque_scale(joint + 1)] for joint in range(len(filled))])
     held = 0.5 * scale * (period.torque + np.roll(period.torque, 1, axis=1))
     chosen = slice(None, None, max(1, samples // _DOTS))
@@ -46,10 +46,10 @@ def _left_to_friction(model: ArmModel, period: PlayedPeriod) -> tuple[Array, Arr
 
 def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) -> Picture:
     fastest = float(np.abs(speed).max())
-    # Denser where friction bends: cubes of an even grid.
+    # Cubes of an even grid are denser near zero speed, where the curve bends.
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3
-    curve = _torque(data.model, at)[:, joint]
-    low, high = _interval(data, at, joint)
+    curve = friction_curve(data.model, at)[:, joint]
+    low, high = friction_interval(data.model, data.result.covariance, at, joint)
     series = (
         Series("from the measured motion", speed, torque, GREY, "dots"),
         Series("95 % interval", at, high, BLUE, "area", low),
@@ -61,25 +61,24 @@ def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) ->
     return Picture(chart, f"{name}: friction versus speed, without the constant offset.{more}")
 
 
-def _torque(model: ArmModel, speed: Array) -> Array:
+def friction_curve(model: ArmModel, speed: Array) -> Array:
     return model.friction_torque(np.repeat(speed[:, None], len(model.joints), axis=1))
 
 
-def _interval(data: RunData, speed: Array, joint: int) -> tuple[Array, Array]:
+def friction_interval(model: ArmModel, kept: Covariance, speed: Array, joint: int) -> tuple[Array, Array]:
     """The curve's 2.5 and 97.5 percentiles under the parameters' covariance."""
-    kept = data.result.covariance
     names = [name for name in kept.names if name.endswith(f"_{joint + 1}")]
     index = [kept.names.index(name) for name in names]
     covariance = kept.array()[np.ix_(index, index)]
     seen = np.isfinite(np.diag(covariance))
     covariance = np.where(seen[:, None] & seen, covariance, 0.0)
-    value = np.array([data.model.values[name] for name in names])
+    value = np.array([model.values[name] for name in names])
     size, turn = np.linalg.eigh(covariance)
     random = np.random.default_rng(0)
     draws = value + random.normal(size=(_DRAWS, len(value))) @ (turn * np.sqrt(np.maximum(size, 0.0))).T
     floor = np.array([1e-6 if name.startswith(("coulomb_width", "stribeck_velocity")) else -np.inf for name in names])
     curves = [
-        _torque(_with(data.model, dict(zip(names, np.maximum(draw, floor).tolist(), strict=True))), speed)[:, joint]
+        friction_curve(_with(model, dict(zip(names, np.maximum(draw, floor).tolist(), strict=True))), speed)[:, joint]
         for draw in draws
     ]
     low, high = np.percentile(curves, [2.5, 97.5], axis=0)

@@ -1,4 +1,4 @@
-"""How much of each limit the run used."""
+"""Section on how much of each limit the run used."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from hil.report.words import number, percent
 
 
 def limits(data: RunData) -> Section:
-    """Always present."""
+    """The section, always present."""
     rows: list[tuple[str, ...]] = []
     for index, joint in enumerate(data.config.joints):
         position, velocity = data.samples["position"][:, index], data.samples["velocity"][:, index]
@@ -38,7 +38,7 @@ def limits(data: RunData) -> Section:
 
 
 def _supply(samples: NDArray[np.void], index: int, name: str) -> list[tuple[str, ...]]:
-    """Temperature and supply, where they were read during the run; their limits are the servo's own."""
+    """Temperature and supply voltage, if read during the run; their limits are stored in the servo."""
     temperature, voltage = samples["temperature"][:, index], samples["supply_voltage"][:, index]
     rows: list[tuple[str, ...]] = []
     if np.isfinite(temperature).any():

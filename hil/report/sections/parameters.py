@@ -1,4 +1,4 @@
-"""Parameters with their intervals, what each is, and on a fake arm the truth."""
+"""Section with the parameters: value, interval, meaning and, for a fake arm, the true value."""
 
 import math
 from collections.abc import Mapping
@@ -8,13 +8,18 @@ from hil.report.run_data import RunData
 from hil.report.section import Section, Table
 from hil.report.words import number, percent
 from hil.results.parts import Quantity
+from hil.results.result import Result
 
 TWO_SIDED_95 = 1.96
 
 
 def parameters(data: RunData) -> Section:
     """Always present."""
-    result = data.result
+    return parameters_of(data.result)
+
+
+def parameters_of(result: Result) -> Section:
+    """Of any result."""
     groups = {} if result.chain is None else result.chain.groups
     tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]
     if result.extra:
@@ -29,7 +34,7 @@ def parameters(data: RunData) -> Section:
 def _table(
     entries: Mapping[str, Quantity], truth: Mapping[str, float], groups: Mapping[str, str], caption: str
 ) -> Table:
-    """groups: the composition of a spatial arm's base parameters, by name."""
+    """Build a table; groups: composition of a spatial arm's base parameters, by name."""
     head = ("parameter", "meaning", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
     return Table(head, tuple(_row(name, entry, truth, groups) for name, entry in entries.items()), 3, caption, 1)
 
@@ -46,7 +51,7 @@ def _row(name: str, entry: Quantity, truth: Mapping[str, float], groups: Mapping
 
 
 def _interval(value: float, std: float) -> tuple[str, str]:
-    """Value and half-width with as many decimals as the width has two digits that count."""
+    """Value and half-width of the interval, rounded to two significant digits of the half-width."""
     width = TWO_SIDED_95 * std
     if width <= 0:
         return number(value), "exact"

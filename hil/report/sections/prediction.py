@@ -1,4 +1,4 @@
-"""Measured and predicted position, and the residual in encoder steps."""
+"""Section on measured and predicted position, and the residual in encoder steps."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from hil.runs.period_file import PlayedPeriod
 
 
 def prediction(data: RunData) -> Section | None:
-    """Present if the run has its settled periods."""
+    """The section; None if the run has no settled periods."""
     if data.fitted is None:
         return None
     pictures = []

@@ -1,4 +1,4 @@
-"""What was run, on what, when, and what happened."""
+"""Section on the experiment: configuration, hardware, time, versions and events."""
 
 from hil.report.run_data import RunData
 from hil.report.section import Folded, Section, Table
@@ -6,7 +6,7 @@ from hil.runs.run_folder import Excitation
 
 
 def provenance(data: RunData) -> Section:
-    """Always present."""
+    """The section, always present."""
     record, config = data.record, data.config
     servos = "; ".join(f"{joint.name}: {joint.model}, ID {joint.id}" for joint in config.joints)
     rows = [

@@ -1,4 +1,4 @@
-"""Excitation and response, line by line, against what was not excited and the noise."""
+"""Section on the spectra of excitation and response, compared with the noise level."""
 
 import numpy as np
 
@@ -17,11 +17,11 @@ _KINDS = {
     "even": "even, not driven (offsets, direction)",
     "other": "not driven",
 }
-_BEYOND = 3.0  # times the highest excited line are shown
+_BEYOND = 3.0  # highest frequency shown, relative to the highest excited line
 
 
 def spectra(data: RunData) -> Section | None:
-    """Present if the run has its settled period."""
+    """The section; None if the run has no settled period."""
     if data.fitted is None:
         return None
     excited = _excited(data)
@@ -36,7 +36,7 @@ def spectra(data: RunData) -> Section | None:
 
 
 def _levels(data: RunData) -> tuple[Table, ...]:
-    """Motion on one line of each kind, and what the model leaves of it; older results do not have it."""
+    """Table of the motion per line of each kind and its residual; empty for older results, which lack these values."""
     levels = data.result.validation.line_levels_ticks
     if levels is None:
         return ()
@@ -51,7 +51,7 @@ def _levels(data: RunData) -> tuple[Table, ...]:
 
 
 def _excited(data: RunData) -> list[list[int]]:
-    """Excited harmonics per joint."""
+    """Excited harmonics of each joint."""
     entry = next(entry for entry in data.record.excitation if entry.role == IDENTIFY)
     return [list(lines) for lines in entry.lines]
 
@@ -64,7 +64,7 @@ def _excitation(data: RunData, period: PlayedPeriod, excited: list[list[int]]) -
     ]
     chart = Chart("excitation", "Excitation", "frequency [Hz]", "torque amplitude [N m]", tuple(series))
     peaks = ", ".join(f"{name} {np.abs(period.torque[joint]).max():.3g} N m" for joint, name in enumerate(data.names))
-    return Picture(chart, f"Spectral lines of the commanded torque. Peaks in time:  {peaks}.")
+    return Picture(chart, f"Spectral lines of the commanded torque. Peaks in the time domain: {peaks}.")
 
 
 def _response(period: PlayedPeriod, joint: int, name: str, excited: list[list[int]]) -> Picture:

@@ -1,4 +1,4 @@
-"""The stabiliser's share of the commanded torque."""
+"""Section on the stabiliser's share of the commanded torque."""
 
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
@@ -6,7 +6,7 @@ from hil.report.words import number
 
 
 def stabiliser(data: RunData) -> Section | None:
-    """Present if a stabiliser held the arm."""
+    """The section; None if no stabiliser held the arm."""
     share = data.result.stabiliser
     if share is None:
         return None

@@ -1,4 +1,4 @@
-"""Predicted and measured peaks of each step, from pilot to full size."""
+"""Section on the predicted and measured peaks of each step, from the pilot to the full run."""
 
 from hil.config.schema import Config
 from hil.dry_run.prediction import quantities_of
@@ -9,7 +9,7 @@ from hil.results.parts import PlayedStep
 
 
 def steps(data: RunData) -> Section | None:
-    """Present if the run was played in steps."""
+    """The section; None if the run was not played in steps."""
     played = data.result.steps
     if not played:
         return None

@@ -1,4 +1,4 @@
-"""Timing of the stream."""
+"""Section on the timing of the stream."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ _BINS = 60
 
 
 def timing(data: RunData) -> Section:
-    """Always present."""
+    """The section, always present."""
     samples = data.samples
     sent = samples[samples["time_after_read"] > samples["time_before_write"]]
     lateness = 1e6 * (sent["time_before_write"] - sent["deadline"])
@@ -46,7 +46,7 @@ def _quantiles(values: Quantiles) -> str:
 
 
 def _histogram(name: str, title: str, values: NDArray[np.float64], colour: str) -> Picture:
-    # All but the last permille: one stall of the machine would squeeze the rest into one bar.
+    # Without the largest 0.1 %: a single stall would compress all other values into one bar.
     most = float(np.quantile(values, 0.999))
     low = float(values.min())
     high = most if most > low else low + 1.0

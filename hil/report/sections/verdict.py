@@ -1,11 +1,11 @@
-"""The verdict in words: can this model be trusted, why, and what to do if not. The judgement is the result's own."""
+"""Section with the verdict stored in the result: can the model be trusted, why, and what to do if not."""
 
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
 
-_TITLES = {
+TITLES = {
     "yes": ("good", "This model can be trusted"),
     "with care": ("fair", "This model can be used with care"),
     "no": ("poor", "Do not trust this model yet"),
@@ -13,9 +13,9 @@ _TITLES = {
 
 
 def verdict(data: RunData) -> Section:
-    """Always present."""
+    """Return the section, which every report has."""
     judged = data.result.verdict
-    tone, title = _TITLES[judged.trust]
+    tone, title = TITLES[judged.trust]
     warnings = [f"Warning: {warning}" for warning in data.result.warnings]
     words = [
         *(_residual(data), _truth(data), _limits(data)),

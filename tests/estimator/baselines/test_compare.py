@@ -1,4 +1,4 @@
-"""The peers find what they can: a comparison with straw men would prove nothing."""
+"""The other methods reach their known accuracy: a comparison with poor implementations would prove nothing."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_a_filter_that_diverges_says_so(ideal_period: SettledPeriod) -> None:
 
 
 def test_linear_lines_are_right_for_small_swings_of_an_arm_without_dry_friction() -> None:
-    """A linear arm's exact response: the corrected method must be exact on what it was made for."""
+    """For a linear arm's exact response, for which it was designed, the corrected method must be exact."""
     rate, samples = 200.0, 2000
     theta = {"inertia_1": 0.02, "coupling": 0.003, "inertia_2": 0.004, "armature_2": 0.01, "gravity_1": 0.6}
     theta |= {"gravity_2": 0.2, "viscous_1": 0.05, "viscous_2": 0.04}
@@ -86,7 +86,7 @@ def test_linear_lines_are_right_for_small_swings_of_an_arm_without_dry_friction(
         assert found.parameters[name] == pytest.approx(true, rel=1e-3)
     with pytest.raises(ModelError, match="length of link 1"):
         fit_linearised(period, None, 9.81)
-    with pytest.raises(ModelError, match="without gravity"):
+    with pytest.raises(ModelError, match="requires gravity"):
         fit_linearised(period, length, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""The seed paper's method: what its print says, what is right, and how much lies between."""
+"""The seed paper's method: the printed version, the corrected one, and the difference between them."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_with_the_papers_noise_the_print_is_biased_and_the_likelihood_is_not() -
     rmse = np.sqrt(np.mean((np.array(likely) - (5.0, 1.5)) ** 2, axis=0))
     assert rmse[0] <= 0.05 and rmse[1] <= 0.004
     assert np.mean(std, axis=0) == pytest.approx(rmse, rel=0.35)
-    assert np.mean([m2 for _, m2 in literal]) < 0.5, "errors in variables drive m2 towards zero"
+    assert np.mean([m2 for _, m2 in literal]) < 0.5, "errors in variables bias m2 towards zero"
 
 
 def test_the_corrected_arm_is_second_order_and_its_friction_is_found() -> None:
@@ -62,7 +62,7 @@ def test_a_period_too_short_for_the_lines_is_refused() -> None:
 
 
 def test_undamped_poles_are_imaginary_so_that_nothing_settles() -> None:
-    """The paper's "exponentially": the poles of its own arm have no real part (docs/paper.md)."""
+    """The paper claims exponential convergence, but the poles of its own arm have no real part (docs/paper.md)."""
     arm = PaperArm()
     squared = np.linalg.eigvals(-np.linalg.inv(arm.mass_matrix()) @ arm.stiffness())
     assert np.all(squared.real < 0.0) and np.abs(squared.imag).max() < 1e-12

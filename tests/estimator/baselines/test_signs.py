@@ -1,22 +1,23 @@
-"""Reversed columns are found and named on a real arm's recording; a recording as it should be raises no suspicion."""
+"""Reversed columns are found and named; a recording with correct signs raises no suspicion."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hil.config.csv_columns import load_csv_config
-from hil.estimation.unsettled.csv_recording import read_csv
+from hil.config.csv_columns import load_recording_config
 from hil.estimator.baselines.signs import Signs, suspect_signs
 from hil.estimator.data.recording import Recording
+from hil.recordings.convert import convert
+from hil.recordings.csv_file import read_csv_table
 from tests.support.paths import CONFIGS, DATA
 
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
     """Both joints driven, four and ten rad/s."""
-    columns = load_csv_config(CONFIGS / "recordings" / "dfki_double_pendulum.toml").columns
-    return read_csv(DATA / "dfki_double_pendulum" / "c1_sinusoids_143601.csv", columns)
+    columns = load_recording_config(CONFIGS / "recordings" / "dfki_double_pendulum.toml").columns
+    return convert(read_csv_table(DATA / "dfki_double_pendulum" / "c1_sinusoids_143601.csv"), columns).recordings[0]
 
 
 def turned(recording: Recording, torque: tuple[int, int], position: tuple[int, int]) -> Recording:
@@ -29,7 +30,9 @@ def turned(recording: Recording, torque: tuple[int, int], position: tuple[int, i
 
 def test_right_signs_raise_no_suspicion(recording: Recording) -> None:
     assert suspect_signs([recording]) is None
-    assert suspect_signs([turned(recording, (-1, -1), (-1, -1))]) is None, "the mirrored arm is an arm"
+    assert suspect_signs([turned(recording, (-1, -1), (-1, -1))]) is None, (
+        "a mirrored arm is equivalent, so there is no evidence"
+    )
 
 
 @pytest.mark.parametrize(

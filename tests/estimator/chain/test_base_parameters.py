@@ -14,7 +14,7 @@ def bundled(name: str) -> Chain:
 
 
 def planar() -> Chain:
-    """Two links in a vertical plane."""
+    """Return two links in a vertical plane."""
     along = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
     return Chain(np.stack([np.eye(3)] * 2), along, np.array([[0.0, 1.0, 0.0]] * 2), np.array([0.0, 0.0, -9.81]))
 
@@ -46,7 +46,7 @@ def test_there_are_as_many_as_the_literature_counts(name: str, count: int) -> No
 
 
 def test_two_links_in_a_plane_have_those_of_the_planar_model() -> None:
-    """Inertia of the first, that of the second, its armature, coupling with gravity in two moments each."""
+    """Base parameters: both inertias, the second armature, and two moments each for coupling and gravity."""
     base = BaseParameters.of(planar())
     assert base.names == (
         *("moment_x_1", "moment_z_1", "inertia_yy_1"),

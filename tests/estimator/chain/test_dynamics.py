@@ -1,4 +1,4 @@
-"""The chain's compiled dynamics against MuJoCo, pinocchio (where it is installed), each other and differences."""
+"""The chain's compiled dynamics compared with MuJoCo, pinocchio (if installed), each other and finite differences."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def motion(joints: int, seed: int) -> np.ndarray:
 
 
 def described(path: Path, joints: int) -> tuple[Chain, np.ndarray]:
-    """Chain and all parameters of a random arm, armature zero."""
+    """Return the chain and all parameters of a random arm with zero armature."""
     path.write_text(random_urdf(joints, joints), encoding="utf-8")
     arm = read_urdf(path)
     parameters = np.column_stack((arm.parameters, np.zeros(joints))).reshape(-1)

@@ -1,4 +1,4 @@
-"""Both stages on the four-joint arm with sticking Stribeck friction, masses of the description 20 % off."""
+"""Both stages on the four-joint arm with stiction and Stribeck friction; described masses are off by 20 %."""
 
 from dataclasses import replace
 
@@ -75,7 +75,7 @@ def test_missing_samples_cost_little(setup: bench.Setup, period: SettledPeriod, 
 
 
 def test_what_the_data_do_not_show_is_said(setup: bench.Setup, period: SettledPeriod) -> None:
-    """Ten times coarser encoders leave some base parameters to the description."""
+    """With ten times coarser encoders, some base parameters come from the description."""
     step = 40 * period.position_step
     coarse = replace(period, position=np.round(period.position / step[:, None]) * step[:, None], position_step=step)
     found = identify_chain(coarse, ChainModel(setup.base, friction="coulomb"), setup.prior)

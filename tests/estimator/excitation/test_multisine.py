@@ -1,4 +1,4 @@
-"""Multisines: lines where asked, peaks as asked, low crest factors, the same bits for the same seed."""
+"""Multisines: the requested lines and peaks, low crest factors, and identical bits for the same seed."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ def test_the_sum_of_cosines_is_what_is_written() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_crest_factor_is_low(seed: int) -> None:
-    """Schroeder's phases give 1.7 and more for 25 lines, random ones 2.5 to 3.5."""
+    """Crest factors for 25 lines are at least 1.7 with Schroeder's phases and 2.5 to 3.5 with random ones."""
     wave = design_multisine(400.0, 10.0, zippered_lines(10.0, (0.1, 5.0), 2), (0.8, 0.42), seed)
     assert wave.crest_factor.max() < 1.43
 
@@ -110,7 +110,7 @@ def test_what_cannot_be_built_is_said(lines: tuple[tuple[int, ...], ...], peak: 
 
 
 def test_an_empty_band_and_a_broken_period_are_refused() -> None:
-    with pytest.raises(ExcitationError, match="holds 1 harmonics"):
+    with pytest.raises(ExcitationError, match="contains 1 harmonics"):
         zippered_lines(1.0, (0.9, 1.1), 2)
     with pytest.raises(ExcitationError, match="whole number"):
         design_multisine(100.0, 1.005, ((1,),), (1.0,), 0)

@@ -1,4 +1,4 @@
-"""How the likelihood's fit steps: widths of friction, limits, tries side by side."""
+"""Steps of the likelihood's fit: widths of friction, limits, parallel candidates."""
 
 import numpy as np
 import pytest

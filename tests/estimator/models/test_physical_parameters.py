@@ -1,4 +1,4 @@
-"""What somebody knows of the arm: quantities from base parameters, torque constants from a known mass."""
+"""Physical quantities from base parameters and other knowledge; torque constants from a known mass."""
 
 import math
 from dataclasses import replace
@@ -78,7 +78,7 @@ def test_contradictions_and_nonsense_are_named(ideal_arm: Arm) -> None:
 
 
 def heavier(arm: Arm, mass: float, distance: float) -> Arm:
-    """The same arm with a point mass on its last link."""
+    """Return the same arm with a point mass on its last link."""
     described: dict[str, Any] = arm.model_dump()
     link = dict(described["links"][-1])
     total = link["mass"] + mass

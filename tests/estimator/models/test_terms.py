@@ -1,4 +1,4 @@
-"""The registry of terms: what fits, results, reports, exports and the configuration take from it."""
+"""The registry of terms, as used by fits, results, reports, exports and the configuration."""
 
 from typing import get_args
 
@@ -41,7 +41,7 @@ models = st.builds(
 def test_every_part_of_a_model_is_declared() -> None:
     assert set(get_args(Option)) == set(OPTIONS)
     assert set(get_args(Drive)) == set(DRIVES)
-    parts = {"base", *FRICTIONS, *OPTIONS, *(term for terms in DRIVES.values() for term in terms)}
+    parts = {"base", "voltage", *FRICTIONS, *OPTIONS, *(term for terms in DRIVES.values() for term in terms)}
     assert {term.part for term in TERMS.values()} == parts
 
 

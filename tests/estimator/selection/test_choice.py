@@ -1,4 +1,4 @@
-"""Friction chosen by what it predicts, robustness, intervals and verdict, on arms that the estimator did not write."""
+"""Friction model selection by prediction, robustness, intervals and verdict, on independently simulated arms."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.recorded_arm import servo_arm
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.fit.covariance import correlation_time, structured_share
@@ -19,6 +18,8 @@ from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
 from hil.fakes.plants.arm import Arm, base_parameters
 from tests.estimator.conftest import STICKING
+from tests.support.elsewhere import Elsewhere
+from tests.support.recorded_arm import servo_arm
 
 Recorder = Callable[[Arm, Multisine], SettledPeriod]
 Wave = Callable[..., Multisine]
@@ -35,7 +36,7 @@ def test_the_plain_model_is_kept_where_nothing_more_is_true(
     choice = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay")
     assert choice.estimate.model == Model(2, "coulomb", "delay")
     assert choice.gained == 1.0 and choice.cost == pytest.approx(1.0)
-    # A start that leads nowhere is counted, so it was taken, and costs the result nothing.
+    # An initial guess that fails is counted, which shows that it was used, and does not affect the result.
     astray = {name: 0.1 * value for name, value in base_parameters(ideal_arm).items()}
     again = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay", starts=[astray])
     first, second = again.trials[0].estimate, choice.trials[0].estimate
@@ -46,7 +47,12 @@ def test_the_plain_model_is_kept_where_nothing_more_is_true(
 def test_friction_is_chosen_by_what_it_predicts(
     sticking_arm: Arm, sticking_period: SettledPeriod, recorded: Recorder, wave: Wave
 ) -> None:
-    choice = choose([sticking_period], recorded(sticking_arm, wave(2, (0.8, 0.42))), "lag")
+    other, elsewhere = recorded(sticking_arm, wave(2, (0.8, 0.42))), Elsewhere()
+    choice = choose([sticking_period], other, "lag")
+    again = choose([sticking_period], other, "lag", executor=elsewhere)
+    assert elsewhere.submitted >= 3
+    assert [each.model for each in again.trials] == [each.model for each in choice.trials]
+    assert (again.estimate.value == choice.estimate.value).all()
     assert choice.estimate.model == Model(2, "stribeck", "lag")
     assert worst(choice.estimate.parameters, sticking_arm) < 0.005
     assert choice.estimate.residual_steps.max() <= 0.30
@@ -79,7 +85,7 @@ def test_a_wild_reading_costs_nothing(ideal_arm: Arm, ideal_period: SettledPerio
     position[0, wild] += 1.0
     spiked = replace(ideal_period, position=position)
     left_out = np.flatnonzero(~without_spikes(spiked).valid[0])
-    # Two steps away from a wild reading the median itself is off by a sample's motion.
+    # Two samples from an outlier, the median itself is off by the motion of one sample.
     assert set(wild) <= set(left_out) and left_out.size <= 3 * wild.size
     estimate = identify(spiked, Model(2))
     assert worst(estimate.parameters, ideal_arm) < 0.002
@@ -105,12 +111,12 @@ def test_the_zeros_of_the_encoders_are_found(ideal_period: SettledPeriod) -> Non
 def test_the_ratio_of_two_torque_constants_is_found(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
     believed = replace(ideal_period, torque=ideal_period.torque / np.array([[1.0], [1.1]]))
     without, found = identify(believed, Model(2), coarse=True), identify(believed, Model(2, options={"torque_scale"}))
-    assert without.residual_steps.max() > 1.0, "no arm is like this one with equal torque constants"
+    assert without.residual_steps.max() > 1.0, "no arm with equal torque constants moves like this one"
     assert found.parameters["torque_scale_2"] == pytest.approx(1.1, rel=1e-3)
     assert worst(found.parameters, ideal_arm) < 0.002
     elsewhere = {name: 1.5 * value for name, value in found.parameters.items()}
     again = identify(believed, Model(2, options={"torque_scale"}), starts=[elsewhere])
-    assert again.parameters == pytest.approx(found.parameters, rel=0.01), "only a place to start"
+    assert again.parameters == pytest.approx(found.parameters, rel=0.01), "the initial guess must not affect the result"
 
 
 def test_intervals_cover_the_truth_where_the_model_lacks_something(

@@ -1,4 +1,4 @@
-"""Odd and even distortion where nothing was driven, and what a model leaves of it."""
+"""Odd and even distortion on unexcited lines, and the part of it that a model does not explain."""
 
 from collections.abc import Callable
 
@@ -35,8 +35,10 @@ def test_friction_is_odd_and_an_offset_even(ideal_arm: Arm, recorded: Recorder, 
     found = levels(recorded(changed(ideal_arm, offset=0.0), odd_wave))
     assert found.odd is not None and found.even is not None
     assert np.all(found.odd.motion > 100.0 * found.noise)
-    assert np.all(found.even.motion < 2.0 * found.noise), "a hanging arm whose friction is the same both ways is odd"
-    assert np.all(found.odd.left < 2.0 * found.noise), "and the model has it"
+    assert np.all(found.even.motion < 2.0 * found.noise), (
+        "a hanging arm with symmetric friction only has odd distortion"
+    )
+    assert np.all(found.odd.left < 2.0 * found.noise), "and the model explains it"
     aside = levels(recorded(changed(ideal_arm, offset=0.03), odd_wave))
     assert aside.even is not None
     assert np.all(aside.even.motion > 20.0 * aside.noise)

@@ -1,4 +1,4 @@
-"""What a model leaves out: seen by the score test, said in the verdict, counted in error bars; drifting friction."""
+"""Terms that a model omits: found by the score test, named in the verdict, included in error bars; friction drift."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +28,7 @@ def changed(arm: Arm, **changes: float) -> Arm:
 
 
 def wrong_encoders(period: SettledPeriod, once: float, twice: float) -> SettledPeriod:
-    """As encoders would read it that err by so many steps once and twice a turn."""
+    """Return the period as read by encoders with the given periodic errors [encoder steps]."""
     step = period.position_step[:, None]
     error = once * np.sin(period.position + 0.7) + twice * np.sin(2.0 * period.position - 0.4)
     return replace(period, position=np.round(period.position / step + error) * step)
@@ -65,7 +65,7 @@ def test_of_nothing_nothing_is_seen(ideal_period: SettledPeriod) -> None:
 def test_error_bars_hold_what_is_left_out_and_cannot_be_ruled_out(
     ideal_arm: Arm, recorded: Recorder, wave: Wave
 ) -> None:
-    """Half a percent less torque at the peak leaves a clean residual and gravity many standard errors off."""
+    """With half a percent less torque at the peak, the residual is clean but gravity is off by many standard errors."""
     period = recorded(changed(ideal_arm, saturation=0.005, saturation_current=0.44), wave(1, PEAKS))
     estimate = identify(period, PLAIN)
     truth = np.array(list(base_parameters(ideal_arm).values()))

@@ -1,10 +1,10 @@
-"""The closed loop's simulation against the open one's, and excitation by design against plain."""
+"""The closed-loop simulation compared with the open-loop one, and designed compared with plain excitation."""
 
 import numpy as np
 import pytest
 
 from hil.estimator.excitation.multisine import design_multisine, zippered_lines
-from hil.estimator.excitation.optimal_design import Limits, Problem, design_optimal
+from hil.estimator.excitation.optimal_design import DesignProblem, Limits, design_optimal
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.closed_loop import Feedback, respond, resting
@@ -69,7 +69,7 @@ def test_a_stabiliser_holds_an_arm_on_its_head() -> None:
 def test_designed_excitation_beats_plain_within_the_same_limits() -> None:
     limits = Limits(np.array([-4.2, -3.1]), np.array([1.06, 3.1]), np.array([15.0, 20.0]), np.array([2.1, 1.4]))
     step = np.full(2, 2 * np.pi / 4096)
-    problem = Problem(Physics.of({**ARM, **SHAPE}), tuple(ARM), limits, POSE, step, Feedback.none(2))
+    problem = DesignProblem(Physics.of({**ARM, **SHAPE}), tuple(ARM), limits, POSE, step, Feedback.none(2))
     plain = wave(1.0)
     design = design_optimal(plain, problem, 1)
     again = design_optimal(plain, problem, 1)

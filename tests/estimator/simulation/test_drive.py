@@ -1,4 +1,4 @@
-"""The motors' torque against a lag that is followed from command to command."""
+"""The motors' torque compared with a lag that is integrated from command to command."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,10 @@ FINE = 40  # instants in a step
 
 
 def followed(command: np.ndarray, command_to_sample: float, delay: float, lag: float) -> np.ndarray:
-    """Means over the steps after each sample of the last of ten periods, the lag advanced exactly from instant to
-    instant; delay and `command_to_sample` are whole instants."""
+    """Return the mean torque over the steps after each sample of the last of ten periods.
+
+    The lag is advanced exactly from instant to instant; delay and `command_to_sample` are whole numbers of instants.
+    """
     joints, samples = command.shape
     instant = 1.0 / (RATE * STEPS * FINE)
     held = np.tile(np.repeat(command, STEPS * FINE, axis=1), 10)

@@ -1,4 +1,4 @@
-"""Forward sensitivities against differences of the simulation itself, every parameter at once."""
+"""Forward sensitivities compared with finite differences of the simulation, for all parameters at once."""
 
 import numpy as np
 import pytest
@@ -43,9 +43,10 @@ def test_derivatives_are_those_of_the_simulation(bristles: dict[str, float]) -> 
     values = {**ARM, **START, **bristles}
     start = np.array(list(START.values())).reshape(2, 2)
     motor, slopes = torque_and_slopes(torque(), RATE, 3e-4, STEPS, delay=ARM["delay"], lag=Physics.of(ARM).lags)
-    # With bristles no step over the velocity has a width, without them they have no stiffness.
+    # With bristles there is no width of the Coulomb step; without them there is no stiffness.
     absent = "coulomb_width" if bristles else "presliding"
-    causes = tuple(cause for cause in CAUSES if not cause.startswith(absent))
+    # Back-EMF is differentiated in test_back_emf.py.
+    causes = tuple(cause for cause in CAUSES if not cause.startswith((absent, "back_emf")))
     motion = sensitive(Physics.of(values))(Physics.of(values), start, causes, 1.0 / (RATE * STEPS))
     assert isinstance(motion, PreslidingSensitive) == bool(bristles)
     parts = [motion.advance(motor[:, part], slopes[:, :, part]) for part in (slice(0, 250), slice(250, SAMPLES))]
@@ -71,6 +72,8 @@ def test_what_the_encoders_get_wrong_is_differentiated_too(joints: int) -> None:
     q = true[0]
     wrong = 0.01 * np.sin(q) - 0.02 * np.cos(q) + 0.015 * np.sin(2 * q) + 0.005 * np.cos(2 * q)
     assert np.allclose(read[0], q + wrong, atol=1e-12)
+    ((_, without_derivatives, _),) = run.pieces(Physics.of(values), start, ())
+    assert np.allclose(without_derivatives, read, atol=1e-12)
     assert derivative.shape == (joints, SAMPLES, len(names) + 2 * joints)
     for index, name in enumerate(names):
         change = 1e-6 * max(abs(values[name]), 1e-3)

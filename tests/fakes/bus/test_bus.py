@@ -1,4 +1,4 @@
-"""The wire: when bytes are where, who answers whom, groups, broadcasts, noise and collisions. Two servos at 1 Mbaud."""
+"""The wire: timing of bytes, who replies, groups, broadcasts, noise and collisions. Two servos at 1 MBd."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +20,7 @@ from hil.drivers.packet import (
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import BOOT_S, Servo
+from hil.fakes.servo.servo import BOOT_S, EmulatedServo
 
 Make = Callable[..., Any]
 
@@ -162,13 +162,13 @@ def test_goal_and_state_in_one_write(bench: Any) -> None:
     start = bench.clock.now()
     bench.bus.write(goals + sync_read(126, 10, 1, 2))
     raw = bench.bus.read(42, 1.0)
-    assert bench.clock.now() - start == pytest.approx(78 * BYTE_S, abs=1e-12)  # as counted in the field
+    assert bench.clock.now() - start == pytest.approx(78 * BYTE_S, abs=1e-12)  # as observed on a real bus
     first, second = Framer().feed(raw)
     assert [int.from_bytes(p.data[:2], "little", signed=True) for p in (first, second)] == [100, -100]
 
 
 def test_fast_sync_read_is_the_manuals_packet() -> None:
-    """The example of page protocol2: three XC330-T288 in the order 3, 7, 4 at positions 166, 2079 and 1023."""
+    """The example on page protocol2: three XC330-T288 in the order 3, 7, 4 at positions 166, 2079 and 1023."""
 
     class Still:
         joints = 3
@@ -179,7 +179,7 @@ def test_fast_sync_read_is_the_manuals_packet() -> None:
         def advance(self, until: float, current: object) -> None: ...
 
     model = load_model("XC330-T288")
-    servos = [Servo(model, number, zero_ticks=ticks) for number, ticks in ((3, 166), (7, 2079), (4, 1023))]
+    servos = [EmulatedServo(model, number, zero_ticks=ticks) for number, ticks in ((3, 166), (7, 2079), (4, 1023))]
     bus = FakeBus(servos, Still(), VirtualClock())
     request = sync_read(132, 4, 3, 7, 4, fast=True)
     assert request == bytes.fromhex("FFFFFD00FE0A008A840004000307 0420F2")
@@ -393,4 +393,4 @@ def test_one_servo_per_joint() -> None:
         joints = 1
 
     with pytest.raises(ValueError, match="2 servos for a plant of 1 joints"):
-        FakeBus([Servo(load_model("XM430-W350"), i) for i in (1, 2)], OneJoint(), VirtualClock())  # type: ignore[arg-type]
+        FakeBus([EmulatedServo(load_model("XM430-W350"), i) for i in (1, 2)], OneJoint(), VirtualClock())  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Every fault: it happens at its time, to its servo, as often as its probability says, and the same seed repeats it."""
+"""Every fault happens at its time, to its servo, with its probability, and reproducibly for the same seed."""
 
 import termios
 from pathlib import Path
@@ -24,7 +24,7 @@ from hil.fakes.description import DescriptionError, load_fake
 from hil.fakes.plants.plant import PlantError
 from hil.fakes.protocol_fake import open_fake
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import BOOT_S, Servo
+from hil.fakes.servo.servo import BOOT_S, EmulatedServo
 from tests.support.paths import CONFIGS
 
 CONFIG = CONFIGS / "fake_two_link.toml"
@@ -33,7 +33,7 @@ PONG = encode_status(1, 0, b"\xfc\x03\x30")
 
 
 def raw_replies(bench: Any, count: int = 1, servo_id: int = 1) -> list[bytes]:
-    """What comes back for each of so many pings."""
+    """Return the replies to each of several pings."""
     replies = []
     for _ in range(count):
         bench.bus.write(encode(servo_id, Instruction.PING))
@@ -120,7 +120,7 @@ def test_lost_and_corrupted_instructions(bench: Any) -> None:
 
 def test_probability_and_seed() -> None:
     def struck(seed: int) -> list[bool]:
-        bus = FakeBus([Servo(load_model("XM430-W350"), 1)], _Still(), VirtualClock(), seed=seed)
+        bus = FakeBus([EmulatedServo(load_model("XM430-W350"), 1)], _Still(), VirtualClock(), seed=seed)
         bus.faults.add(Fault(kind="lost_reply", probability=0.3))
         lost = []
         for _ in range(300):
@@ -167,7 +167,7 @@ def test_reboot_takes_torque_and_deafens_for_a_while(bench: Any) -> None:
     assert raw_replies(bench) == [b""]
     bench.clock.wait_until(1.0 + BOOT_S)
     assert raw_replies(bench) == [PONG]
-    assert bench.plant.velocity[0] == pytest.approx(50 * 0.269 * 1.0, rel=0.06)  # it coasts since
+    assert bench.plant.velocity[0] == pytest.approx(50 * 0.269 * 1.0, rel=0.06)  # it has been coasting since
 
 
 @pytest.mark.parametrize(
@@ -268,7 +268,7 @@ def test_a_pulled_cable_fails_as_a_real_one_and_comes_back() -> None:
     with pytest.raises(termios.error):
         port.reset_input_buffer()
     port.close()
-    with pytest.raises(serial.SerialException, match="cable is pulled"):
+    with pytest.raises(serial.SerialException, match="cable is unplugged"):
         port.open()
     assert port.bus._servos[0].torque_enabled
     port.clock.wait_until(1.6)
@@ -277,7 +277,7 @@ def test_a_pulled_cable_fails_as_a_real_one_and_comes_back() -> None:
     port.open()
     port.write(PING)
     assert port.read(14) == PONG
-    assert port.bus.servos[1].watchdog_tripped  # nobody spoke for 0.1 s
+    assert port.bus.servos[1].watchdog_tripped  # no packet for 0.1 s
 
 
 def test_what_was_open_when_the_cable_was_pulled_stays_lost() -> None:
@@ -304,8 +304,8 @@ def test_from_the_command_line() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("gone", "kinds: lost_reply, corrupted_reply"),
-        ("overload:when=3", '"when=3" is not KEY=VALUE with a key of at, duration'),
+        ("gone", "Its kinds: lost_reply, corrupted_reply"),
+        ("overload:when=3", '"when=3" is not KEY=VALUE with one of the keys at, duration'),
         ("overload:at=soon", "at = 'soon': must be a number"),
         ("overload:probability=2", "probability = 2.0"),
         ("overload:servo=1.5", "servo = '1.5': must be a number"),
@@ -363,7 +363,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     assert played() == played()
 
 
-# What servos answer, and who else speaks
+# Servo answers, and another master
 
 
 @pytest.mark.parametrize("error", [1, 2, 7, 0x84])

@@ -1,4 +1,4 @@
-"""The hand: it moves limp joints, holds them, and lets go when their torque comes on."""
+"""The hand moves joints whose torque is off, holds them, and releases them when their torque comes on."""
 
 import math
 from collections.abc import Callable

@@ -8,18 +8,18 @@ from hil.drivers.packet import Instruction, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, FakeArm, make_bus
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from tests.fakes.conftest import XM430, Bench, FreeInertia
 
 PAIR = ({"joint": 1}, {"joint": 1, "direction": -1}, {})
 
 
 def pair(**second: Any) -> Bench:
-    """Servos 1 and 2 on one joint, the second one turned about, and 3 on the next."""
+    """Return servos 1 and 2 on one joint, the second one reversed, and servo 3 on the next joint."""
     bench = Bench.__new__(Bench)
     bench.clock = VirtualClock()
     bench.plant = FreeInertia(2)
-    servos = [Servo(XM430, 1), Servo(XM430, 2, direction=-1, **second), Servo(XM430, 3)]
+    servos = [EmulatedServo(XM430, 1), EmulatedServo(XM430, 2, direction=-1, **second), EmulatedServo(XM430, 3)]
     bench.bus = FakeBus(servos, bench.plant, bench.clock, joints=(0, 0, 1))
     return bench
 
@@ -64,7 +64,7 @@ def test_group_reads_are_those_of_single_reads() -> None:
 
 
 def test_a_shadow_left_in_position_mode_fights_its_leader() -> None:
-    """What a ViperX does when a program sets Operating Mode through the Secondary ID alone."""
+    """This is what happens on a ViperX if a program sets Operating Mode only through the Secondary ID."""
     bench = pair(registers={"Secondary(Shadow) ID": 1})
     assert bench.write(1, 11, 0) == 0
     assert bench.write(1, 102, 0, 2) == 0

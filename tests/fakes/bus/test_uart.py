@@ -1,4 +1,4 @@
-"""Bytes heard at another baud than they were sent at."""
+"""Bytes received at a baud rate other than the sender's."""
 
 import itertools
 from typing import Any
@@ -49,7 +49,7 @@ def test_a_reply_on_its_way_is_garbage_to_a_host_that_changes_its_baud(bench: An
 
 
 def test_the_baud_asked_for_is_set_behind_the_status_at_the_old_one(bench: Any) -> None:
-    """As every setup does it: nothing of the reply is lost, since the host reads it before it changes its baud."""
+    """As in every set-up, the reply is not lost, since the host reads it before it changes its baud rate."""
     assert bench.write(1, 8, 2) == 0
     bench.bus.baud = 115_200
     assert bench.ask(1, Instruction.PING).error == 0

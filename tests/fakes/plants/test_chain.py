@@ -1,4 +1,4 @@
-"""The spatial arm behind the fake servos: against the estimator's equations, MuJoCo, energy and sticking friction."""
+"""The spatial plant compared with the estimator's equations and MuJoCo; energy conservation and stiction."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ def arm(drives: Sequence[Drive], **more: object) -> ChainArm:
 
 
 def test_its_equations_are_the_estimators() -> None:
-    """Kane's with centres of mass on one side, spatial vectors and base-frame composites on the other."""
+    """The plant's equations (Kane's, centres of mass) match the estimator's (spatial vectors in the base frame)."""
     scale = (1.0, 1.2, 0.8, 1.1, 0.9, 1.3)
     described = arm([drive()] * 6, mass_scale=scale, centre_shift=(0.01,) * 6, base=(0.3, -0.2, 0.1))
     plant = SpatialChain(described)
@@ -85,7 +85,7 @@ def test_friction_holds_the_arm_exactly() -> None:
 
 
 def test_half_the_step_gives_the_same_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sticking Stribeck friction and all: what the estimator is judged by must not be the plant's own step."""
+    """The motion with stiction and Stribeck friction does not depend on the plant's step."""
     drives = [drive(viscous=0.05, coulomb=0.05, stribeck_rise=0.4, stribeck_velocity=0.15, current_lag=1e-3)] * 6
 
     def moved() -> np.ndarray:

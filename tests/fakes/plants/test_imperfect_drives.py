@@ -1,4 +1,4 @@
-"""Drives that differ from the textbook: torque that saturates, cables that pull, friction that falls while it warms."""
+"""Drives that differ from the textbook: saturating torque, pulling cables, friction that falls during warm-up."""
 
 import math
 
@@ -12,7 +12,7 @@ from tests.fakes.plants.test_plants import DRIVE, KINDS, arm, played
 
 
 def pushed(current: float, **changes: float) -> float:
-    """Steady torque of a motor without friction at this current [A], at angle 0.3 rad."""
+    """Return the steady torque of a frictionless motor at this current [A] and at an angle of 0.3 rad."""
     motor = Motor(Drive.model_validate({**DRIVE, **changes}))
     return motor.push(1e-3, current, 0.3, 0.0)[0]
 
@@ -35,7 +35,7 @@ def test_a_cable_pulls_towards_its_slack_angle() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_friction_falls_while_the_grease_warms(kind: str) -> None:
-    """At a steady speed friction takes the whole torque; so speed grows as friction falls."""
+    """At a steady speed, friction equals the whole torque, so the speed increases as friction falls."""
     count = 1 if "pendulum" in kind else 2
     warming = {"viscous": 0.2, "coulomb": 0.02, "cold_viscous": 0.25, "cold_coulomb": 0.5, "warm_up_time": 2.0}
     described = arm(kind, gravity=0.0, **warming)

@@ -1,4 +1,4 @@
-"""A MuJoCo model behind the fake servos, held against the fake's own pendulum; and what is said without MuJoCo."""
+"""A MuJoCo model as the plant, compared with the fake's own pendulum; the error message without MuJoCo."""
 
 import importlib
 import math

@@ -1,4 +1,4 @@
-"""Ten thousand pieces of noise; benchmarks/fake_noise.py, which this runs, sends a million."""
+"""Run benchmarks/fake_noise.py with ten thousand pieces of noise; the benchmark itself sends a million."""
 
 import importlib
 

@@ -1,4 +1,4 @@
-"""Backlash, cogging, stops, tilt, jams; plants of somebody else's."""
+"""Backlash, cogging, stops, tilt, jams; third-party plants."""
 
 import math
 import sys
@@ -138,7 +138,7 @@ def test_tilt_is_less_gravity() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"stops": [1.0, 0.5]}, "the first must be the smaller"),
+        ({"stops": [1.0, 0.5]}, "the first must be less than the second"),
         ({"stops": [0.0, 0.5]}, "beyond its stops"),
         ({"backlash": 0.01, "rotor_inertia": 0.0}, "backlash needs a rotor_inertia"),
     ],
@@ -148,7 +148,7 @@ def test_impossible_drives(changes: dict[str, Any], said: str) -> None:
         arm("pendulum", **changes)
 
 
-# Somebody else's plant
+# Third-party plants
 
 
 class Good:
@@ -217,9 +217,9 @@ def test_another_plant() -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("no_such_module:Good", "No module named 'no_such_module'; write \"module:factory\""),
+        ("no_such_module:Good", "No module named 'no_such_module'; give \"module:factory\""),
         ("plants_of_others:Bad", "has no attribute 'Bad'"),
-        ("plants_of_others", 'write "module:factory"'),
+        ("plants_of_others", 'give "module:factory"'),
         ("plants_of_others:Lame", "its Lame lacks position, velocity, current, advance"),
         ("plants_of_others:fails", "RuntimeError: no such robot"),
     ],
@@ -253,7 +253,7 @@ def test_joints_of_plant_and_servos_must_agree() -> None:
 def test_arm_or_plant(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     path.write_text('[fake]\n[[fake.servos]]\nid = 1\nmodel = "XM430-W350"\nzero_ticks = 0\n', encoding="utf-8")
-    with pytest.raises(DescriptionError, match="give one of the table arm, the table chain and plant"):
+    with pytest.raises(DescriptionError, match="give exactly one of the table arm, the table chain and plant"):
         load_fake(path)
 
 

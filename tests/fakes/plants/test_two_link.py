@@ -1,4 +1,4 @@
-"""The plant against energy, sticking, its own finer steps and the estimator's independent equations."""
+"""The plant compared with energy conservation, stiction, finer steps and the estimator's independent equations."""
 
 import math
 from typing import Any
@@ -31,7 +31,7 @@ def arm(joints: int = 2, start: tuple[float, ...] = (-math.pi / 2, 0.0), **drive
 
 
 def energy(arm: Arm, position: tuple[float, ...], velocity: tuple[float, ...]) -> float:
-    """Sum over bodies of kinetic and potential energy, each body's place and velocity by plane geometry."""
+    """Return the sum over bodies of kinetic and potential energy, with positions and velocities by plane geometry."""
     total = 0.0
     angle = rate = 0.0
     x = y = vx = vy = 0.0
@@ -83,7 +83,7 @@ def test_plant_and_regressor_are_the_same_arm(
 ) -> None:
     """Two derivations, from bodies and from base parameters, agree on the torque of an accelerating arm."""
     smooth = arm(start=position, viscous=0.04, coulomb=0.05, coulomb_width=0.3, offset=0.01)
-    step = 1e-8  # s: short against everything, long against rounding
+    step = 1e-8  # s: short compared with all time scales, long enough to avoid rounding errors
     plant = TwoLink(smooth, velocity)
     plant.advance(step, current)
     acceleration = [(after - before) / step for before, after in zip(velocity, plant.velocity, strict=True)]
@@ -101,11 +101,11 @@ def test_truth_has_the_estimators_names() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.floats(-0.99, 0.99), st.floats(-0.99, 0.99))
 def test_a_torque_below_static_friction_moves_nothing(share_1: float, share_2: float) -> None:
-    """Hanging straight down nothing else acts; each joint is held by 1.4 times Coulomb's friction."""
+    """When hanging straight down no other torque acts; each joint is held by 1.4 times Coulomb friction."""
     sticking = arm(**FRICTION)
     plant = make_plant(sticking)
     static = 0.05 * 1.4 / 1.8
-    # Straight down means cos(q1) is 6e-17: not a torque that friction notices.
+    # Straight down means cos(q1) is 6e-17: a negligible torque compared with friction.
     for k in range(1, 200):
         plant.advance(k / 400, (share_1 * static, share_2 * static))
     assert plant.position == sticking.start
@@ -128,7 +128,7 @@ def test_friction_brings_a_swinging_arm_to_an_exact_rest() -> None:
 
 
 def test_friction_yields_before_it_slides_and_lets_go_again() -> None:
-    """Pushed slowly by less than its level, it bends by -level / stiffness log(1 - torque / level)."""
+    """Pushed slowly with less than its level, it deflects by -level / stiffness log(1 - torque / level)."""
     soft = arm(1, coulomb=0.05, presliding_stiffness=10.0, presliding_damping=0.3, viscous=0.02)
     plant = make_plant(soft)
     gravity = base_parameters(soft)["gravity_1"]
@@ -139,14 +139,14 @@ def test_friction_yields_before_it_slides_and_lets_go_again() -> None:
     assert moved == pytest.approx(-0.05 / 10.0 * math.log(1.0 - held / 0.05), rel=0.01)
     assert abs(plant.velocity[0]) < 1e-5
     plant.advance(15.0, (0.0,))
-    # Bent back by log(1 + torque / level): what is left is friction's hysteresis.
+    # The deflection recovers by log(1 + torque / level); the rest is friction's hysteresis.
     left = moved - 0.05 / 10.0 * math.log(1.0 + held / 0.05)
     assert plant.position[0] - soft.start[0] == pytest.approx(left, rel=0.1)
 
 
 @pytest.mark.parametrize("joints", [1, 2])
 def test_friction_that_has_yielded_is_dry_friction(joints: int) -> None:
-    """Far from standstill both kinds of dry friction brake alike."""
+    """Far from standstill, both kinds of dry friction have the same effect."""
     start, speed = (0.3, 0.4)[:joints], (3.0, -4.0)[:joints]
     ends = []
     for near in ({}, {"presliding_stiffness": 100.0, "presliding_damping": 0.1}):
@@ -207,7 +207,10 @@ def test_current_follows_a_first_order_lag() -> None:
         ({"drives": ({**DRIVE, "coulomb_width": 1e-5}, DRIVE)}, "coulomb_width"),
         ({"drives": ({**DRIVE, "presliding_stiffness": 9.0}, DRIVE)}, "needs a coulomb"),
         ({"drives": ({**DRIVE, "presliding_damping": 0.1}, DRIVE)}, "needs a presliding_stiffness"),
-        ({"drives": ({**DRIVE, "presliding_stiffness": 9.0, "coulomb": 0.1, "coulomb_width": 0.1}, DRIVE)}, "give one"),
+        (
+            {"drives": ({**DRIVE, "presliding_stiffness": 9.0, "coulomb": 0.1, "coulomb_width": 0.1}, DRIVE)},
+            "give only one",
+        ),
     ],
 )
 def test_a_wrong_arm_is_refused_by_name(change: dict[str, Any], named: str) -> None:

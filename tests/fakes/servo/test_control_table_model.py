@@ -1,7 +1,7 @@
-"""The servo's control table against a reference as plain as it can be: a dictionary and the manual's rules.
+"""The servo's control table compared with a minimal reference: a dictionary and the manual's rules.
 
-hypothesis makes up sequences of reads, writes, registered writes, torque, reboots and resets, and looks for one after
-which the two differ.
+hypothesis generates sequences of reads, writes, registered writes, torque, reboots and resets, and searches for one
+after which the two differ.
 """
 
 from typing import Any
@@ -14,11 +14,11 @@ from hil.drivers.packet import Framer, Instruction, Packet, StatusError, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import Register, load_model
-from hil.fakes.servo.servo import BOOT_S, Servo
+from hil.fakes.servo.servo import BOOT_S, EmulatedServo
 from tests.fakes.conftest import FreeInertia
 
 GOALS = {"Goal PWM": "PWM Limit", "Goal Current": "Current Limit", "Goal Velocity": "Velocity Limit"}
-# What time, joint or bus change: not the table's affair. ID and Baud Rate: the machine would lose its servo.
+# Left out: registers that time, joint or bus change; ID and Baud Rate, after which the servo would not respond.
 LEFT_OUT = ("Present", "Realtime", "Moving Status", "Moving", "ID", "Baud Rate", "Velocity Traj", "Position Traj")
 LEFT_OUT += (
     "Indirect",
@@ -97,7 +97,7 @@ class ControlTable(RuleBasedStateMachine):
     def switch_on(self, name: str) -> None:
         self.reference = Reference(name)
         self.clock = VirtualClock()
-        self.servo = Servo(self.reference.model, 1)
+        self.servo = EmulatedServo(self.reference.model, 1)
         self.bus = FakeBus([self.servo], FreeInertia(1, 0.0), self.clock)
         self.known = [r for r in self.reference.model.registers.values() if not r.name.startswith(LEFT_OUT)]
 

@@ -1,4 +1,4 @@
-"""Errors of Present Position: noise, what repeats once and twice a turn; which current Present Current is."""
+"""Errors of Present Position: noise and periodic errors; motor or supply current in Present Current."""
 
 import math
 import statistics

@@ -1,4 +1,4 @@
-"""Warmth, overload, the supply, the servo's own clock, the current sensor's noise."""
+"""Heating, overload, the supply, the servo's own clock, the current sensor's noise."""
 
 import statistics
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.supply import Supply
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import BOOT_S, Servo
+from hil.fakes.servo.servo import BOOT_S, EmulatedServo
 from tests.fakes.conftest import Bench, FreeInertia
 
 Make = Callable[..., Any]
@@ -41,7 +41,7 @@ def test_a_current_held_too_long_is_an_overload(make_bench: Make) -> None:
     bench.arm(goal_ticks=250)
     bench.wait(0.9)
     bench.write(1, 102, 50, 2)
-    bench.wait(0.5)  # it forgets as fast as it counts
+    bench.wait(0.5)  # the timer runs down as fast as it runs up
     bench.write(1, 102, 250, 2)
     bench.wait(0.5)
     assert bench.servo().torque_enabled
@@ -56,7 +56,7 @@ def test_a_current_held_too_long_is_an_overload(make_bench: Make) -> None:
 
 
 def on_supply(supply: Supply, **settings: Any) -> Bench:
-    servos = [Servo(load_model("XM430-W350"), servo_id, **settings) for servo_id in (1, 2)]
+    servos = [EmulatedServo(load_model("XM430-W350"), servo_id, **settings) for servo_id in (1, 2)]
     bench = Bench(*servos)
     bench.bus = FakeBus(servos, FreeInertia(2, 0.0), bench.clock, supply=supply)
     bench.plant = bench.bus.plant  # type: ignore[assignment]
@@ -102,7 +102,7 @@ def test_realtime_tick_runs_by_the_servos_own_clock(make_bench: Make) -> None:
 
 def test_current_is_measured_with_noise_that_the_seed_repeats() -> None:
     def measured(seed: int) -> list[int]:
-        bench = Bench(Servo(load_model("XM430-W350"), 1, current_noise_a=0.02, seed=seed))
+        bench = Bench(EmulatedServo(load_model("XM430-W350"), 1, current_noise_a=0.02, seed=seed))
         bench.plant.current[0] = 0.3
         bench.plant.gain = 0.0
         bench.arm(goal_ticks=112)
@@ -116,7 +116,7 @@ def test_current_is_measured_with_noise_that_the_seed_repeats() -> None:
 
 
 def test_the_330_series_measures_the_supplys_current() -> None:
-    servo = Servo(load_model("XC330-T288"), 1)
+    servo = EmulatedServo(load_model("XC330-T288"), 1)
     bench = Bench(servo)
     bench.plant.gain = 0.0
     bench.arm(goal_ticks=400)

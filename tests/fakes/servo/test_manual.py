@@ -1,4 +1,4 @@
-"""What the e-Manual and ROBOTIS' own sources say, point by point; docs/fake-bus.md names the place for each."""
+"""Statements of the e-Manual and ROBOTIS' own sources, point by point; docs/fake-bus.md names the source of each."""
 
 from collections.abc import Callable
 from typing import Any
@@ -36,7 +36,7 @@ def test_indirect_data_of_430_servos_stay_at_224() -> None:
 
 @pytest.fixture
 def shadowed(make_bench: Make) -> Any:
-    """Servo 2 listens to 1 as well."""
+    """Return a bench on which servo 2 also listens to ID 1."""
     return make_bench({}, {"registers": {"Secondary(Shadow) ID": 1}})
 
 
@@ -110,7 +110,7 @@ def test_homing_offset_keeps_its_sign_in_reverse_mode(make_bench: Make) -> None:
 
 
 def test_a_led_byte_out_of_range_does_not_keep_the_goal_from_being_taken(make_bench: Make) -> None:
-    """The order of ROBOTIS' example indirect_address: Goal Position and LED behind one another, in one Sync Write."""
+    """The order in ROBOTIS' example indirect_address: Goal Position followed by LED in one Sync Write."""
     bench = make_bench({})
     for index, address in enumerate((116, 117, 118, 119, 65)):
         assert bench.write(1, 168 + 2 * index, address, 2) == 0

@@ -1,4 +1,4 @@
-"""Operating modes: does a move look right, do gains, limits and profiles do what they say."""
+"""Operating modes: whether a move is realistic, and whether gains, limits and profiles have the documented effect."""
 
 import math
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from hil.drivers.packet import encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.fakes.servo.trajectory import Trajectory, profile
 
 Make = Callable[..., Any]
@@ -19,7 +19,7 @@ RPM = 0.229 * math.tau / 60  # rad/s per tick of velocity
 
 
 class Shaft:
-    """A motor that turns an inertia with some friction, ideal current loop."""
+    """A motor with an ideal current loop that turns an inertia with some friction."""
 
     joints = 1
 
@@ -40,13 +40,13 @@ class Shaft:
 
 
 class Rig:
-    """One servo on a shaft; writes registers by name, watches it over time."""
+    """One servo on a shaft; writes registers by name and simulates it over time."""
 
     def __init__(self, mode: int, model: str = "XM430-W350", **registers: int) -> None:
         self.clock = VirtualClock()
         self.shaft = Shaft()
         named = {key.replace("_", " "): value for key, value in registers.items()}
-        self.servo = Servo(load_model(model), 1, zero_ticks=2048, registers={"Operating Mode": mode, **named})
+        self.servo = EmulatedServo(load_model(model), 1, zero_ticks=2048, registers={"Operating Mode": mode, **named})
         self.bus = FakeBus([self.servo], self.shaft, self.clock)
 
     def write(self, name: str, value: int) -> None:
@@ -214,7 +214,7 @@ def test_torque_off_lets_go_at_once() -> None:
 def test_current_mode_is_limited_by_the_supply_if_asked() -> None:
     current = []
     for limited in (False, True):
-        servo = Servo(load_model("XM430-W350"), 1, registers={"Operating Mode": 0}, voltage_limited=limited)
+        servo = EmulatedServo(load_model("XM430-W350"), 1, registers={"Operating Mode": 0}, voltage_limited=limited)
         shaft = Shaft()
         clock = VirtualClock()
         bus = FakeBus([servo], shaft, clock)

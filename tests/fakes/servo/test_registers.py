@@ -1,4 +1,4 @@
-"""The fake's control tables: complete, not overlapping, factory values within their own ranges."""
+"""The fake's control tables: complete, without overlaps, factory values within their own ranges."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""The Bus Watchdog: fed by any packet on the bus, tripping in bus time, at the moment and not later."""
+"""The Bus Watchdog: fed by any packet on the bus, and tripping in bus time at exactly the right moment."""
 
 from typing import Any
 

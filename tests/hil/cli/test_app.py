@@ -1,4 +1,4 @@
-"""The command line as a person meets it: output, files, exit codes, and one clear message instead of a traceback."""
+"""The command line as users see it: output, files, exit codes, and one clear message instead of a traceback."""
 
 import json
 import os
@@ -22,7 +22,10 @@ ArmFile = Callable[..., Path]
 LONG = (
     ("period = 2.0", "period = 100.0"),
     ("band = [0.5, 6.0]", "band = [0.1, 0.3]"),
-    ("peak_torque = [0.80, 0.42]", "peak_torque = [0.2, 0.1]"),  # so slow a motion would go over the top with more
+    (
+        "peak_torque = [0.80, 0.42]",
+        "peak_torque = [0.2, 0.1]",
+    ),  # with more torque, such a slow motion would swing over the top
 )
 """Changes that make an experiment long enough to be interrupted."""
 

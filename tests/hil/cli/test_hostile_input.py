@@ -1,4 +1,4 @@
-"""Files that mean harm, or only look like it: code in a TOML, names that are markup, archives that burst."""
+"""Malicious or suspicious files: code in a TOML file, names that contain markup, archive bombs."""
 
 import shutil
 import zipfile
@@ -52,7 +52,7 @@ def test_a_link_made_by_somebody_else_while_the_cable_was_out_stays(arm_file: Ar
     server = PtyServer(load_fake(arm_file()), link)
     server._unplug()
     link.write_text("mine")
-    with pytest.raises(LinkError, match="somebody else"):
+    with pytest.raises(LinkError, match="created by another program"):
         server._plug_in()
     server.close()
     assert link.read_text() == "mine"

@@ -1,4 +1,4 @@
-"""`hil init`: a file that can be run, from what is on the bus and a few answers."""
+"""`hil init` creates a valid file from the servos on the bus and a few answers."""
 
 import math
 import sys

@@ -1,6 +1,8 @@
-"""`hil report` and `hil export` on the command line: what they print, and runs that are not what they should be."""
+"""`hil report` and `hil export` on the command line: their output, and incomplete or damaged runs."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -36,7 +38,7 @@ def test_a_run_that_is_not_whole_is_one_message_and_code_2(
 ) -> None:
     path = identified / "result.json"
     newer = json.dumps({**json.loads(path.read_text(encoding="utf-8")), "schema": 7})
-    for content, said in ((newer, "a newer hil"), ('{"schema": 1,', "incomplete or damaged"), (None, "hil estimate")):
+    for content, said in ((newer, "a newer"), ('{"schema": 1,', "incomplete or damaged"), (None, "hil estimate")):
         path.unlink() if content is None else path.write_text(content, encoding="utf-8")
         assert hil(*command, identified) == 2
         printed = capsys.readouterr()
@@ -52,3 +54,28 @@ def test_arguments_that_do_not_go_together(identified: Path, capsys: pytest.Capt
     assert "'step' is not a format" in capsys.readouterr().err
     assert hil("export", identified, "--format", "urdf", "--link-length", 0.2) == 2
     assert "--link-length = 0.2 m is not needed" in capsys.readouterr().err
+
+
+def test_a_reader_that_closes_early_and_a_full_disk_are_no_traceback(identified: Path) -> None:
+    """As `hil runs | head -1` and `hil runs > /dev/full` do."""
+    command = [sys.executable, "-m", "hil", "diff", str(identified), str(identified)]
+    reading, writing = os.pipe()
+    os.close(reading)
+    closed = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (closed.returncode, closed.stderr) == (0, "")
+    with Path("/dev/full").open("w") as full_disk:
+        full = subprocess.run(command, stdout=full_disk, stderr=subprocess.PIPE, text=True, check=False)
+    assert full.returncode == 1 and "no space left" in full.stderr and "Traceback" not in full.stderr
+
+
+def test_no_figure_is_cut_in_a_narrow_terminal(
+    identified: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert hil("diff", identified, identified) == 0
+    wide = capsys.readouterr().out
+    monkeypatch.setenv("COLUMNS", "40")
+    assert hil("diff", identified, identified) == 0
+    assert capsys.readouterr().out.split() == wide.split()
+    assert hil("runs", identified.parent) == 0
+    assert str(identified) in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The list of runs, their notes, and the difference of two, as typed."""
+"""`hil runs`, `hil note` and `hil diff` on the command line."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The schema that editors use is the one that the code checks with."""
+"""The JSON Schema for editors agrees with the models that check the TOML."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""The TOML: both fake arms load; each kind of fault names file, key, value and what is allowed."""
+"""The TOML schema: both fake arms load; every kind of error names file, key, value and what is allowed."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""URDF files: geometry and inertias as other programs read them, and every fault named."""
+"""URDF files: geometry and inertias as in other programs, and an error message for every fault."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Dry runs: what they foresee, what they allow, and the command around them."""
+"""Dry runs: their predictions, the torque they allow, and the command."""
 
 import json
 from collections.abc import Callable
@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from benchmarks.dry_run import is_within, prior_study, run_on
 from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude
 from hil.dry_run.ensemble import prior_ensemble
@@ -15,6 +14,9 @@ from hil.dry_run.prediction import GUARDED, predict
 from hil.errors import ConfigError
 from hil.plan.plan import make_plan
 from tests.support.command_line import hil
+from tests.support.dry_runs import is_within, prior_study, run_on
+from tests.support.edits import replaced
+from tests.support.elsewhere import Elsewhere
 from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
@@ -37,6 +39,15 @@ def test_the_same_prior_gives_the_same_prediction_and_more_torque_larger_peaks(k
     assert (first.quantile[1:] >= first.median[1:] - 1e-9).all() and (first.quantile[0] <= first.median[0]).all()
 
 
+def test_an_executor_gives_the_same_prediction(known: Config) -> None:
+    ensemble, plan, elsewhere = prior_ensemble(known, 40), make_plan(known), Elsewhere()
+    here, there = predict(known, plan, ensemble), predict(known, plan, ensemble, executor=elsewhere)
+    assert elsewhere.submitted == 3
+    assert (here.values == there.values).all() and (here.settled_after == there.settled_after).all()
+    found, again = largest_amplitude(known, ensemble), largest_amplitude(known, ensemble, executor=elsewhere)
+    assert (found.peak_torque == again.peak_torque).all()
+
+
 def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known: Config) -> None:
     found = largest_amplitude(known, prior_ensemble(known, 48))
     assert found.prediction.stop_chance <= known.safety.limit_chance
@@ -45,11 +56,11 @@ def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known
 
 
 def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_file: Callable[..., Path]) -> None:
-    path = arm_file()  # the hanging one's place
+    path = arm_file()  # overwritten by the horizontal arm
     text = (CONFIGS / "fake_horizontal.toml").read_text(encoding="utf-8")
-    for old, new in (KNOWN, ("period = 10.0 ", "held_out = false\nperiod = 4.0 "), ("[0.30, 0.18]", "[0.15, 0.09]")):
-        assert old in text, old
-        text = text.replace(old, new, 1)
+    text = replaced(
+        text, KNOWN, ("period = 10.0 ", "held_out = false\nperiod = 4.0 "), ("[0.30, 0.18]", "[0.15, 0.09]")
+    )
     held_text = text.replace(
         "[model]\n", "[stabiliser]\nstiffness = [1.0, 0.5]\ndamping = [0.02, 0.01]\n\n[model]\n", 1
     )

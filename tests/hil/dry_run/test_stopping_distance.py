@@ -1,6 +1,4 @@
-"""How far an arm goes beyond its limits when it is stopped, against the fake arm's plant, which is another program than
-the prediction.
-"""
+"""Predicted overshoot of a stopped arm, compared with the independent plant of the fake arm."""
 
 from functools import cache
 from itertools import product
@@ -8,7 +6,6 @@ from itertools import product
 import numpy as np
 import pytest
 
-from benchmarks.short_experiment import CONFIG, short_config
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
@@ -19,6 +16,8 @@ from hil.fakes.plants.arm import base_parameters
 from hil.fakes.plants.two_link import TwoLink
 from hil.plan.brake import GETS_FASTER, Brake
 from hil.plan.plan import Plan, make_plan, scaled
+from tests.support.edits import replaced
+from tests.support.short_experiment import CONFIG, short_config
 
 NONE = Feedback.none(2)
 SPEEDS = np.array([3.0, 2.0])
@@ -27,15 +26,13 @@ CLOSE = (("[-4.2, 1.06]", "[-2.6, -0.3]"), ("[-3.1, 3.1]", "[-0.4, 0.4]"))
 
 def close_config(*changes: tuple[str, str]) -> Config:
     text = CONFIG.read_text(encoding="utf-8")
-    for old, new in (*CLOSE, *changes):
-        assert old in text, old
-        text = text.replace(old, new, 1)
+    text = replaced(text, *CLOSE, *changes)
     return short_config(text)
 
 
 @cache
 def fake_itself() -> Ensemble:
-    """The one arm that the fake is, by the model's parameters."""
+    """An ensemble with only the fake arm, described by the model's parameters."""
     arm = close_config().fake.arm  # type: ignore[union-attr]
     assert arm is not None
     known = base_parameters(arm) | {"lag": arm.drives[0].current_lag}
@@ -57,7 +54,7 @@ def plant_of(config: Config, pose: np.ndarray, speed: np.ndarray) -> TwoLink:
 
 
 def seen_beyond(config: Config, plant: TwoLink, current: np.ndarray) -> np.ndarray:
-    """Ways beyond the limits when torque is cut two samples after a limit was passed under `current` [A]."""
+    """Overshoot when torque is cut two samples after a limit was exceeded under `current` [A]."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     beyond = np.zeros(2)
     for sample in range(round(LONGEST_S * config.experiment.rate)):
@@ -109,7 +106,7 @@ def test_the_ways_of_stopping_in_their_order() -> None:
 
 
 def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
-    """The motion beyond it will not be played; the guard stops the arm."""
+    """Motion beyond a limit is never played, because the guard stops the arm there."""
     config = close_config()
     harder = scaled(config, make_plan(config), np.array([2.1, 1.4]))
     moved = respond(

@@ -1,6 +1,7 @@
-"""Recordings from elsewhere, runs cut short, peers and the known mass, as a person meets them on the command line."""
+"""CSV recordings, incomplete runs, peers and calibration with a known mass, on the command line."""
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def ratio(result: dict) -> tuple[float, float]:
-    """Length of link 1 [m] as coupling and gravity_2 say, and its standard error."""
+    """Length of link 1 [m] from coupling and gravity_2, and its standard error."""
     names = result["covariance"]["names"]
     covariance = np.array(result["covariance"]["matrix"])
     coupling, gravity = (result["parameters"][name]["value"] for name in ("coupling", "gravity_2"))
@@ -37,7 +38,7 @@ def ratio(result: dict) -> tuple[float, float]:
 
 
 def test_a_real_arm_recorded_by_others(capsys: pytest.CaptureFixture[str]) -> None:
-    """Four seconds of it: link 1 is 0.2 m long, which nothing in the file says."""
+    """Four seconds of a recording suffice to find the length of link 1, 0.2 m, which the file does not contain."""
     text = DFKI.read_text(encoding="utf-8").replace('friction = "stribeck_load"', 'friction = "coulomb"')
     Path("arm.toml").write_text(text.replace("presliding = true", "presliding = false"), encoding="utf-8")
     assert hil("estimate", RECORDINGS / "c1_sinusoids_143339.csv", "--config", "arm.toml", "--json") == 0
@@ -76,11 +77,18 @@ COLUMNS = (
         (CSV, COLUMNS.replace("[1.8, 1.8]", "[1.8]"), 2, "has 1 entries; position has 2"),
         (CSV, COLUMNS.replace('"deg"', '"turns"'), 1, "are these degrees or encoder"),
         (CSV, COLUMNS.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'), 1, "jumps by"),
-        (CSV, "[arm]\ngravity = 9.81\n", 2, "has no [columns] table"),
+        (CSV, "[arm]\ngravity = 9.81\n", 2, "columns.torque_constant is missing"),
         (CSV.replace("\n0.50,", "\n0.50,x"), COLUMNS, 2, "column 'q1' is not a number"),
         (CSV.replace("\n0.50,", "\n0.50,1,"), COLUMNS, 2, "6 fields for 5 columns"),
-        (CSV.replace(",0.1\n", ",nan\n", 3), COLUMNS, 1, "joint 2: 3 torques are not finite"),
+        (CSV.replace(",0.1\n", ",nan\n"), COLUMNS, 2, "holds no numbers at all"),
         (CSV[:300], COLUMNS, 2, "fields for 5 columns"),
+        (CSV, COLUMNS.replace('"q2"]', '"q_2"]'), 2, "Did you mean 'q2'?"),
+        (CSV.replace("t,q1", "t [ms],q1"), COLUMNS + 'time_unit = "s"\n', 2, "states the unit ms"),
+        (CSV.replace("q1,q2", "q1 [furlong],q2"), COLUMNS.replace('position_unit = "deg"', ""), 2, "'furlong'"),
+        (CSV, COLUMNS.replace('"deg"', '"ticks"'), 2, "columns.ticks_per_turn is missing"),
+        (CSV, COLUMNS + 'pwm = ["i1", "i2"]\n', 2, "current and pwm are both given"),
+        (CSV, COLUMNS.replace("current", "voltage"), 2, "columns.torque_per_volt is missing"),
+        (re.sub(r"^(\d\.\d)\d", r"\1", CSV, flags=re.MULTILINE), COLUMNS, 2, "they are too coarse"),
         ("".join(CSV.splitlines(True)[:20]), COLUMNS, 1, "at least 32 are needed"),
         ("", COLUMNS, 2, "is empty"),
     ],
@@ -104,7 +112,7 @@ def test_a_csv_that_is_wrong_is_named(
         ),
         (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
         (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),
-        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "encoder steps only"),
+        (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "moved by only"),
     ],
 )
 def test_data_that_is_doubtful_comes_with_a_warning(
@@ -120,7 +128,7 @@ def test_torque_of_the_wrong_sign_is_an_error_that_says_where_to_look(capsys: py
 
 
 def estimate_pendulum(spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> int:
-    """A pendulum swinging as 0.02 q'' + 0.5 cos q + 0.03 q' = tau; one column is then wrong. The exit code."""
+    """Estimate a pendulum with 0.02 q'' + 0.5 cos q + 0.03 q' = tau, one of whose columns is spoiled; the exit code."""
     time = 0.0025 * np.arange(2000)
     torque = 0.25 * np.sin(2.0 * time) + 0.2 * np.sin(7.1 * time + 1.0)
     angle, velocity = np.empty(2000), 0.0
@@ -138,14 +146,19 @@ def estimate_pendulum(spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndar
     return hil("estimate", "data.csv", "--config", "arm.toml", "--json")
 
 
-def test_a_csv_needs_its_config_and_no_run_beside_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_csv_whose_columns_are_unclear_needs_a_config_and_no_run_beside_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Path("data.csv").write_text("a,b,c\n1,2,3\n", encoding="utf-8")
     assert hil("estimate", "data.csv") == 2
-    assert "--config ARM.toml" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "--config ARM.toml" in error and "a, b, c" in error and "[columns]" in error
+    assert not any(Path("runs").glob("*")), "nothing stands in the way of the next try"
     assert hil("estimate", "data.csv", "some_run", "--config", "arm.toml") == 2
 
 
 def test_a_run_cut_short_still_tells_something(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    """Killed before the second period, a run holds no settled one; shooting needs none."""
+    """A run killed before the second period has no settled one; multiple shooting needs none."""
     assert hil("identify", arm_file(), "--out", "run", "--json") == 0
     whole = json.loads(capsys.readouterr().out)
     samples = load_samples(Path("run/samples.npy"), 2)
@@ -172,8 +185,8 @@ def test_compare_and_known_quantities_on_one_run(
     assert "centre_2" in capsys.readouterr().out
     physical = json.loads(Path("run/result.json").read_text(encoding="utf-8"))["physical"]
     assert physical["quantities"]["centre_2"]["value"] == pytest.approx(0.112, rel=0.005)
-    # A small difference of large numbers: what is promised is its error bar, which holds that zeros, the ratio of the
-    # torque constants and the like may be off although this model does without them.
+    # A small difference of large numbers. Its error bar allows for errors that this model does not include, such as
+    # encoder zeros and the ratio of the torque constants.
     inertia = physical["quantities"]["link_inertia_2"]
     assert abs(inertia["value"] - 2.9e-4) < 3.0 * inertia["std"] < 1.5e-4
     assert physical["not_told_apart"] == []
@@ -186,7 +199,7 @@ def test_compare_and_known_quantities_on_one_run(
 
 
 def test_a_known_mass_mends_a_torque_constant(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    """The TOML supposes 20 % too much at the shoulder and 10 % too little at the elbow."""
+    """The torque constant in the TOML is 20 % too high for the shoulder and 10 % too low for the elbow."""
     wrong = [("torque_constant = 1.80         #", "torque_constant = 2.16         #")]
     wrong += [("torque_constant = 1.80\ntorque_constant_std", "torque_constant = 1.62\ntorque_constant_std")]
     assert hil("identify", arm_file(*wrong), "--out", "bare", "--json") == 0

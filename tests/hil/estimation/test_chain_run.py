@@ -1,4 +1,4 @@
-"""An arm in space from its TOML to its result, model and exports, on the fake bus."""
+"""A spatial arm from its TOML file to result, model and exports, on the fake bus."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ from hil.estimator.chain.dynamics import inverse_dynamics
 from hil.estimator.chain.geometry import Chain, parameter_names
 from hil.experiment.run import run_experiment
 from hil.export.formats import export
-from hil.plan.chain_plan import make_chain_plan, plan_of
+from hil.plan.chain_plan import make_chain_plan
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
@@ -32,7 +32,7 @@ TEXT = FOUR.read_text(encoding="utf-8")
 
 
 def short(folder: Path) -> Config:
-    """Five seconds a period, the URDF beside it."""
+    """The configuration with a period of 5 s, next to its URDF."""
     (folder / "open_manipulator_x_like.urdf").write_bytes((CONFIGS / "open_manipulator_x_like.urdf").read_bytes())
     (folder / "arm.toml").write_text(TEXT.replace("period = 10.0", "period = 5.0"), encoding="utf-8")
     return load_config(folder / "arm.toml")
@@ -112,7 +112,7 @@ def test_exports_move_as_identified_and_keep_the_urdf(run: RunFolder, result: Se
     for name in ("urdf", "mjcf"):
         engine = mujoco.MjModel.from_xml_path(str(tmp_path / f"arm.{name}"))
         engine.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        if name == "urdf":  # cannot represent rotors, and says so
+        if name == "urdf":  # cannot represent rotors and lists them instead
             found = [float(text.split(" = ")[1].split()[0]) for text in said[name] if text.startswith("armature")]
             engine.dof_armature[:] = found
         engine.dof_damping[:] = 0.0
@@ -152,10 +152,12 @@ def test_what_is_not_there_yet_is_refused(run: RunFolder) -> None:
             command()
 
 
-def test_no_real_arm_is_moved() -> None:
-    real = TEXT.replace('url = "fake://"', 'url = "/dev/ttyUSB0"')
-    with pytest.raises(ConfigError, match="not supported yet"):
-        plan_of(parse_config(real, FOUR))
+def test_a_path_that_leads_too_near_is_refused_on_a_real_port(tmp_path: Path) -> None:
+    text = TEXT.replace('url = "fake://"', 'url = "/dev/ttyUSB0"').replace('floor = "none"', "floor = 0.0")
+    config = parse_config(text, FOUR)
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises(ConfigError, match=r"too near: .*floor"):
+        run_experiment(config, run, config.path, lambda _: None)
 
 
 def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
@@ -164,7 +166,7 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
     assert [segment.role for segment in plan.segments] == ["identify", "held_out"]
     first = plan.segments[0]
     assert len(first.ramp_in) == len(first.ramp_out) == first.ramp_samples == 1200
-    # Continuous where the pieces meet.
+    # The pieces join continuously.
     joined = np.concatenate((first.ramp_in[-2:], first.period_current[:2]))
     assert np.abs(np.diff(joined, axis=0)).max() < 0.2
     joined = np.concatenate((first.period_current[-2:], first.ramp_out[:2]))
@@ -177,7 +179,7 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
         ('name = "joint2"', 'name = "elbow"', 'no joint "elbow"'),
         ("swing = [0.9", "swing = [3.9", "outside its position_limit"),
         ("speed = [4.8", "speed = [48.0", "velocity_limit"),
-        ("[experiment]", "[experiment]\npilot = true", "only planar arms support the pilot"),
+        ("[experiment]", "[experiment]\npilot = true", "the path is found"),
         ('friction = "stribeck"', 'friction = "auto"', "only for planar arms so far"),
         ('drive = "lag"', 'drive = "lag"\nripple = true', "model.ripple = true"),
         ("[stabiliser]", "[stabilizer]", "stabili"),

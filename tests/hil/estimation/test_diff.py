@@ -1,4 +1,4 @@
-"""What changed between two runs: found where it did, silent where it did not."""
+"""Changes between two runs: real ones are found, and there are no false alarms."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ MODEL = ArmModel(VALUES, {name: abs(value) * 0.01 for name, value in VALUES.item
 
 
 def drawn(rng: np.random.Generator, changed: str | None = None) -> ArmModel:
-    """One identification of the arm: its values with noise of the standard errors that it states."""
+    """One identification of the arm, with noise according to its standard errors."""
     truth = {name: value * (1.1 if name == changed else 1.0) for name, value in MODEL.values.items()}
     values = {name: value + MODEL.stds[name] * rng.standard_normal() for name, value in truth.items()}
     return replace(MODEL, values=values)

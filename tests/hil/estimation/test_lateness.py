@@ -1,4 +1,4 @@
-"""A computer that is late costs nothing as long as it says how late it was."""
+"""Recorded lateness of the computer has no effect on the estimate."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import jitter
 from hil.config.schema import Config, load_config
 from hil.estimation.lateness import acting_torque
+from tests.support import late_loop
 
 Arm = Callable[..., Config]
 
@@ -20,7 +20,7 @@ def test_torque_between_deadlines_is_the_mean_of_what_acted() -> None:
 
 
 def test_jitter_of_the_loop_is_taken_back(arm_file: Callable[..., Path]) -> None:
-    found = jitter.measure(load_config(arm_file()), 400e-6)
+    found = late_loop.measure(load_config(arm_file()), 400e-6)
     assert found["real"]["residual_ticks"] < 0.30
     assert found["nominal"]["residual_ticks"] > 0.45, "or this test could not fail"
     assert found["real"]["worst_error"] < 0.02, "as without jitter, in the 2 s that this test has"

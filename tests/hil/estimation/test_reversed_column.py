@@ -1,4 +1,4 @@
-"""A recording with a reversed torque column: the person reads which column it is."""
+"""The warning about a recording with a reversed torque column names the column."""
 
 import csv
 import json

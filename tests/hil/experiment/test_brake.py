@@ -1,4 +1,4 @@
-"""The brake: against each velocity, within the limits, and over when it cannot or should not go on."""
+"""The brake opposes each velocity within the limits, and ends when it cannot or should not continue."""
 
 from collections.abc import Callable
 from math import nan
@@ -16,7 +16,7 @@ MOVING = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (3.0, -4.0), (-1.57, 0.0), (0
 
 
 def test_full_current_at_half_of_the_velocity_limit(arm: Arm) -> None:
-    """1.2 A and 15 rad/s, 0.8 A and 20 rad/s."""
+    """The limits of the joints are 1.2 A and 15 rad/s, 0.8 A and 20 rad/s."""
     assert braking_gains(arm()) == pytest.approx([1.2 / 7.5, 0.8 / 10.0])
     assert Brake(arm()).goals(MOVING) == pytest.approx([-1.2 * 3.0 / 7.5, 0.8 * 4.0 / 10.0])
 
@@ -48,7 +48,7 @@ def test_one_joint_that_still_moves_is_braked_alone(arm: Arm) -> None:
 @pytest.mark.parametrize(("more", "goes_on"), [(3.9, True), (4.1, False)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_joint_that_gets_faster_ends_it(arm: Arm, more: float, goes_on: bool, sign: float) -> None:
-    """By more than a fifth of the velocity limit, 20 rad/s, than when the braking began, in whatever direction."""
+    """The tolerance is a fifth of the velocity limit, 20 rad/s, above the speed at the start of braking."""
     brake = Brake(arm())
     assert brake.goals(MOVING) is not None
     faster = MOVING._replace(velocity=(0.0, sign * (4.0 + more)))

@@ -1,4 +1,4 @@
-"""Position against velocity, sample by sample: frozen readings are seen soon, healthy and laggy ones never."""
+"""Position and velocity are compared on every sample: frozen readings are detected, healthy ones accepted."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ def quantised(value: float, step: float) -> float:
 def seen_after(
     rate: int, position: Callable[[float], float], velocity: Callable[[float], float], start: float = 0.0
 ) -> float:
-    """When it is seen [s], infinite within six seconds where it is not."""
+    """Time of detection [s]; infinite if nothing is detected within six seconds."""
     look = Consistency()
     for index in range(6 * rate):
         now = start + index / rate
@@ -68,7 +68,7 @@ def test_a_velocity_that_is_scaled_turned_round_or_old(rate: int, scale: float, 
     amplitude=st.floats(0.0, 1.0),
 )
 def test_healthy_joints_are_never_stopped(rate: int, seed: int, lag: float, scatter: float, amplitude: float) -> None:
-    """Multisines up to a quarter of the rate, a filtered velocity, an encoder that scatters, joints at rest."""
+    """Multisines up to a quarter of the rate, filtered velocities, encoder noise, joints at rest."""
     random = Random(seed)
     lag = min(lag, 0.5 / rate) if rate < 100 else lag
     waves = [(random.uniform(0.1, min(5.0, rate / 4.2)), random.uniform(0, math.tau)) for _ in range(6)]

@@ -1,43 +1,41 @@
-"""Random faults over every shipped configuration and rate; benchmarks/faults.py draws thousands."""
+"""Random faults in every bundled configuration and rate; benchmarks/faults.py draws thousands."""
 
 import pytest
 
 from benchmarks.fault_campaign.arms import RATES, names, settings
-from benchmarks.fault_campaign.attack import Kind
 from benchmarks.faults import campaign, figures
-from hil.fakes.bus.faults import FaultKind
 
-INJECTIONS = 132
-"""Three for each configuration and rate: what a minute of processor time allows."""
+INJECTIONS = 300
+
+PERIOD_S = 1.2
+"""Of the multisines: shorter than in the script's campaign, for the processor's sake."""
 
 PARTS = 2
-"""Tests that share them out, so that they run side by side."""
+"""Number of tests that share them, so that they run side by side."""
 
 NAMED = 0.95
 
+SEEN_LATER = 0.05
+"""Share of the injections at most whose time counts from when the fault could be seen, later than it began."""
+
 NOT_STABLE = "fake_inverted at 20 Hz"
-NOT_SETTLED = "fake_horizontal at 20 Hz"
-"""What cannot be played there at all: a spring in software 50 ms late, and an arm that nothing brings back."""
-
-FOUND_LATE = frozenset({Kind.SCALE, FaultKind.STUCK_JOINT, FaultKind.STATUS_ERROR})
-"""Faults that may keep current for longer than 100 ms, as docs/safety.md says."""
-
-OTHERS_LATE = 0.02
-"""Of all injections: what else is found late at present. The figure is none; this may only be lowered."""
+"""A setting that cannot be played: a software spring delayed by 50 ms."""
 
 
 @pytest.mark.parametrize("part", range(PARTS))
 def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
-    outcomes, left_out = campaign(settings()[part::PARTS], INJECTIONS // PARTS, jobs=1)
-    assert all(why.startswith((NOT_STABLE, NOT_SETTLED)) for why in left_out), left_out
-    unsafe = [str(each) for each in outcomes if each.verdict.unsafe and not set(each.drawn.kinds) & FOUND_LATE]
-    assert len(unsafe) <= OTHERS_LATE * len(outcomes), "\n\n".join(unsafe)
-    bad = [each for each in outcomes if each.beyond_limit or each.unreadable or each.not_restored]
-    bad += [each for each in outcomes if each.verdict.misleading]
+    outcomes, left_out = campaign(settings()[part::PARTS], INJECTIONS // PARTS, jobs=1, period=PERIOD_S, even=False)
+    assert all(why.startswith(NOT_STABLE) for why in left_out), left_out
+    bad = [
+        each
+        for each in outcomes
+        if each.verdict.unsafe or each.beyond_limit or each.unreadable or each.not_restored or each.verdict.misleading
+    ]
     assert not bad, "\n\n".join(map(str, bad))
     counted = figures(outcomes)
     assert counted["unnamed"] <= (1 - NAMED) * counted["stopped"]
     assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it meets stops and runs that go on"
+    assert counted["seen_later"] <= SEEN_LATER * len(outcomes)
 
 
 def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:

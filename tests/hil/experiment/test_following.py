@@ -1,4 +1,4 @@
-"""Whether a motor carries what it is told to: how fast lost torque is seen, and what healthy motors may do."""
+"""Checks of the motor current: how fast lost torque is detected, and what healthy motors may do."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ def joints(name: str) -> list[tuple[JointConfig, float]]:
 def seen_after(
     follow: Following, rate: int, goal: Callable[[float], float], carried: Callable[[float, float], float]
 ) -> float:
-    """Seconds until it is seen, infinite within ten seconds where it is not."""
+    """Time of detection [s]; infinite if nothing is detected within ten seconds."""
     for index in range(10 * rate):
         now = index / rate
         if follow.look(goal(now), carried(goal(now), now), 1 / rate) is not None:
@@ -40,7 +40,7 @@ def seen_after(
 def test_lost_torque_is_seen_within_a_tenth_of_a_second_of_a_current_worth_speaking_of(
     name: str, rate: int, joint: int
 ) -> None:
-    """Planned are a quarter and an eighth of current_limit in the configurations for real arms."""
+    """The plans use a quarter and an eighth of current_limit in the configurations of real arms."""
     config, planned = joints(name)[joint]
     follow = Following(config, planned, 0.3, 0.05)
     assert seen_after(follow, rate, lambda _: 0.5 * planned, lambda goal, now: 0.0) <= 0.1
@@ -50,7 +50,7 @@ def test_lost_torque_is_seen_within_a_tenth_of_a_second_of_a_current_worth_speak
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000), noise=st.floats(0.0, 0.05), gain=st.floats(0.8, 1.2), lag=st.floats(0.0, 3e-3))
 def test_a_healthy_motor_is_never_stopped(rate: int, seed: int, noise: float, gain: float, lag: float) -> None:
-    """Noise as a share of the planned peak, a sensor 20 % off, a current loop that lags; multisines up to 5 Hz."""
+    """Noise relative to the planned peak, a sensor error of 20 %, a lagging current loop; multisines up to 5 Hz."""
     config, planned = joints("xm430_two_link")[0]
     follow = Following(config, planned, 0.3, 0.05)
     random = Random(seed)
@@ -61,7 +61,7 @@ def test_a_healthy_motor_is_never_stopped(rate: int, seed: int, noise: float, ga
         return planned / 4 * sum(math.sin(math.tau * f * held + phase) for f, phase in waves)
 
     def carried(_: float, now: float) -> float:
-        # Read at once after the write: hardly anything of the newest goal, and so much of the former one.
+        # Measured right after the write: mostly the previous goal, and hardly any of the newest one.
         former = goal(now - 1 / rate) if now > 0 else 0.0
         share = 1.0 if lag < 1e-6 else 1.0 - math.exp(-0.2e-3 / lag)
         return gain * (former + share * (goal(now) - former)) + random.gauss(0.0, noise * planned)

@@ -1,7 +1,7 @@
-"""The guard by itself: what each sample must not show, and what a look costs."""
+"""The guard alone: each cause of a stop, and the computing time of a check."""
 
 from collections.abc import Callable
-from math import inf, nan
+from math import inf, nan, sin, tau
 from timeit import timeit
 from typing import Any
 
@@ -13,13 +13,14 @@ from hil.errors import Cause, SafetyStop
 from hil.experiment.guard import Guard
 
 Arm = Callable[..., Config]
+AT_20_HZ = ("rate = 400.0", "rate = 20.0"), ("band = [0.5, 6.0]", "band = [0.5, 4.0]")
 STILL = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (-1.57, 0.0), (0, 0), (False, False))
 MISSING = STILL._replace(current=(0.0, nan), velocity=(0.0, nan), position=(-1.57, nan), missing=(False, True))
 NOTHING_SLOW = Slow((nan, nan), (nan, nan), (nan, nan))
 
 
 def look(guard: Guard, *states: State) -> Cause:
-    """Show the states; the cause for which the guard stops, at the last one."""
+    """Pass the states to the guard; return the cause for which it stops at the last one."""
     for state in states[:-1]:
         guard.look(state)
     with pytest.raises(SafetyStop) as stop:
@@ -72,9 +73,14 @@ def test_a_current_that_does_not_follow(arm: Arm) -> None:
         guard.look(state)
 
 
+def at(number: int, state: State) -> State:
+    """The same as sample `number` of 400 a second."""
+    return state._replace(time_before_write=number / 400, time_after_read=number / 400 + 0.001)
+
+
 def test_a_motor_that_only_takes_work_out_turns_the_wrong_way(arm: Arm) -> None:
     braking = STILL._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0))
-    falling = [braking._replace(position=(-1.57 - 0.0075 * n, 0.0)) for n in range(12)]
+    falling = [at(n, braking._replace(position=(-1.57 - 0.0075 * n, 0.0))) for n in range(13)]
     assert look(Guard(arm()), *falling) is Cause.WRONG_SIGN
 
 
@@ -94,12 +100,12 @@ def test_a_jump_is_one_in_either_direction_and_what_the_velocity_limit_allows_is
 
 
 def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> None:
-    """The elbow swings the shoulder along: what the shoulder's motor takes out, the elbow's put in."""
+    """The elbow drives the shoulder: the work that the shoulder's motor takes out was put in by the elbow."""
     taken = {"goal_current": (0.4, 0.7), "current": (0.4, 0.7), "velocity": (-3.0, 9.0)}
 
     def states(count: int) -> list[State]:
         position = [(-1.57 - 0.0075 * n, 0.0225 * n) for n in range(count)]
-        return [STILL._replace(position=each, **taken) for each in position]
+        return [at(n, STILL._replace(position=each, **taken)) for n, each in enumerate(position)]
 
     guard = Guard(arm())
     for state in states(60):
@@ -108,22 +114,42 @@ def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> No
     guard = Guard(arm())
     for state in alone[:11]:
         guard.look(state)
-    assert look(guard, alone[11]._replace(goal_current=(0.45, 0.0), current=(0.45, 0.0))) is Cause.WRONG_SIGN
+    guard.look(alone[11]._replace(goal_current=(0.45, 0.0), current=(0.45, 0.0)))
+    assert look(guard, alone[12]) is Cause.WRONG_SIGN
+
+
+@pytest.mark.parametrize("hertz", [1.0, 4.0])
+def test_work_is_what_a_goal_has_done_until_the_next_one(arm: Arm, hertz: float) -> None:
+    """At 20 Hz half a period passes in two samples: a motor that drives an arm forth and back only puts work in."""
+    guard = Guard(arm(*AT_20_HZ))
+    position, velocity = -1.57, 0.0
+    for n in range(200):
+        goal = 0.2 * sin(tau * hertz * n / 20)
+        told = STILL._replace(position=(position, 0.0), velocity=(velocity, 0.0), time_before_write=n / 20)
+        guard.look(told._replace(time_after_read=n / 20 + 1e-3, goal_current=(goal, 0.0), current=(goal, 0.0)))
+        velocity = 2.0 * goal  # much friction: it follows its motor at once
+        position += velocity / 20
+
+
+def test_a_refusal_needs_no_second_one_at_a_slow_rate(arm: Arm) -> None:
+    slow = arm(*AT_20_HZ)
+    refused = at(20, MISSING._replace(error=(0, 1)))
+    assert look(Guard(slow), STILL, refused) is Cause.MISSING
+    guard = Guard(slow)
+    for state in (STILL, at(20, MISSING._replace(error=(0, 3))), at(40, STILL), at(60, MISSING)):
+        guard.look(state)  # a damaged question, and a lost reply
 
 
 def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:
     given = "[stabiliser]\nstiffness = [1.0, 1.0]\ndamping = [0.1, 0.1]\n\n[experiment]\n"
     guard = Guard(arm(("[experiment]\n", given)))
+    braking = STILL._replace(goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0))
     for n in range(60):
-        guard.look(
-            STILL._replace(
-                goal_current=(0.4, 0.0), current=(0.4, 0.0), velocity=(-3.0, 0.0), position=(-1.57 - 0.0075 * n, 0.0)
-            )
-        )
+        guard.look(at(n, braking._replace(position=(-1.57 - 0.0075 * n, 0.0))))
 
 
 def test_lost_torque_is_measured_against_what_the_configuration_plans(arm: Arm) -> None:
-    """0.8 N m at 1.8 N m/A: a third of that is worth speaking of."""
+    """At 1.8 N m/A and a planned 0.8 N m, a third of the planned current is enough to detect lost torque."""
     off = STILL._replace(goal_current=(0.15, 0.0))
     assert look(Guard(arm()), *[off] * 14) is Cause.NOT_FOLLOWING
 
@@ -160,7 +186,7 @@ def test_deadlines_missed_again_and_again_stop_though_never_many_in_a_row(arm: A
         for _ in range(400):
             guard.look(STILL)
     guard = Guard(arm())
-    for _ in range(500):  # one in eight
+    for _ in range(500):  # one missed deadline in eight
         guard.late()
         for _ in range(7):
             guard.look(STILL)
@@ -187,7 +213,7 @@ def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:
 
 
 def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
-    """The figure is benchmarks/guard.py's; here only what slows a look down shows, on a machine of any speed."""
+    """benchmarks/guard.py measures the time; this test detects a slow check on a machine of any speed."""
     guard = Guard(arm())
     moving = STILL._replace(goal_current=(0.1, 0.1), current=(0.1, 0.1), velocity=(0.02, 0.02))
 
@@ -202,3 +228,19 @@ def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
 
     rounds = [(timeit(look, number=500), timeit(add, number=500)) for _ in range(20)]
     assert min(looked for looked, _ in rounds) < 3 * min(added for _, added in rounds)
+
+
+def test_a_joint_that_a_run_left_beyond_its_limit_may_move_in_and_no_farther_out(arm: Arm) -> None:
+    config = arm()
+    high = config.joints[1].position_limit[1]
+
+    def at(*beyond: float) -> list[State]:
+        return [STILL._replace(position=(-1.57, high + each)) for each in beyond]
+
+    assert look(Guard(config), *at(0.006)) is Cause.POSITION, "a person put it there"
+    guard = Guard(config, left_by_a_run=True)
+    for state in at(0.006, 0.007, 0.004, -0.002):
+        guard.look(state)
+    assert look(guard, *at(0.001)) is Cause.POSITION, "it was inside"
+    assert look(Guard(config, left_by_a_run=True), *at(0.006, 0.013, 0.02)) is Cause.POSITION
+    assert look(Guard(config, left_by_a_run=True), *at(0.2)) is Cause.POSITION, "no stop leaves it that far away"

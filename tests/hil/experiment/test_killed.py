@@ -1,12 +1,12 @@
-"""SIGKILL in the middle of an experiment: only the servos' own watchdogs are left. benchmarks/kills.py does fifty."""
+"""SIGKILL during an experiment: only the servos' own watchdogs remain. benchmarks/kills.py repeats it fifty times."""
 
 from pathlib import Path
 
 import pytest
 
-from benchmarks import kills
-from benchmarks.kills import Kill, kill_campaign
 from hil.config.schema import Config
+from tests.support import kills
+from tests.support.kills import Kill, kill_campaign
 
 
 def test_a_killed_program_leaves_servos_that_stop_themselves(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The model beside the experiment: healthy arms pass, others do not, and what it allows follows from what is known."""
+"""The model watch accepts healthy arms, detects others, and its tolerance follows from the prior knowledge."""
 
 import math
 
@@ -24,7 +24,7 @@ def config() -> Config:
 
 
 def waves(seconds: float, peaks: tuple[float, float], seed: int) -> np.ndarray:
-    """Torques (2, samples) [N m]."""
+    """Random torques (2, samples) [N m]."""
     random = np.random.default_rng(seed)
     when = np.arange(round(seconds * RATE)) / RATE
     frequency, phase = random.uniform(0.3, 4.0, (2, 6, 1)), random.uniform(0, math.tau, (2, 6, 1))
@@ -33,7 +33,7 @@ def waves(seconds: float, peaks: tuple[float, float], seed: int) -> np.ndarray:
 
 
 def motion(config: Config, physics: Physics, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As the servos tell it, in whole ticks (2, samples)."""
+    """Positions and velocities as reported by the servos, rounded to ticks (2, samples)."""
     moved = respond(physics, resting(np.array(config.arm.rest_pose)), torque, RATE, Feedback.none(2))
     return np.round(moved.position / STEP) * STEP, np.round(moved.velocity / TICK) * TICK
 
@@ -41,7 +41,7 @@ def motion(config: Config, physics: Physics, torque: np.ndarray) -> tuple[np.nda
 def seen_after(
     watch: ModelWatch, config: Config, torque: np.ndarray, position: np.ndarray, velocity: np.ndarray
 ) -> float:
-    """When it stops [s], infinite where it does not."""
+    """Time of the stop [s]; infinite if there is none."""
     constants = [joint.torque_per_goal for joint in config.joints]
     for index in range(torque.shape[1]):
         goal = tuple(torque[:, index] / constants)
@@ -57,7 +57,7 @@ def seen_after(
 
 
 def fastest(velocity: np.ndarray, since: float) -> int:
-    """The sample within a second of `since` [s] at which the first joint is fastest."""
+    """Index of the sample with the highest speed of the first joint within a second from `since` [s]."""
     first = round(since * RATE)
     return first + int(np.argmax(np.abs(velocity[0, first : first + round(RATE)])))
 
@@ -72,7 +72,7 @@ def test_arms_of_the_prior_pass_and_what_is_not_their_motion_does_not(config: Co
     torque = waves(6.0, (0.5, 0.25), arm)
     position, velocity = motion(config, physics, torque)
     assert seen_after(ModelWatch(config, planned(config, torque)), config, torque, position, velocity) == math.inf
-    # From a moment on both readings of both joints stand still, as if everything were held.
+    # From some moment on, the readings of both joints freeze, as if everything were blocked.
     at = fastest(velocity, 3.0)
     held, still = position.copy(), velocity.copy()
     held[:, at:] = held[:, at - 1 : at]
@@ -82,7 +82,7 @@ def test_arms_of_the_prior_pass_and_what_is_not_their_motion_does_not(config: Co
 
 
 def test_torque_that_reaches_the_arm_no_more(config: Config) -> None:
-    """Though nothing in the replies says so; an arm that these torques hardly move cannot tell."""
+    """Lost torque is detected from the motion alone, except on arms that these torques hardly move."""
     seen = 0
     for arm in range(6):
         physics = prior_ensemble(config, 8, seed=7).physics[arm]
@@ -114,7 +114,7 @@ def test_a_lost_reply_and_a_stall_begin_anew(config: Config) -> None:
     physics = prior_ensemble(config, 8, seed=7).physics[0]
     torque = waves(4.0, (0.5, 0.25), 0)
     position, velocity = motion(config, physics, torque)
-    # Two seconds are missing, and some replies before: the arm is somewhere else, at another speed.
+    # Two seconds and some earlier replies are missing: the arm is elsewhere, at another speed.
     constants = [joint.torque_per_goal for joint in config.joints]
     watch = ModelWatch(config, planned(config, torque))
     for index in (*range(400), *range(1200, 1600)):

@@ -1,4 +1,4 @@
-"""Real-time measures: whatever was given, everything is as before afterwards."""
+"""Real-time settings: whatever was granted, everything is restored afterwards."""
 
 import gc
 import os
@@ -43,5 +43,5 @@ def test_what_is_not_permitted_is_said_and_how_to_get_it(monkeypatch: pytest.Mon
     with real_time() as granted:
         fifo, core, *_ = granted
         assert str(fifo) == "real-time scheduling: no (Operation not permitted; needs `ulimit -r 20` or root)"
-        # Without it a pinned loop would wait for whoever holds its core.
+        # Without SCHED_FIFO, a pinned loop would have to wait for other tasks on its core.
         assert not core.given

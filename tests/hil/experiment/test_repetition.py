@@ -1,4 +1,4 @@
-"""Periods compared sample by sample, against the comparison of whole periods that the estimate makes."""
+"""The comparison of periods sample by sample gives the same result as comparing whole periods."""
 
 import math
 from itertools import pairwise
@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.estimation.settled_period import settling_difference
-from hil.experiment.repetition import Repetition
+from hil.experiment.repetition import FLOOR_RAD, LASTING_S, TIMES, Repetition
+
+INTERVAL = 0.01
 
 
 def played(repetition: Repetition, period: np.ndarray) -> None:
@@ -30,7 +32,7 @@ def test_the_same_as_of_whole_periods(seed: int, samples: int, joints: int, lost
     random = np.random.default_rng(seed)
     periods = -1.5 + moved * random.standard_normal((3, joints, samples))
     periods[random.random(periods.shape) < lost] = np.nan
-    repetition = Repetition(samples, joints)
+    repetition = Repetition(samples, joints, INTERVAL)
     played(repetition, periods[0])
     for former, latest in pairwise(periods):
         played(repetition, latest)
@@ -42,7 +44,7 @@ def test_the_same_as_of_whole_periods(seed: int, samples: int, joints: int, lost
 
 
 def test_how_far_each_joint_moved() -> None:
-    repetition = Repetition(4, 3)
+    repetition = Repetition(4, 3, INTERVAL)
     nan = math.nan
     played(repetition, np.array([[1.0, 3.0, nan, 2.0], [nan, nan, nan, nan], [0.5, 0.5, 0.5, 0.5]]))
     first, second, third = repetition.moved
@@ -50,9 +52,78 @@ def test_how_far_each_joint_moved() -> None:
 
 
 def test_a_shorter_period_after_a_longer_one() -> None:
-    repetition = Repetition(6, 1)
+    repetition = Repetition(6, 1, INTERVAL)
     played(repetition, np.arange(6.0)[None])
     short = np.array([[1.0, 2.0, 1.0, 5.0]])
     played(repetition, short)
     played(repetition, short)
     assert repetition.difference == 0.0
+
+
+def unlike_at(periods: np.ndarray, interval: float = INTERVAL) -> tuple[int, int, int] | None:
+    """Period, sample and joint at which the motion first counts as not repeated; periods (periods, joints, samples)."""
+    repetition = Repetition(periods.shape[2], periods.shape[1], interval)
+    for number, period in enumerate(periods):
+        repetition.begin(period.shape[1])
+        for index, sample in enumerate(period.T.tolist()):
+            repetition.add(index, sample)
+            if (joint := repetition.unlike) is not None:
+                return number, index, joint
+    return None
+
+
+def drifting(seed: int, rms: float, samples: int = 200) -> np.ndarray:
+    """Four periods of two joints that differ from one another by random deviations of this RMS [rad]."""
+    random = np.random.default_rng(seed)
+    motion = np.sin(np.linspace(0, 2 * np.pi, samples)) * np.array([[1.0], [0.4]])
+    return motion + rms / math.sqrt(2) * random.standard_normal((4, 2, samples))
+
+
+@pytest.mark.parametrize("rms", [0.0, 1e-3, 0.1])
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_and_drift_repeat_the_motion(seed: int, rms: float) -> None:
+    assert unlike_at(drifting(seed, rms)) is None
+
+
+@pytest.mark.parametrize("rms", [0.0, 0.01])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_joint_that_is_elsewhere_than_a_period_before_is_seen_after_the_shortest_time(joint: int, rms: float) -> None:
+    periods = drifting(1, rms)
+    deviation = TIMES * rms * 1.4 + 1.01 * FLOOR_RAD
+    periods[2, joint, 50:] += deviation
+    number, index, seen = unlike_at(periods) or (0, 0, -1)
+    assert (number, seen) == (2, joint) and index == 50 + round(LASTING_S / INTERVAL) - 1
+    periods = drifting(1, rms)
+    periods[2, joint, 50:52] -= deviation  # too short
+    assert unlike_at(periods) is None
+
+
+def test_slow_rates_take_two_samples_and_missing_ones_say_nothing() -> None:
+    periods = drifting(2, 0.0)
+    periods[2, 0, 50] += 1.0
+    assert unlike_at(periods, 0.05) is None
+    periods[2, 0, 51] = math.nan
+    periods[2, 0, 52] -= 1.0
+    assert unlike_at(periods, 0.05) == (2, 52, 0)
+
+
+def test_the_second_period_may_differ_from_the_first() -> None:
+    periods = drifting(3, 0.0)
+    periods[0] += 1.0
+    assert unlike_at(periods) is None
+    assert unlike_at(periods + np.array([0.0, 0.0, 11.0, 0.0])[:, None, None]) is not None
+
+
+def test_another_torque_is_not_compared_with_the_one_before() -> None:
+    time = np.arange(200) * INTERVAL
+    first, second = np.sin(time)[None], 2.0 + np.cos(3.0 * time)[None]
+    repetition = Repetition(200, 1, INTERVAL)
+    for period in (first, first, first):
+        played(repetition, period)
+    assert repetition.unlike is None
+    repetition.forget()
+    played(repetition, second)
+    assert repetition.unlike is None
+    played(repetition, second)
+    played(repetition, first)
+    assert repetition.unlike == 0

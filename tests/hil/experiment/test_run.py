@@ -1,6 +1,4 @@
-"""The experiment on the fake bus. Whatever happens, the emulated servos themselves must end without torque, or stopped
-by their watchdog, and what was recorded must be readable.
-"""
+"""The experiment on the fake bus: the servos must always end without torque, and the recording must be readable."""
 
 import os
 import signal
@@ -29,7 +27,7 @@ SERVO_1 = 'id = 1\nmodel = "XM430-W350"\nzero_ticks = 3072\n'
 
 
 def ignore(_: Progress) -> None:
-    """Watch nothing."""
+    """Ignore progress reports."""
 
 
 def run(config: Config, folder: Path, watch: Watch = ignore) -> RunFolder:
@@ -39,7 +37,7 @@ def run(config: Config, folder: Path, watch: Watch = ignore) -> RunFolder:
 
 
 def at_sample(count: int, action: Callable[[], Any]) -> Watch:
-    """A watch that acts once, when `count` samples have been taken."""
+    """A callback that calls `action` once, after `count` samples."""
     done: list[bool] = []
 
     def watch(progress: Progress) -> None:
@@ -184,7 +182,7 @@ def test_a_motion_that_never_settles_is_said(arm: Arm, tmp_path: Path, ports: li
     assert_no_torque(ports[0])
 
 
-# Before torque is ever on
+# Before torque is switched on
 
 
 @pytest.mark.parametrize(
@@ -212,7 +210,7 @@ def test_a_servo_in_another_mode_is_brought_into_current_mode_and_back(
 ) -> None:
     seen: list[int] = []
     look = at_sample(10, lambda: seen.extend(servo.operating_mode for servo in ports[0].bus.servos.values()))
-    run(arm(), tmp_path / "run", look)  # the fake, as servos from the factory, starts in position mode
+    run(arm(), tmp_path / "run", look)  # like servos from the factory, the fake starts in position mode
     assert seen == [0, 0]
     assert [servo.operating_mode for servo in ports[0].bus.servos.values()] == [3, 3]
 

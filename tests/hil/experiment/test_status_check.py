@@ -1,4 +1,4 @@
-"""What servos tell of themselves: each thing that can be wrong, and what is nothing out of the ordinary."""
+"""Status registers of the servos: every fault is detected, and normal values are accepted."""
 
 from collections.abc import Callable
 
@@ -46,11 +46,11 @@ def test_a_goal_may_get_lost_once_but_not_twice_in_a_row(arm: Arm) -> None:
     assert check.look(0, FINE, 0.1, 1.0) is None
     assert check.look(0, lost, 0.1, 1.0) is None
     wrong = check.look(0, lost, 0.1, 1.0)
-    assert wrong is not None and wrong[0] is Cause.GOALS_LOST and "holds 0.050 A where 0.100 A was sent" in wrong[1]
+    assert wrong is not None and wrong[0] is Cause.GOALS_LOST and "holds 0.050 A but 0.100 A was sent" in wrong[1]
 
 
 def readings(check: StatusCheck, clock: Callable[[float], float], until: float) -> tuple[float, str] | None:
-    """Every 35 ms; when it is seen that replies are not of now."""
+    """Readings every 35 ms; returns when stale replies are detected, and the message."""
     for index in range(int(until / 0.035)):
         now = 0.035 * index
         wrong = check.look_at_clock(0, clock(now), now)

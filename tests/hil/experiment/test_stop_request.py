@@ -1,4 +1,4 @@
-"""Requests to stop: noted while servos may have torque, remembered until the outermost block is left."""
+"""Stop requests are deferred while servos may have torque, and kept until the outermost block is left."""
 
 import os
 import signal
@@ -84,7 +84,7 @@ def test_in_another_thread_there_is_never_a_request() -> None:
 def test_a_signal_while_torque_is_being_cut_is_not_lost(
     arm: Arm, tmp_path: Path, ports: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A pilot's next step would have moved the arm."""
+    """Otherwise, the next step of a pilot would move the arm."""
     config = arm()
     cut = ServoBus.torque_off
 

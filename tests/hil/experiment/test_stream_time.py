@@ -1,4 +1,4 @@
-"""The stream and time: a stall is counted to the period, and an error carries what was recorded last."""
+"""Timing of the stream: stalled periods are counted exactly, and an error carries the last samples."""
 
 import json
 from collections.abc import Callable
@@ -44,7 +44,7 @@ def test_a_stall_costs_the_periods_it_covers_and_no_burst_follows(arm: Arm, tmp_
     kept = timing(samples, 400.0)
     assert kept.missed_ticks == 9
     assert kept.lost_replies == 0
-    # The exchange before the stall took a third of a period; what came after it stayed on the old deadlines.
+    # The exchange before the stall took a third of a period; later ones stay on the original deadlines.
     sent = samples[samples["time_after_read"] > samples["time_before_write"]]
     assert np.diff(sent["time_before_write"]).min() > 0.15 / 400
     assert np.allclose(np.diff(samples["deadline"]), 1 / 400)

@@ -1,4 +1,4 @@
-"""URDF and MJCF, read by the engines that are made for them: the same torques, and nothing dropped in silence."""
+"""Physics engines read the exported URDF and MJCF: the torques agree, and nothing is dropped silently."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ def test_mujoco_has_the_same_inverse_dynamics(identified: Path, name: str) -> No
     model, length = arms(load_model(identified))[name]
     path, _ = write(model, identified, "mjcf", length)
     engine = mujoco.MjModel.from_xml_path(str(path))
-    # Dry friction is a constraint in MuJoCo, which acts on what moves next; limits are one too.
+    # In MuJoCo, dry friction and limits are constraints, which affect the next state.
     engine.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     data = mujoco.MjData(engine)
     q, dq, ddq = motions(len(model.joints))
@@ -103,7 +103,7 @@ def test_pinocchio_has_the_same_inverse_dynamics(identified: Path, name: str) ->
     data = engine.createData()
     q, dq, ddq = motions(len(model.joints))
     ours = model.rigid_body_torque(q, dq, ddq)
-    # URDF cannot represent the armature: it is named, and whoever uses the file adds it.
+    # URDF cannot represent the armature: it is listed, and the user has to add it.
     ours[:, -1] -= model.values.get("armature_2", 0.0) * ddq[:, -1]
     theirs = np.array([pinocchio.rnea(engine, data, *row) for row in zip(q, dq, ddq, strict=True)])
     assert np.abs(theirs - ours).max() < 1e-6 * np.abs(ours).max()

@@ -1,4 +1,4 @@
-"""Arms drawn from the error bars: as spread as stated, physical, loadable, the same for the same seed."""
+"""Arms drawn from the posterior: correct spread, physical, loadable, and reproducible by seed."""
 
 import math
 from dataclasses import replace
@@ -20,14 +20,14 @@ def source(identified_once: Path) -> Source:
 
 
 def wider(source: Source, factor: float) -> Source:
-    """The same result with error bars this much wider."""
+    """The same result with its error bars scaled by this factor."""
     matrix = source.result.covariance.array() * factor**2
     covariance = Covariance(source.result.covariance.names, tuple(map(tuple, matrix.tolist())))
     return replace(source, result=replace(source.result, covariance=covariance))
 
 
 def test_the_spread_is_the_covariance(source: Source) -> None:
-    source = wider(source, 0.1)  # a short experiment's own error bars reach arms that cannot be
+    source = wider(source, 0.1)  # the error bars of a short experiment include impossible arms
     drawn = draw_arms(source, 100, torque_constants=False)
     assert drawn.redrawn == 0
     stated = source.result.covariance.array()

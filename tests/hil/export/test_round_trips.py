@@ -1,4 +1,4 @@
-"""What was exported reads back the same, to the last bit."""
+"""Exported files read back without loss."""
 
 import csv
 import json

@@ -1,5 +1,6 @@
-"""What a run teaches of the arm, moved or not; gains for arms without a stable rest; when to give up."""
+"""Belief updates from runs with and without motion, stabiliser gains, and when the search gives up."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from hil.pilot.seen import Seen
 from hil.plan.plan import make_plan
 from hil.plan.stabiliser import feedback_of
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 
@@ -26,7 +28,7 @@ def config() -> Config:
 
 
 def commands(config: Config, peak: tuple[float, float]) -> np.ndarray:
-    """Ramp and one period of a pilot (joints, samples) [N m]."""
+    """Torque of the ramp and one period of a pilot (joints, samples) [N m]."""
     pilot = with_torque(pilot_config(config), np.array(peak))
     segment = make_plan(pilot).segments[0]
     constants = np.array([joint.torque_per_goal for joint in config.joints])
@@ -86,18 +88,30 @@ def test_arms_that_do_not_come_back_are_given_gains_that_hold_them(
     assert np.mean(np.array(away) < 0.5) > 0.95
 
 
+def test_a_joint_that_friction_holds_against_its_weight_gets_a_spring_alone(config: Config) -> None:
+    belief = prior_belief(config, 48)
+    assert with_stabiliser(config, belief) is config
+    rough = dataclasses.replace(belief, coordinates=belief.coordinates.copy())
+    weight = median(belief, "gravity_2")
+    rough.coordinates[:, belief.names.index("coulomb_2")] = np.log(2.0 * weight)
+    held = with_stabiliser(config, rough)
+    assert held.stabiliser is not None
+    assert held.stabiliser.stiffness[0] == held.stabiliser.damping[0] == 0.0
+    assert held.stabiliser.stiffness[1] > weight
+    kept = with_stabiliser(config, belief, np.array([False, True])).stabiliser
+    assert kept is not None and kept.stiffness[0] == 0.0 < kept.stiffness[1], "what had a spring keeps it"
+
+
 def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tmp_path: Path) -> None:
     text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
     path = tmp_path / "held.toml"
-    for old, new in (("coulomb = 0.050", "coulomb = 9.0"), ("current_limit = 0.8", "current_limit = 0.1")):
-        assert old in text, old
-        text = text.replace(old, new, 1)
+    text = replaced(text, ("coulomb = 0.050", "coulomb = 9.0"), ("current_limit = 0.8", "current_limit = 0.1"))
     path.write_text(text, encoding="utf-8")
     held = load_config(path)
     said: list[str] = []
     with pytest.raises(
-        ExperimentError, match=r"Elbow did not move by 12 encoder steps\. Tried: Pilot .*; Pilot 2 "
+        ExperimentError, match=r"Elbow did not move by 26 encoder steps\. Tried: Pilot .*; Pilot 2 "
     ) as error:
         identify_in_steps(held, RunFolder.create(tmp_path / "run", held), path, lambda _: None, said.append)
     assert "current limits allow" in str(error.value) and "stronger servo" in str(error.value)
-    assert any("did not move: friction exceeds this torque" in line for line in said)
+    assert any("did not move: friction is larger than this torque" in line for line in said)

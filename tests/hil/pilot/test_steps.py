@@ -1,4 +1,4 @@
-"""Pilot, then full, from joint limits and link lengths only; and arms that need a stabiliser."""
+"""Pilot and full run from joint limits and link lengths only, and arms that need a stabiliser."""
 
 from io import StringIO
 from pathlib import Path
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.dry_run import worst_relative_std
 from hil.cli.views.result_table import print_result
 from hil.config.schema import load_config
 from hil.estimation.settled_estimate import estimate_run
@@ -18,6 +17,7 @@ from hil.report.page import make_page
 from hil.report.run_data import RunData
 from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
+from tests.support.dry_runs import worst_relative_std
 from tests.support.paths import CONFIGS
 
 
@@ -32,21 +32,14 @@ def in_steps(tmp_path_factory: pytest.TempPathFactory) -> tuple[SettledResult, P
 
 
 def used_range(result: SettledResult) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Share of each joint's position limits that the full run used (joints,)."""
+    """Fraction of each joint's position range that the full run used (joints,)."""
     low, high = np.array(result.steps[-1].seen)[:2] if result.steps else np.zeros((2, 2))
     limits = [joint.position_limit for joint in load_config(CONFIGS / "first_time.toml").joints]
     return np.asarray((high - low) / np.ptp(limits, axis=1))
 
 
-def test_the_full_run_uses_most_of_the_shoulders_room(in_steps: Any) -> None:
-    assert used_range(in_steps[0])[0] >= 0.7
-
-
-@pytest.mark.xfail(
-    strict=True, reason="The elbow uses 66 % of its range: the search's belief leaves arms that go farther"
-)
-def test_the_full_run_uses_most_of_the_elbows_room(in_steps: Any) -> None:
-    assert used_range(in_steps[0])[1] >= 0.7
+def test_the_full_run_uses_most_of_the_room(in_steps: Any) -> None:
+    assert (used_range(in_steps[0]) >= 0.7).all()
 
 
 def test_the_full_run_beats_the_pilot(in_steps: Any) -> None:

@@ -1,4 +1,4 @@
-"""The page in a real browser, without a network: opens fast, no errors, no requests, figures drawn, hover and zoom."""
+"""The report in a real browser without a network: opens fast, no errors or requests; figures and tooltips work."""
 
 import json
 import re
@@ -19,7 +19,7 @@ MOST_SECONDS = 2.0
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
 
-# Put before everything else, it notes whatever goes wrong; after the page's own script it plays a visitor.
+# Inserted at the beginning, it records all errors; after the page's own script, it simulates a visitor.
 _BEFORE = """<script>
 window.seen = { errors: [] };
 addEventListener("error", (event) => seen.errors.push(String(event.message || event.target.tagName)), true);

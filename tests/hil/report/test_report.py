@@ -1,4 +1,4 @@
-"""The report's page: what it says and holds, its size and time, and runs that are not whole."""
+"""The report: content, size, time, and incomplete runs."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""result.json and the frozen results are the same thing: nothing is lost either way, and damage is named."""
+"""Conversion between result.json and the frozen results is lossless, and damage is reported."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ from hil.results.parts import Covariance, ModelChoice, Quantity, ShootingFit, Ti
 from hil.results.result import SettledResult, ShootingResult, result_from_json
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
-ERRORS = st.floats(min_value=0.0, allow_nan=False)  # infinite where nothing was seen
+ERRORS = st.floats(min_value=0.0, allow_nan=False)  # infinite if there is no information
 
 
 @st.composite
@@ -106,6 +106,6 @@ def test_a_pair_needs_two_entries() -> None:
         limits: tuple[float, float]
 
     assert from_json(Range, {"limits": [1, 2.5]}) == Range((1.0, 2.5))
-    with pytest.raises(FormError, match="has 3 entries in place of 2 as 'limits'"):
+    with pytest.raises(FormError, match="has 3 entries instead of 2 as 'limits'"):
         from_json(Range, {"limits": [1, 2, 3]})
     assert to_json(Range((1.0, 2.0))) == {"limits": [1.0, 2.0]}

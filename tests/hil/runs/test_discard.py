@@ -1,4 +1,4 @@
-"""A start that fails before the first sample leaves nothing in the way of the next; what was recorded stays."""
+"""An experiment that fails before the first sample leaves no folder; a recording is always kept."""
 
 from collections.abc import Callable
 from pathlib import Path

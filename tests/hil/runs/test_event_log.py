@@ -1,4 +1,4 @@
-"""Events and whoever watches, handed to threads: nothing that blocks there holds up the program."""
+"""Events and callbacks run in threads, so that blocking ones cannot delay the program."""
 
 import json
 import os
@@ -89,7 +89,7 @@ def test_events_are_on_file_when_the_log_is_left(tmp_path: Path) -> None:
 
 def test_an_events_file_that_blocks_holds_up_nobody_and_the_last_line_is_on_file(tmp_path: Path) -> None:
     run = make_run(tmp_path)
-    os.mkfifo(run.path / "events.jsonl")  # nobody reads it: opening it blocks without end
+    os.mkfifo(run.path / "events.jsonl")  # without a reader, opening it blocks indefinitely
     with EventLog(run) as log:
         started = time.process_time()
         for number in range(2000):
@@ -101,7 +101,7 @@ def test_an_events_file_that_blocks_holds_up_nobody_and_the_last_line_is_on_file
 
 def test_a_full_disk_is_no_reason_to_stop(tmp_path: Path, monkeypatch: object) -> None:
     run = make_run(tmp_path)
-    (run.path / "events.jsonl").mkdir()  # nothing can be appended to it
+    (run.path / "events.jsonl").mkdir()  # a folder cannot be appended to
     with EventLog(run) as log:
         log.note(0.0, "torque is off")
     assert log.failure is not None

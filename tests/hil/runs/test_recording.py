@@ -1,4 +1,4 @@
-"""A recording on file: what killed, stopped and full-disk runs leave, and that its end needs no more room."""
+"""Recordings of killed runs, stopped runs, and runs on a full disk; closing needs no further disk space."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""The timing of a recording whose every lateness is known."""
+"""Timing figures of a recording with known lateness."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What servos are set to, before and after: every end of a run, a kill and the next start; other people's servos."""
+"""Servo settings are restored after every kind of ending, including a kill; other servos are left alone."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, 
 from hil.errors import HilError
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
-from hil.fakes.servo.servo import Servo
+from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.servo_session import SETTINGS_NAME, servo_session
@@ -28,12 +28,12 @@ from tests.support.command_line import hil
 Arm = Callable[..., Config]
 SERVO_2 = 'id = 2\nmodel = "XM430-W350"\nzero_ticks = 2048\n'
 FREE = {"Goal Position", "Realtime Tick"}
-"""A servo writes these itself."""
+"""Registers that a servo changes by itself."""
 
 
 @dataclass
 class Bench:
-    """One fake arm that stays where it is, whoever opens its port; EEPROM writes of every servo, by register."""
+    """One fake arm that keeps its state whenever a port is opened; records EEPROM writes of every servo."""
 
     port: Any = None
     before: dict[int, dict[str, int]] = field(default_factory=dict)
@@ -41,11 +41,11 @@ class Bench:
     prepare: Callable[[Any], None] = lambda port: None
 
     @property
-    def servos(self) -> dict[int, Servo]:
+    def servos(self) -> dict[int, EmulatedServo]:
         return dict(self.port.bus.servos)
 
     def changed(self) -> list[str]:
-        """Registers that are not as they were when the port was opened first."""
+        """Registers that differ from when the port was first opened."""
         return [
             f"{name} of {servo_id}: {value} -> {self.servos[servo_id].value(name)}"
             for servo_id, registers in self.before.items()
@@ -64,7 +64,7 @@ class Bench:
             self.eeprom[servo_id] = []
             self._count(servo, self.eeprom[servo_id])
 
-    def _count(self, servo: Servo, written: list[str]) -> None:
+    def _count(self, servo: EmulatedServo, written: list[str]) -> None:
         store = servo.memory.store
 
         def counting(register: Any, value: int) -> None:
@@ -77,7 +77,7 @@ class Bench:
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    """Every port opened is the same arm's."""
+    """Every opened port leads to the same arm."""
     made = Bench()
     opened = serial.serial_for_url
 
@@ -140,7 +140,7 @@ def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_star
 
 
 class _Gone(BaseException):
-    """The program is no more."""
+    """Simulates the end of the program."""
 
 
 def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(
@@ -221,7 +221,7 @@ def test_a_check_leaves_every_register_as_it_was(arm_file: Any, bench: Bench, mo
     def set_up(port: Any) -> None:
         for servo in port.bus.servos.values():
             servo.write(11, bytes((mode,)))
-            servo.write(100, (300).to_bytes(2, "little"))  # Goal PWM, and a gain of the user's
+            servo.write(100, (300).to_bytes(2, "little"))  # Goal PWM, and a gain set by the user
             servo.write(84, (777).to_bytes(2, "little"))
             if "Goal Current" in servo.memory:
                 servo.write(102, (55).to_bytes(2, "little"))
@@ -246,7 +246,7 @@ def test_a_check_sees_that_goals_are_dropped(arm: Arm, bench: Bench, monkeypatch
 
 
 def _drop(_body: bytes, _now: float) -> None:
-    """A Sync Write that never arrives."""
+    """Drop a Sync Write."""
 
 
 @pytest.mark.parametrize(
@@ -285,7 +285,7 @@ def test_no_supply_is_a_reason_not_to_start(arm: Arm, bench: Bench) -> None:
 
 def hold(port: Any) -> None:
     for servo in port.bus.servos.values():
-        servo.write(64, b"\x01")  # in position mode, as the fake starts
+        servo.write(64, b"\x01")  # in position mode, the fake's initial mode
 
 
 def test_a_held_arm_is_refused_and_stays_held(arm: Arm, tmp_path: Path, bench: Bench) -> None:
@@ -345,7 +345,7 @@ def test_a_servo_of_somebody_else_keeps_its_torque_and_is_told_of(
 
 
 def test_a_killed_process_on_a_pty_is_put_back(arm_file: Any, tmp_path: Path) -> None:
-    """Two programs, a real SIGKILL between them, and the fake arm in a third."""
+    """Two programs, a real SIGKILL between them, and the fake arm in a third process."""
     path = arm_file()
     link = tmp_path / "arm"
     served = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""scan, check and setup on the fake bus: what they find, what they change, and what they leave alone."""
+"""scan, check and setup on the fake bus: findings, changes, and what must stay unchanged."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -28,7 +28,7 @@ SERVO_2 = 'id = 2\nmodel = "XM430-W350"\nzero_ticks = 2048\n'
 
 @pytest.fixture
 def port(arm_file: ArmFile) -> Iterator[Callable[..., Port]]:
-    """Opens the port of the fake arm with changes to its TOML; `._serial.bus` are its servos."""
+    """Opens the port of the fake arm with changes to its TOML; `._serial.bus` has its servos."""
     opened = []
     fakes.register()
 
@@ -144,7 +144,7 @@ def test_a_rate_that_the_bus_cannot_hold_is_a_stop_with_the_rate_that_it_can(arm
 
 
 def test_an_arm_that_needs_two_writes_is_found(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bus that hears only the first packet of a write."""
+    """The bus receives only the first packet of each write."""
     write = FakeBus.write
     monkeypatch.setattr(FakeBus, "write", lambda bus, data: write(bus, data[: 7 + (data[5] | data[6] << 8)]))
     finding = look(arm())["bus", "rate"]
@@ -254,7 +254,7 @@ def test_setup_command_asks(arm_file: ArmFile) -> None:
 @pytest.mark.parametrize("kind", ["lost_reply", "corrupted_reply", "lost_instruction", "truncated_reply"])
 @pytest.mark.parametrize("place", range(14))
 def test_one_lost_packet_loses_no_servo(port: Callable[..., Port], kind: str, place: int) -> None:
-    """Whatever packet of the whole work it is; the status of the change itself is the one that used to hurt."""
+    """Any single packet may be lost, including the status reply to the change itself."""
     opened = port()
     servo = open_servo(opened, 2)
     bus = opened._serial.bus

@@ -1,4 +1,4 @@
-"""The pieces of a study without workers: draws, keys, datasets, figures, fleets, what is refused beforehand."""
+"""Parts of a study without workers: draws, keys, datasets, figures, fleets, and checks before the start."""
 
 import math
 from pathlib import Path
@@ -63,7 +63,7 @@ def test_a_run_draws_the_same_whatever_was_drawn_before(tmp_path: Path) -> None:
         ("[study]\ntask = 'identify'\n", "needs config"),
         (EMPTY + "[vary]\na = {uniform = [2.0, 1.0]}\n", "must not be larger"),
         (EMPTY + "[vary]\na = {uniform = [1.0, 2.0]}\n", "runs is missing"),
-        (EMPTY + "[vary]\na = {uniform = [1.0, 2.0], choice = [1]}\n", "give one of"),
+        (EMPTY + "[vary]\na = {uniform = [1.0, 2.0], choice = [1]}\n", "give exactly one of"),
         (EMPTY + "[vary]\na = []\n", "empty list"),
         (EMPTY + "runs = 0\n", "runs"),
         (EMPTY + "colour = 1\n", "colour"),
@@ -199,7 +199,7 @@ def test_the_arm_unlike_its_fleet_is_found_and_no_other() -> None:
     friction = 0.05 * (1 + 0.05 * rng.standard_normal(20))
     friction[7] = 0.08
     poor = rng.standard_normal(20) * 0.002 + 0.3
-    poor[3] = 0.4  # far off, but with a standard error that says so
+    poor[3] = 0.4  # far off, but with a correspondingly large standard error
     std = np.full(20, 1e-4)
     std[3] = 0.1
     table = pa.table(

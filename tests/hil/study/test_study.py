@@ -1,4 +1,4 @@
-"""A study from its file to its rows, on real workers: the same numbers whatever their number, failures as rows."""
+"""Complete studies on real workers: the results do not depend on their number, and failures become rows."""
 
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from hil.study.run import StudyProgress, run_study
 from hil.study.schema import EngineTable, load_study
 from hil.study.work import TIMINGS
 from tests.support.command_line import hil
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 STUDY = """
@@ -37,9 +38,7 @@ columns = ["parameters.*.value", "verdict.trust"]
 @pytest.fixture
 def study_file(tmp_path: Path) -> Path:
     text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
-    for old, new in (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]")):
-        assert old in text
-        text = text.replace(old, new)
+    text = replaced(text, ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
     (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
     path = tmp_path / "study.toml"
     path.write_text(STUDY, encoding="utf-8")
@@ -93,7 +92,7 @@ def test_the_command_makes_rows_and_a_page(
     study_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # A run whose arm passes its limits fails: a row, and not the end of the study.
+    # A run whose arm exceeds its limits becomes a failed row and does not end the study.
     text = STUDY.replace('"safety.max_missing" = [5, 5, 5, 1]', '"joints.0.velocity_limit" = [15.0, 0.5]')
     study_file.write_text(text.replace("runs = 4", "runs = 2"), encoding="utf-8")
     assert hil("study", study_file, "--out", "out", "--workers", "1") == 0

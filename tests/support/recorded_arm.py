@@ -1,4 +1,4 @@
-"""A fake arm's settled motion without its bus: positions as they are, to be given errors and rounded afterwards."""
+"""Settled motion of a fake arm without its bus: exact positions, to which errors and rounding can be added."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class Recorded:
     """One settled period."""
 
     torque: np.ndarray
-    """Commanded, of whole current steps (joints, samples) [N m]."""
+    """Commanded torque, rounded to current steps (joints, samples) [N m]."""
     position: np.ndarray
     """Exact angles (joints, samples) [rad]."""
     start: np.ndarray
@@ -47,7 +47,7 @@ class Recorded:
         return SettledPeriod(RATE, self.torque, position, COMMAND_TO_SAMPLE, steps)
 
     def rounded(self) -> SettledPeriod:
-        """As an encoder reads it."""
+        """The period as measured by an encoder."""
         return self.period(np.round(self.position / self.step) * self.step)
 
 
@@ -63,7 +63,7 @@ def wave(seed: int, peak: Sequence[float], period: float = PERIOD) -> Multisine:
 
 
 def record(arm: Arm, multisine: Multisine) -> Recorded:
-    """Play it: one period to settle, one kept."""
+    """Play the multisine: one period to settle, and one that is returned."""
     constant = np.array([drive.torque_constant for drive in arm.drives])[:, None]
     current = np.round(multisine.torque / constant / CURRENT_STEP) * CURRENT_STEP
     commands: list[Any] = current.T.tolist()

@@ -1,0 +1,119 @@
+"""What is done to the servos, to their motors and to the program itself, past the bytes."""
+
+import contextlib
+import os
+import resource
+import signal
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from benchmarks.fault_campaign.attack import ON_MOTORS, Attack, Kind
+from benchmarks.fault_campaign.witness import Witness
+from hil.fakes.servo.servo import EmulatedServo
+
+if TYPE_CHECKING:
+    from benchmarks.fault_campaign.middle import Middle
+
+Undo = Callable[[], None]
+
+_ELSEWHERE_ID = 200
+_SLOWEST_REPLY = 254  # Return Delay Time
+_ROOM_BYTES = 1 << 12  # a file may grow to this once the disk is full
+_WRAP_S = 32.768
+_SHORT_BOOT_S = 5e-3
+
+
+class Killed(BaseException):
+    """The program is gone: whatever it still tries on this port, nothing leaves it any more."""
+
+
+def prepare(attack: Attack, port: "Middle") -> None:
+    """Prepare the plant for attacks that must be set up before the program starts."""
+    if attack.kind in ON_MOTORS:
+        witness = port.bus.plant
+        assert isinstance(witness, Witness)
+        for joint, servo in enumerate(port.bus._servos):
+            if attack.concerns(servo.id):
+                witness.disturb(joint, attack)
+    elif attack.kind == Kind.CLOCK_WRAP:
+        for servo in port.bus._servos:
+            if attack.concerns(servo.id):
+                servo.present._booted_at -= _WRAP_S - attack.start % _WRAP_S
+
+
+def happen(attack: Attack, port: "Middle") -> list[Undo]:
+    """What happens at one moment; how to undo what the program is not to be blamed for."""
+    match attack.kind:
+        case Kind.SIGINT | Kind.SIGTERM | Kind.SIGHUP:
+            os.kill(os.getpid(), signal.Signals[attack.kind])
+        case Kind.KILLED:
+            port.dead = True
+            raise Killed
+        case Kind.STALL:
+            port.clock.wait_until(port.clock.now() + attack.amount)
+        case Kind.DISK_FULL:
+            return [_fill_disk()]
+        case _:
+            return [
+                undo
+                for servo in port.bus._servos
+                if attack.concerns(servo.id) and (undo := _touch(attack, servo, port.clock.now())) is not None
+            ]
+    return []
+
+
+def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
+    match attack.kind:
+        case Kind.TORQUE_TAKEN:
+            servo.write(64, b"\x00")
+        case Kind.WATCHDOG_TRIPPED if servo.torque_enabled:
+            servo.trip_watchdog()
+        case Kind.STRANGE_GOAL:
+            with contextlib.suppress(KeyError):
+                goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
+                servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
+        case Kind.WATCHDOG_OFF:
+            _change(servo, "Bus Watchdog", 0)
+        case Kind.WATCHDOG_LONG:
+            return _change(servo, "Bus Watchdog", 127, 0)
+        case Kind.LOWERED_LIMIT if "Current Limit" in servo.memory:
+            return _change(servo, "Current Limit", round(attack.amount * servo.value("Current Limit")))
+        case Kind.RAISED_LIMIT if "Current Limit" in servo.memory:
+            return _change(servo, "Current Limit", 2 * servo.value("Current Limit"))
+        case Kind.TURNED_ROUND:
+            undo = _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
+            servo.reboot(now, _SHORT_BOOT_S)  # with torque on it could not be written
+            return undo
+        case Kind.SLOW_REPLIES:
+            return _change(servo, "Return Delay Time", _SLOWEST_REPLY)
+        case Kind.NEW_ID:
+            return _change(servo, "ID", _ELSEWHERE_ID)
+        case Kind.NEW_BAUD:
+            return _change(servo, "Baud Rate", 1)
+        case Kind.CLOCK_RATE:
+            servo.present._clock_rate *= 1.0 + attack.amount
+    return None
+
+
+def _change(servo: EmulatedServo, register: str, value: int, before: int | None = None) -> Undo:
+    """Another program writes a register: the program under test is not to be blamed where that value stays.
+
+    before: what it then becomes again, by default what it was.
+    """
+    before = servo.value(register) if before is None else before
+    servo.memory.set(register, value)
+    servo._derive()
+
+    def undo() -> None:
+        if servo.value(register) == value:
+            servo.memory.set(register, before)
+            servo._derive()
+
+    return undo
+
+
+def _fill_disk() -> Undo:
+    """No file grows any more: a write that needs room fails, in this process alone."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (_ROOM_BYTES, hard))
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -1,0 +1,176 @@
+"""Cutting torque: every servo is told and polled, whatever fails and whoever interrupts.
+
+The order matters. Torque off is sent to all servos at once, which takes 0.3 ms. Then each servo is polled once; one
+that does not reply costs about 40 ms, so torque off is sent to all again afterwards: a servo may receive without being
+able to reply, and a packet may have been lost. If a servo still cannot be confirmed, the bus stays silent for as long
+as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives and does not obey, because it
+refuses or has another ID by now. For the same reason servos that did not answer the last exchange are not polled
+before. Then the remaining servos are tried again, patiently.
+
+Ctrl-C raises KeyboardInterrupt wherever the program happens to be, even between two servos while torque is being cut. A
+program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
+signals back while torque is cut.
+"""
+
+import signal
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from types import FrameType
+
+from hil.drivers.errors import DriverError
+from hil.drivers.joint import Joint
+from hil.drivers.packet import BROADCAST_ID, Instruction, encode
+from hil.drivers.port import Port
+from hil.drivers.servo import Servo
+from hil.drivers.servo_model import WATCHDOG_UNIT
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+_INTERRUPTS_BORNE = 5
+"""Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
+
+_TRIP_S = WATCHDOG_UNIT + 5e-3
+"""Delay with which a watchdog may act after its time is over, since it counts in steps [s]."""
+
+_REPEATS, _REPEAT_S = 2, 0.003
+"""Further torque-off packets and the time between them [s]: one that meets a reply on the wire is lost."""
+
+
+@dataclass(frozen=True)
+class TorqueOff:
+    """Result of an attempt to cut torque.
+
+    confirmed: joints whose servos were read back as off.
+    unconfirmed: the other joints, each with the reason.
+    unwatched: joints, of either group, whose servos have no Bus Watchdog.
+    """
+
+    confirmed: tuple[Joint, ...]
+    unconfirmed: tuple[tuple[Joint, str], ...]
+    unwatched: frozenset[Joint] = frozenset()
+
+    def __str__(self) -> str:
+        if not self.unconfirmed:
+            servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
+            return f"Torque is off on {servos}, read back."
+        names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
+        alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
+        if alone:
+            return (
+                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
+                "Watchdog and may keep its last current: cut the supply now."
+            )
+        return (
+            f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
+            "but cut the supply before you reach into the arm."
+        )
+
+
+def cut_torque(
+    port: Port,
+    servos: Mapping[Joint, Servo],
+    silent: Collection[Joint],
+    watchdog: float,
+    interrupts: list[BaseException],
+) -> tuple[tuple[Joint, ...], tuple[tuple[Joint, str], ...]]:
+    """Cut torque on all servos and read it back. Returns the confirmed ones, and the others with the reason.
+
+    silent: servos that did not answer the last exchange.
+    watchdog: the servos' Bus Watchdog [s].
+    interrupts: receives every interrupt that arrives meanwhile.
+    """
+    left = dict(servos)
+    why: dict[Joint, str] = {}
+
+    def confirm(asked: Mapping[Joint, Servo], attempts: int | None) -> None:
+        _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
+        for joint, servo in asked.items():
+            failed = _confirm(servo, attempts, interrupts)
+            if failed is None:
+                del left[joint]
+            else:
+                why[joint] = failed
+                _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
+
+    def wait(seconds: float) -> None:
+        _uninterrupted(lambda: port.clock.wait_until(port.clock.now() + seconds), interrupts)
+
+    confirm({joint: servo for joint, servo in servos.items() if joint not in silent}, attempts=1)
+    if left:
+        for _ in range(_REPEATS):
+            wait(_REPEAT_S)
+            _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
+        wait(watchdog + _TRIP_S)
+        confirm(dict(left), attempts=None)
+    return tuple(joint for joint in servos if joint not in left), tuple((joint, why[joint]) for joint in left)
+
+
+def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
+    """Send torque off to all servos in one packet; a failure shows when they are read back.
+
+    It is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be lost.
+    """
+    every = list(servos.values())
+    entry = every[0].table["Torque Enable"]
+    body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
+    body += b"".join(bytes((servo.id, 0)) for servo in every)
+    with suppress(DriverError):
+        port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
+
+
+def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> None:
+    """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more."""
+    for servo in servos.values():
+        _uninterrupted(lambda servo=servo: servo.write("Bus Watchdog", 0), interrupts)  # type: ignore[misc]
+
+
+def _confirm(servo: Servo, attempts: int | None, interrupts: list[BaseException]) -> str | None:
+    """Write torque off and read it back; return None, or the reason for the failure."""
+    return _uninterrupted(lambda: servo.write("Torque Enable", 0, attempts), interrupts)
+
+
+def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> str | None:
+    """Run `action`; return None, or the reason for the failure.
+
+    An interrupt is appended to `interrupts` and the action is run again.
+    """
+    for _ in range(_INTERRUPTS_BORNE):
+        try:
+            action()
+        except Exception as error:  # whatever fails on one servo, the next must still be tried
+            return str(error) or type(error).__name__
+        except BaseException as interrupt:
+            interrupts.append(interrupt)
+        else:
+            return None
+    return "The write was interrupted repeatedly."
+
+
+@contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Hold back SIGINT, SIGTERM and SIGHUP in the block; each kind that arrived is raised once afterwards.
+
+    Only the main thread receives signals; in any other thread this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if number not in came:
+            came.append(number)
+
+    # None is a handler that was not installed from Python: it could not be restored, so it is left alone.
+    former = {number: handler for number in _SIGNALS if (handler := signal.getsignal(number)) is not None}
+    try:
+        for number in former:
+            signal.signal(number, note)
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+        for late in came:
+            signal.raise_signal(late)

@@ -1,0 +1,228 @@
+"""Checks sample by sample whether the motion of an arm in space is consistent with what is known of it.
+
+Angles, velocities and commanded torques pass the same first-order low-pass, whose own slope gives accelerations. What
+then lacks of the commanded torque, `torque - Y(q, v, a) theta`, is compared with what the parameters' covariance, the
+velocities' rounding and a noise that is learnt leave open. Parameters are learnt from sample to sample (a Kalman filter
+on constants that drift slowly), so that what is allowed narrows as the arm moves. As in
+`hil.estimator.models.momentum_observer`, which planar arms use, an alarm takes `HOLD_S`, more than `TIMES` standard
+deviations, more than friction can hold while the joint stands, and more than a share of the largest planned torque.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.dynamics import places
+from hil.estimator.chain.kernels import accelerate, move, place, regress, room
+from hil.estimator.compiled import compiled
+
+FILTER_S = 0.02
+HOLD_S = 0.02
+TIMES = 4.0
+FLOOR_SHARE = 0.25
+"""Of the largest planned torque: less is never an alarm."""
+
+FIRST_NOISE_SHARE = 0.1
+STANDING = 0.05  # rad/s below which a joint may be held by its dry friction
+STATIC = 1.5  # static friction over Coulomb's
+VELOCITY_STD = 0.0135  # rad/s: a register's step and some noise
+NOISE_S = 1.0
+CLIPPED = 9.0
+DRIFT, LEAST_DRIFT = 0.03, 1e-3
+MOST_WEIGHT = 4.0
+WARM_S = 3 * FILTER_S
+LONGEST_GAP = 3.0
+# Rows of the memory of single numbers, per joint: filtered angle, velocity, torque; acceleration, noise variance, how
+# long it stood, time of alarm, samples of it, lacking torque. Then of all: time since the last lesson, age.
+ANGLE, VELOCITY, TORQUE, SLOPE, NOISE, STANDS, HELD, SAMPLES, LACKING, TIMES_OF_ALL = range(10)
+
+
+class ChainObserver:
+    """mean: base parameters, then viscous and dry friction and offsets (base + 3 joints,) [SI]; covariance of them.
+
+    largest: planned torque of each joint (joints,) [N m]. interval: from one sample to the next [s].
+    """
+
+    def __init__(self, base: BaseParameters, mean: Array, covariance: Array, largest: Array, interval: float) -> None:
+        n = base.chain.joints
+        count = base.count + 3 * n
+        if mean.shape != (count,) or covariance.shape != (count, count) or largest.shape != (n,):
+            raise ValueError(f"{mean.shape}, {covariance.shape} and {largest.shape} for {count} parameters, {n} joints")
+        self._theta, self._covariance = np.array(mean), np.array(covariance)
+        self._memory = np.zeros((10, max(n, 2)))
+        self._first = np.array((FIRST_NOISE_SHARE * largest) ** 2)
+        self._memory[NOISE, :n] = self._first
+        drift = LEAST_DRIFT**2 * np.diag(covariance)
+        self._constants = FLOOR_SHARE * largest, (0.01 * largest) ** 2, drift, interval
+        self._chain = base.chain.arrays, places(n, base.columns), base.count
+        self._work = room(n), np.zeros((n, base.count + 1)), np.zeros(count), np.zeros(count), np.zeros((n, 10))
+        self._joints = n
+        nothing = np.zeros(n)
+        self.observe(nothing, nothing, nothing, math.inf, False)  # compiled, and begun anew
+        self.observe(nothing, nothing, nothing, interval, False)
+        self.observe(nothing, nothing, nothing, math.inf, False)
+
+    def observe(self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: bool) -> int:
+        """One sample: angles [rad], velocities [rad/s], torques commanded since the previous sample [N m], the time
+        since then [s], and whether nothing but its motors holds the arm. Returns the joint (from 0) whose motion no arm
+        explains, -1 for none."""
+        return _observe(
+            *(self._memory, self._theta, self._covariance, self._constants, self._chain, self._work),
+            *(np.asarray(each, dtype=np.float64) for each in (position, velocity, torque)),
+            *(seconds, is_free),
+        )
+
+    @property
+    def lacking(self) -> list[float]:
+        """Latest torque per joint that is missing from the commanded one to explain the motion (joints,) [N m]."""
+        return [float(value) for value in self._memory[LACKING, : self._joints]]
+
+    @property
+    def parameters(self) -> Array:
+        """What has been learnt so far."""
+        return self._theta.copy()
+
+
+def _observe_loop(  # noqa: PLR0912, PLR0915
+    memory: Any,
+    theta: Any,
+    covariance: Any,
+    constants: Any,
+    chain: Any,
+    work: Any,
+    q: Any,
+    v: Any,
+    torque: Any,
+    dt: float,
+    is_free: bool,
+) -> int:
+    floor, least_noise, drift, interval = constants
+    arrays, column, base = chain
+    rooms, Y, row, gain, _ = work
+    n, count = q.size, theta.size
+    if dt > LONGEST_GAP * interval:
+        for j in range(n):
+            memory[ANGLE, j], memory[VELOCITY, j], memory[TORQUE, j] = q[j], v[j], torque[j]
+            memory[SLOPE, j] = memory[HELD, j] = memory[SAMPLES, j] = 0.0
+            memory[STANDS, j] = 1.0
+        memory[TIMES_OF_ALL, 0] = memory[TIMES_OF_ALL, 1] = 0.0
+        return -1
+    fallen = 1.0 - math.exp(-dt / FILTER_S)
+    slope = fallen / ((1.0 - fallen) * dt)
+    for j in range(n):
+        memory[ANGLE, j] += fallen * (q[j] - memory[ANGLE, j])
+        memory[VELOCITY, j] += fallen * (v[j] - memory[VELOCITY, j])
+        memory[SLOPE, j] = slope * (v[j] - memory[VELOCITY, j])
+        memory[TORQUE, j] += fallen * (torque[j] - memory[TORQUE, j])
+        standing = 1.0 - abs(math.tanh(v[j] / STANDING))
+        memory[STANDS, j] += fallen * (standing - memory[STANDS, j])
+    memory[TIMES_OF_ALL, 0] += dt
+    memory[TIMES_OF_ALL, 1] += dt
+    if not is_free:
+        for j in range(n):
+            memory[HELD, j] = memory[SAMPLES, j] = memory[LACKING, j] = 0.0
+        return -1
+    if memory[TIMES_OF_ALL, 1] <= WARM_S:
+        return -1
+    lesson = memory[TIMES_OF_ALL, 0] >= FILTER_S
+    if lesson:
+        for i in range(count):
+            covariance[i, i] += (drift[i] + (DRIFT * theta[i]) ** 2) * memory[TIMES_OF_ALL, 0]
+        memory[TIMES_OF_ALL, 0] = 0.0
+    rotation, translation, axis, gravity = arrays
+    place(rotation, translation, axis, memory[ANGLE, :n], rooms[0], rooms[1])
+    link, armature = np.zeros((n, 10)), np.zeros(n)
+    move(link, armature, memory[VELOCITY, :n], rooms)
+    accelerate(armature, gravity, memory[VELOCITY, :n], memory[SLOPE, :n], rooms)
+    for j in range(n):
+        for i in range(base):
+            Y[j, i] = 0.0
+    regress(column, memory[SLOPE, :n], rooms, Y)
+    alarm = -1
+    for j in range(n):
+        for i in range(count):
+            row[i] = Y[j, i] if i < base else 0.0
+        row[base + j] = memory[VELOCITY, j]
+        row[base + n + j] = math.tanh(memory[VELOCITY, j] / STANDING)
+        row[base + 2 * n + j] = 1.0
+        lacking, left_open = memory[TORQUE, j], 0.0
+        for i in range(count):
+            lacking -= row[i] * theta[i]
+            total = 0.0
+            for k in range(count):
+                total += covariance[i, k] * row[k]
+            gain[i] = total
+            left_open += row[i] * total
+        memory[LACKING, j] = lacking
+        friction = base + n + j
+        dry = max(theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0)), 0.0)
+        holds = STATIC * dry * min(max(memory[STANDS, j], 0.0), 1.0)
+        # What rounding of the velocity leaves in the acceleration, times the joint's own inertia.
+        inertia = 0.0
+        if memory[SLOPE, j] != 0.0:
+            inertia = abs(_own_inertia(rooms, column, theta, base, j))
+        rounding = (slope * VELOCITY_STD * inertia) ** 2
+        spread = left_open + rounding + memory[NOISE, j]
+        beyond = max(abs(lacking) - holds, 0.0)
+        limit = TIMES * math.sqrt(spread)
+        share = beyond / max(limit, floor[j])
+        if share <= 1.0:
+            memory[HELD, j] = memory[SAMPLES, j] = 0.0
+        else:
+            memory[HELD, j] += dt * min(share, MOST_WEIGHT)
+            memory[SAMPLES, j] += 1.0
+            if memory[HELD, j] >= HOLD_S and memory[SAMPLES, j] >= 2.0:
+                alarm = j
+        taught = min(beyond * beyond, CLIPPED * spread) - left_open - rounding
+        memory[NOISE, j] += min(dt / NOISE_S, 1.0) * (max(taught, least_noise[j]) - memory[NOISE, j])
+        if lesson and beyond <= limit:
+            total = spread + holds * holds
+            for i in range(count):
+                theta[i] += gain[i] * lacking / total
+                for k in range(count):
+                    covariance[i, k] -= gain[i] * gain[k] / total
+    return alarm
+
+
+def _own_inertia_of(rooms: Any, column: Any, theta: Any, base: int, j: int) -> float:
+    """Inertia that joint j feels alone, of the base parameters: its regressor at unit acceleration."""
+    frame, motion = rooms[0], rooms[1]
+    n = frame.shape[0]
+    s = motion[j, 0]
+    total = 0.0
+    for i in range(j, n):
+        f = frame[i]
+        px, py, pz = f[9], f[10], f[11]
+        bx, by, bz = s[3] + s[1] * pz - s[2] * py, s[4] + s[2] * px - s[0] * pz, s[5] + s[0] * py - s[1] * px
+        z0 = f[0] * s[0] + f[3] * s[1] + f[6] * s[2]
+        z1 = f[1] * s[0] + f[4] * s[1] + f[7] * s[2]
+        z2 = f[2] * s[0] + f[5] * s[1] + f[8] * s[2]
+        b0 = f[0] * bx + f[3] * by + f[6] * bz
+        b1 = f[1] * bx + f[4] * by + f[7] * bz
+        b2 = f[2] * bx + f[5] * by + f[8] * bz
+        at = column[i]
+        total += _of(theta, at[0], base) * (b0 * b0 + b1 * b1 + b2 * b2)
+        total += 2.0 * _of(theta, at[1], base) * (b1 * z2 - b2 * z1)
+        total += 2.0 * _of(theta, at[2], base) * (b2 * z0 - b0 * z2)
+        total += 2.0 * _of(theta, at[3], base) * (b0 * z1 - b1 * z0)
+        total += z0 * z0 * _of(theta, at[4], base) + 2.0 * z0 * z1 * _of(theta, at[5], base)
+        total += 2.0 * z0 * z2 * _of(theta, at[6], base) + z1 * z1 * _of(theta, at[7], base)
+        total += 2.0 * z1 * z2 * _of(theta, at[8], base) + z2 * z2 * _of(theta, at[9], base)
+        if i == j:
+            total += _of(theta, at[10], base)
+    return total
+
+
+def _of_column(theta: Any, at: int, base: int) -> float:
+    """A base parameter, or zero for one that is none."""
+    value: float = theta[at] if at < base else 0.0
+    return value
+
+
+_of: Any = compiled(_of_column)
+_own_inertia: Any = compiled(_own_inertia_of)
+_observe: Callable[..., int] = compiled(_observe_loop)

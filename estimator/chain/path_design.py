@@ -1,0 +1,208 @@
+"""Paths whose amplitudes, phases and centre make the least certain base parameter as certain as possible.
+
+An evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A. Ostermeier,
+Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite Fourier series of
+`hil.estimator.chain.excitation`: the criterion has no gradient that would be cheaper than its value. Every variation is
+scaled into the limits of position and speed and then shrunk until `allowed` accepts it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.excitation import Path
+from hil.estimator.chain.prior import Prior
+from hil.estimator.errors import ExcitationError
+
+LOOKED_AT = 120  # samples of each variation
+NOISE = 0.02  # of a joint's torque: what a regression is thought to leave
+CENTRES = 48
+OFFSPRING, PARENTS = 20, 6
+GENERATIONS = 60
+FIRST_STEP, FASTER, SLOWER = 0.3, 1.1, 0.9
+SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
+SWING_SHARE = 0.9  # of the room between a centre and the nearer limit
+LEAST_SWING_SHARE = 0.15
+_MEAN_SHARE = 0.1  # of the criterion: how certain the others are
+
+
+@dataclass(frozen=True)
+class PathLimits:
+    """low, high [rad], speed [rad/s] (joints,). allowed: whether torque and clearance of a path are in order."""
+
+    low: Array
+    high: Array
+    speed: Array
+    allowed: Callable[[Path], bool]
+
+
+@dataclass(frozen=True)
+class Design:
+    """lines: Fourier coefficients (joints, harmonics), complex; centre (joints,) [rad]; the path that they make within
+    the limits; worst and the median relative standard error that it leaves, in units of the prior's scale."""
+
+    centre: Array
+    lines: Array
+    path: Path
+    worst: float
+    median: float
+
+
+class PathDesigner:
+    """Designs paths of one period [s] at `rate` with harmonics up to `highest` [Hz]. Raises ExcitationError."""
+
+    def __init__(
+        self, base: BaseParameters, prior: Prior, rate: float, period: float, highest: float, limits: PathLimits
+    ) -> None:
+        self._count = int(np.floor(highest * period + 1e-9))
+        if self._count < 2 or highest > rate / 8:
+            raise ExcitationError(
+                f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s: needs at least two "
+                "harmonics below an eighth of the rate"
+            )
+        self._base, self._prior, self._limits = base, prior, limits
+        self._samples, self._period = round(rate * period), period
+        few = min(LOOKED_AT, self._samples)
+        self._few = self._waves(few)
+        self._all: tuple[Array, Array, Array] | None = None
+        self._joints = len(limits.low)
+
+    def plain(self, centre: Array, seed: int) -> Design:
+        """Random phases about a centre, scaled into the limits. Raises ExcitationError where nothing is allowed."""
+        random = np.random.default_rng(seed)
+        found = self._finished(centre, self._random_lines(random))
+        if found is None:
+            raise ExcitationError("no path about this centre stays within the limits of torque and clearance")
+        return found
+
+    def design(self, seed: int, generations: int = GENERATIONS) -> Design:
+        """The best path found; raises ExcitationError where none is allowed."""
+        random = np.random.default_rng(seed)
+        centre, lines = self._start(random)
+        mean = np.concatenate((self._shares_of(centre), lines.real.reshape(-1), lines.imag.reshape(-1)))
+        score = self._score(mean)
+        best, step = mean, FIRST_STEP
+        scale = np.concatenate((np.full(self._joints, 0.15), np.full(mean.size - self._joints, 1.0)))
+        for _ in range(generations):
+            normal = random.standard_normal((OFFSPRING, mean.size))
+            offspring = mean + step * scale * normal
+            scores = np.array([self._score(each) for each in offspring])
+            order = np.argsort(scores)
+            better = scores[order[0]] < score
+            if better:
+                best, score = offspring[order[0]], scores[order[0]]
+            step *= FASTER if (scores[order[:PARENTS]] < score * 1.02).mean() > 0.2 or better else SLOWER
+            chosen = order[: PARENTS - 1]
+            finite = chosen[np.isfinite(scores[chosen])]
+            mean = np.mean([best, *offspring[finite]], axis=0)
+        centre, lines = self._split(best)
+        found = self._finished(centre, lines)
+        if found is None:
+            raise ExcitationError("no path stays within the limits of torque and clearance")
+        return found
+
+    def scaled(self, design: Design, share: float) -> Path:
+        """The same path, smaller about its centre."""
+        centre = design.path.position.mean(axis=1, keepdims=True)
+        path = design.path
+        return Path(centre + share * (path.position - centre), share * path.velocity, share * path.acceleration)
+
+    def worth(self, path: Path) -> tuple[float, float]:
+        """Worst and median relative standard error of the base parameters that a path leaves."""
+        errors = self._errors(path, max(1, path.position.shape[1] // LOOKED_AT))
+        return float(errors.max()), float(np.median(errors))
+
+    def _start(self, random: np.random.Generator) -> tuple[Array, Array]:
+        """The best of random paths about random centres, the middle of the limits among them."""
+        low, high = self._limits.low, self._limits.high
+        best: tuple[float, Array, Array] | None = None
+        for number in range(CENTRES):
+            share = np.full(self._joints, 0.5) if number < 4 else random.uniform(0.15, 0.85, self._joints)
+            centre, lines = low + share * (high - low), self._random_lines(random)
+            path = self._fitted(centre, lines, self._few)
+            if path is None:
+                continue
+            value = self._value(path)
+            if best is None or value < best[0]:
+                best = value, centre, lines
+        if best is None:
+            raise ExcitationError(
+                f"none of {CENTRES} centres has a path that stays within the limits of torque and clearance"
+            )
+        return best[1], best[2]
+
+    def _random_lines(self, random: np.random.Generator) -> Array:
+        shape = self._joints, self._count
+        return np.asarray(random.standard_normal(shape) + 1j * random.standard_normal(shape))
+
+    def _score(self, vector: Array) -> float:
+        path = self._fitted(*self._split(vector), self._few)
+        return np.inf if path is None else self._value(path)
+
+    def _value(self, path: Path) -> float:
+        errors = np.log(self._errors(path, 1))
+        return float((1.0 - _MEAN_SHARE) * errors.max() + _MEAN_SHARE * errors.mean())
+
+    def _errors(self, path: Path, every: int) -> Array:
+        """Relative standard errors (base parameters,): over the prior's standard deviation, as of a whole period."""
+        some = slice(0, None, every)
+        Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
+        level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1)) + 1e-6
+        samples = Y.shape[1]
+        rows = Y * self._prior.std / (NOISE * level[:, None, None] * np.sqrt(samples))
+        rows = rows.reshape(-1, self._base.count) * np.sqrt(self._samples)
+        information = rows.T @ rows + np.eye(self._base.count)
+        errors: Array = np.sqrt(np.diag(np.linalg.inv(information)))
+        return errors
+
+    def _finished(self, centre: Array, lines: Array) -> Design | None:
+        if self._all is None:
+            self._all = self._waves(self._samples)
+        path = self._fitted(centre, lines, self._all)
+        if path is None:
+            return None
+        worst, median = self.worth(path)
+        return Design(centre, lines, path, worst, median)
+
+    def _fitted(self, centre: Array, lines: Array, waves: tuple[Array, Array, Array]) -> Path | None:
+        """The path of these coefficients as large as limits of position and speed let it, then as `allowed` does."""
+        room = np.minimum(centre - self._limits.low, self._limits.high - centre)
+        span = self._limits.high - self._limits.low
+        swing = np.maximum(SWING_SHARE * room, 0.0)
+        if (swing < LEAST_SWING_SHARE * 0.5 * span).any():
+            centre = np.clip(
+                centre,
+                self._limits.low + LEAST_SWING_SHARE * span,
+                self._limits.high - LEAST_SWING_SHARE * span,
+            )
+            swing = SWING_SHARE * np.minimum(centre - self._limits.low, self._limits.high - centre)
+        position, velocity, acceleration = (np.asarray((lines @ wave).real) for wave in waves)
+        scale = np.minimum(
+            swing / np.maximum(np.abs(position).max(axis=1), 1e-9),
+            self._limits.speed / np.maximum(np.abs(velocity).max(axis=1), 1e-9),
+        )[:, None]
+        for shrink in SHRINKS:
+            s = shrink * scale
+            path = Path(centre[:, None] + s * position, s * velocity, s * acceleration)
+            if self._limits.allowed(path):
+                return path
+        return None
+
+    def _waves(self, samples: int) -> tuple[Array, Array, Array]:
+        """exp(i k w t) and its derivatives by time (harmonics, samples)."""
+        turn = 2j * np.pi * np.arange(1, self._count + 1)[:, None] / self._period
+        wave = np.exp(turn * np.arange(samples) * self._period / samples)
+        return wave, turn * wave, turn**2 * wave
+
+    def _shares_of(self, centre: Array) -> Array:
+        low, high = self._limits.low, self._limits.high
+        return np.asarray((centre - low) / (high - low))
+
+    def _split(self, vector: Array) -> tuple[Array, Array]:
+        n, low, high = self._joints, self._limits.low, self._limits.high
+        centre = low + np.clip(vector[:n], 0.05, 0.95) * (high - low)
+        real, imaginary = vector[n:].reshape(2, n, self._count)
+        return centre, real + 1j * imaginary

@@ -1,0 +1,229 @@
+"""Chains under goal torques in closed loop: what an experiment would do to arms that could be the real one.
+
+At each sample a goal torque and a software spring and damper act, the latter on angles and velocities of the sample
+before, as in the real loop. In between the motion is stepped by linearly implicit Euler, friction's slope taken at the
+old velocity: of first order, which a loop that is closed at every sample makes harmless.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.dynamics import TERMS
+from hil.estimator.chain.kernels import accelerate, invert, move, place, room
+from hil.estimator.compiled import compiled
+
+LONGEST_STEP = 1.3e-3  # s
+RAN_AWAY = 1e3  # rad/s
+NEAR_REST = 0.2  # rad: where what the arm lies on may carry it
+YIELDS = 0.03  # rad, under a joint's largest torque: how far that gives way
+PRESSED_SHARE = 0.03  # of a joint's largest torque: less weight presses a joint on nothing
+VISCOUS, COULOMB, OFFSET, WIDTH, SCALE, LAG = range(6)
+DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", "lag")
+
+
+@dataclass(frozen=True)
+class ChainArms:
+    """Arms that could be the real one. rigid: base parameters (arms, base parameters) [SI]; drive: DRIVE_TERMS
+    (arms, 6, joints) [SI], torque_scale being the true over the commanded torque."""
+
+    base: BaseParameters
+    rigid: Array
+    drive: Array
+
+    @property
+    def size(self) -> int:
+        """How many."""
+        return len(self.rigid)
+
+    def first(self, count: int) -> "ChainArms":
+        """A smaller ensemble."""
+        return ChainArms(self.base, self.rigid[:count], self.drive[:count])
+
+    def chosen(self, arms: Any) -> "ChainArms":
+        """Those of these indices."""
+        return ChainArms(self.base, self.rigid[arms], self.drive[arms])
+
+    @property
+    def mean(self) -> "ChainArms":
+        """One arm, in the middle of all."""
+        return ChainArms(self.base, self.rigid.mean(axis=0)[None], np.median(self.drive, axis=0)[None])
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The software's part. goal: torques (samples, joints) [N m]; spring [N m/rad] and damper [N m s/rad] to `pose`
+    (joints,) [rad], in which the arm lies: near it no joint that gravity presses down goes farther; limit [N m]."""
+
+    rate: float
+    goal: Array
+    stiffness: Array
+    damping: Array
+    pose: Array
+    limit: Array
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Of each arm at each sample: angles and velocities (arms, samples, joints) [rad, rad/s], commanded torques
+    [N m]; all NaN after an arm has run away."""
+
+    position: Array
+    velocity: Array
+    torque: Array
+
+
+def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = None) -> Motions:
+    """Motions of all arms from angles `start` (joints,) or (arms, joints) [rad], at rest unless `speed` is given."""
+    n, samples = arms.base.chain.joints, len(loop.goal)
+    at = np.broadcast_to(start, (arms.size, n))
+    moving = np.zeros((arms.size, n)) if speed is None else np.broadcast_to(speed, (arms.size, n))
+    shape = arms.size, samples, n
+    position, velocity, torque = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
+    steps = max(1, math.ceil(1.0 / (loop.rate * LONGEST_STEP)))
+    pressed = weights(arms, loop.pose)
+    pressed = np.where(np.abs(pressed) > PRESSED_SHARE * loop.limit, -np.sign(pressed), 0.0)
+    software = tuple(
+        np.ascontiguousarray(each, dtype=np.float64)
+        for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit)
+    )
+    for arm in range(arms.size):
+        link, armature = _split(arms, arm)
+        _roll(
+            *(arms.base.chain.arrays, link, armature, np.ascontiguousarray(arms.drive[arm]), software),
+            *(pressed[arm], np.array(at[arm]), np.array(moving[arm]), 1.0 / (loop.rate * steps), steps),
+            *(room(n), position[arm], velocity[arm], torque[arm]),
+        )
+    return Motions(position, velocity, torque)
+
+
+def weights(arms: ChainArms, pose: Array) -> Array:
+    """Torque that holds each arm still in a pose (arms, joints) [N m], friction not included."""
+    n = arms.base.chain.joints
+    at, still = np.broadcast_to(pose, (arms.size, n)), np.zeros(n)
+    out = np.empty((arms.size, n))
+    work = room(n)
+    rotation, translation, axis, gravity = arms.base.chain.arrays
+    for arm in range(arms.size):
+        link, armature = _split(arms, arm)
+        place(rotation, translation, axis, np.array(at[arm]), work[0], work[1])
+        move(link, armature, still, work)
+        accelerate(armature, gravity, still, still, work)
+        out[arm] = work[5] + arms.drive[arm, OFFSET]
+    return out
+
+
+def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
+    """Inertia that each joint feels with the others held, the mean over the poses (poses, joints), and with the others
+    free, the least; per arm (arms, joints) [kg m^2]."""
+    n = arms.base.chain.joints
+    work, still = room(n), np.zeros(n)
+    rotation, translation, axis, _ = arms.base.chain.arrays
+    held, free = np.zeros((arms.size, n)), np.full((arms.size, n), np.inf)
+    for arm in range(arms.size):
+        link, armature = _split(arms, arm)
+        for pose in np.ascontiguousarray(poses, dtype=np.float64):
+            place(rotation, translation, axis, pose, work[0], work[1])
+            move(link, armature, still, work)
+            held[arm] += np.diag(work[4]) / len(poses)
+            free[arm] = np.minimum(free[arm], 1.0 / np.diag(np.linalg.inv(work[4])))
+    return held, free
+
+
+def is_physical(arms: ChainArms, poses: Array) -> Any:
+    """Of which arms the mass matrix is positive definite in all poses (poses, joints) (arms,)."""
+    n = arms.base.chain.joints
+    work, still = room(n), np.zeros(n)
+    rotation, translation, axis, _ = arms.base.chain.arrays
+    good = np.ones(arms.size, dtype=bool)
+    for arm in range(arms.size):
+        link, armature = _split(arms, arm)
+        for pose in np.ascontiguousarray(poses, dtype=np.float64):
+            place(rotation, translation, axis, pose, work[0], work[1])
+            move(link, armature, still, work)
+            if np.linalg.eigvalsh(work[4])[0] <= 0.0:
+                good[arm] = False
+                break
+    return good
+
+
+def _split(arms: ChainArms, arm: int) -> tuple[Array, Array]:
+    table = arms.base.as_all(arms.rigid[arm]).reshape(-1, TERMS)
+    return np.ascontiguousarray(table[:, :-1]), np.ascontiguousarray(table[:, -1])
+
+
+def _roll_loop(  # noqa: PLR0912
+    chain: Any,
+    link: Any,
+    armature: Any,
+    drive: Any,
+    software: Any,
+    pressed: Any,
+    q: Any,
+    v: Any,
+    h: float,
+    steps: int,
+    work: Any,
+    position: Any,
+    velocity: Any,
+    torque: Any,
+) -> None:
+    rotation, translation, axis, gravity = chain
+    goal, stiffness, damping, pose, limit = software
+    n = q.size
+    still, real = np.zeros(n), np.zeros(n)
+    seen_q, seen_v = q.copy(), v.copy()
+    A, inverse, factor = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    b, u = np.zeros(n), np.zeros(n)
+    for k in range(goal.shape[0]):
+        for j in range(n):
+            wanted = goal[k, j] + stiffness[j] * (pose[j] - seen_q[j]) - damping[j] * seen_v[j]
+            u[j] = min(max(wanted, -limit[j]), limit[j])
+            seen_q[j], seen_v[j] = q[j], v[j]
+            position[k, j], velocity[k, j], torque[k, j] = q[j], v[j], u[j]
+        for _ in range(steps):
+            place(rotation, translation, axis, q, work[0], work[1])
+            move(link, armature, v, work)
+            accelerate(armature, gravity, v, still, work)
+            carried = 1.0  # share of what lies under the rest pose that is met, fading with the distance from it
+            for j in range(n):
+                carried = min(carried, 2.0 - 2.0 * abs(q[j] - pose[j]) / NEAR_REST)
+            for j in range(n):
+                lag = drive[5, j]
+                kept = math.exp(-h / lag) if lag > 0.0 else 0.0
+                real[j] = kept * real[j] + (1.0 - kept) * u[j] * drive[4, j]
+                bend = math.tanh(v[j] / drive[3, j])
+                slope = drive[0, j] + drive[1, j] * (1.0 - bend * bend) / drive[3, j]
+                b[j] = real[j] - work[5][j]
+                b[j] -= drive[2, j] + drive[0, j] * v[j] + drive[1, j] * bend
+                for i in range(n):
+                    A[j, i] = work[4][j, i]
+                A[j, j] += h * slope
+                if carried > 0.0 and pressed[j] * (q[j] - pose[j]) > 0.0:
+                    stiff = carried * limit[j] / YIELDS
+                    firm = math.sqrt(stiff * work[4][j, j])
+                    b[j] -= stiff * (q[j] - pose[j] + h * v[j]) + firm * v[j]
+                    A[j, j] += h * (firm + h * stiff)
+            if not invert(A, inverse, factor):
+                return
+            for j in range(n):
+                change = 0.0
+                for i in range(n):
+                    change += inverse[j, i] * b[i]
+                still[j] = h * change
+            for j in range(n):
+                v[j] += still[j]
+                still[j] = 0.0
+                q[j] += h * v[j]
+                if not abs(v[j]) < RAN_AWAY:
+                    for i in range(n):
+                        position[k, i] = velocity[k, i] = np.nan
+                    return
+
+
+_roll: Callable[..., None] = compiled(_roll_loop, fastmath={"contract"})

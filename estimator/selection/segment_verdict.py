@@ -1,0 +1,120 @@
+"""The verdict on an estimate from any motion: as `hil.estimator.selection.verdict`, from what segments tell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.recording import Recording
+from hil.estimator.fit.multiple_shooting import ShootingEstimate
+from hil.estimator.models.terms import joint_of, kind_of
+from hil.estimator.selection.candidates import Candidate
+from hil.estimator.selection.verdict import (
+    EXPLAINED,
+    GOOD_PREDICTION,
+    MUCH_LEFT,
+    USABLE_PREDICTION,
+    WEAK,
+    WELL_KNOWN,
+    Trust,
+    Verdict,
+)
+
+LITTLE_TORQUE = 0.1  # of the RMS torque: less gravity than that is as good as none
+IMPROVEMENT = {
+    "inertia": "faster motion",
+    "coupling": "faster motion of both joints together",
+    "armature": "faster motion of joint 2",
+    "gravity": "a wider swing",
+    "viscous": "higher speeds",
+    "coulomb": "more slow reversals",
+}
+
+
+@dataclass(frozen=True)
+class SegmentEvidence:
+    """What is known beside the estimate."""
+
+    held_out: Array | None
+    """Error of predictions of segments not fitted, over the motion's RMS (joints,)."""
+    candidates: Sequence[Candidate] = ()
+    """Missing terms, most significant first."""
+    doubts: tuple[str, ...] = ()
+    """Implausible values, as sentences."""
+    faulty: bool = False
+    """Whether a warning forbids its use."""
+    doubtful: bool = False
+    """Whether a warning casts doubt on it."""
+
+
+def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) -> dict[str, float]:
+    """Relative standard error of each base parameter except offsets; of little gravity, against the torque."""
+    torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
+    relative = {}
+    for name, value, std in zip(estimate.model.base_names, estimate.value, estimate.std, strict=False):
+        if kind_of(name) != "offset":
+            least = float(torque[(joint_of(name) or 1) - 1]) if kind_of(name) == "gravity" else 0.0
+            size = max(abs(float(value)), least)
+            relative[name] = float(std) / size if size else np.inf
+    return relative
+
+
+def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, evidence: SegmentEvidence) -> Verdict:
+    """The verdict on `estimate`, whose standard errors include what its model leaves out."""
+    relative = relative_std(recordings, estimate)
+    left, held_out = float(estimate.residual_over_noise.max()), evidence.held_out
+    weakest = max(relative, key=lambda name: relative[name])
+    sentences = (
+        *(("Do not use these numbers: the warnings say why.",) if evidence.faulty else ()),
+        _left(estimate, evidence),
+        _predicted(held_out, estimate.segment_length),
+        *evidence.doubts,
+        _weakest(weakest, relative[weakest]),
+    )
+    return Verdict(_trust(left, held_out, relative[weakest], evidence), weakest, sentences)
+
+
+def _trust(left: float, held_out: Array | None, weakest: float, evidence: SegmentEvidence) -> Trust:
+    worst = np.inf if held_out is None else float(held_out.max())
+    if evidence.faulty or (held_out is not None and not worst <= USABLE_PREDICTION):
+        return "no"
+    if held_out is None and left > MUCH_LEFT:
+        return "no"
+    doubtful = weakest > WEAK or evidence.doubtful or bool(evidence.doubts)
+    limit = EXPLAINED if held_out is None else MUCH_LEFT
+    return "with care" if doubtful or left > limit or (held_out is not None and worst > GOOD_PREDICTION) else "yes"
+
+
+def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
+    left = estimate.residual_over_noise
+    joint = int(np.argmax(left))
+    if left[joint] <= EXPLAINED:
+        return "The model explains the motion down to the noise of the positions."
+    said = (
+        f"Joint {joint + 1} moves in a way that the model cannot explain: its residual is {left[joint]:.1f} times the "
+        "noise."
+    )
+    seen = [each for each in evidence.candidates if each.evidence > 1.0]
+    if seen:
+        part = seen[0].part.replace("_", " ")
+        said += f" A term for {part} would explain {100.0 * seen[0].explained:.0f} % of it."
+    return said
+
+
+def _predicted(held_out: Array | None, length: float) -> str:
+    if held_out is None:
+        return "No held-out motion validated it: the recording is too short to keep a part of it back."
+    return (
+        f"Fitted to every other segment of {length:g} s, it predicts the others to within "
+        f"{100.0 * float(held_out.max()):.2g} % of the motion's RMS."
+    )
+
+
+def _weakest(name: str, part: float) -> str:
+    if part <= WELL_KNOWN:
+        return f"The least well known parameter is {name}, to {100 * part:.2g} %."
+    if not np.isfinite(part):
+        return f"This motion reveals nothing of {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
+    improvement = IMPROVEMENT[kind_of(name)]
+    return f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}."

@@ -1,0 +1,141 @@
+"""What segments of any motion tell beyond the fit: missing terms, error bars that include them, held-out motion."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.recording import Recording
+from hil.estimator.fit.multiple_shooting import ALL, Shooting, ShootingEstimate
+from hil.estimator.fit.reparametrisation import Sizes
+from hil.estimator.models.terms import Option, term_of
+from hil.estimator.options import ShootingOptions
+from hil.estimator.selection.candidates import Candidate, Linearised, colour, ranked, richer_models, unruled, widened
+
+NOT_HERE: tuple[Option, ...] = ("zeros", "encoder", "lags", "ripple")
+"""What multiple shooting has in another form (each recording's zeros), or not at all."""
+COARSE = ShootingOptions().coarse_step
+KNOWN_SHARE = 1.0 / 3.0  # of a held-out segment: tells the state that the rest is predicted from
+STATE_STEPS = 6
+FEWEST_ROWS = 3  # per unknown of the state
+
+
+def missing_terms(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[Candidate]:
+    """Terms that could be added to the estimate's model, most significant first, by score tests."""
+    richer = {part: more for part, more in richer_models(estimate.model).items() if part not in NOT_HERE}
+    names = {name for more in richer.values() for name in more.names if name not in estimate.names}
+    return ranked(linearised(recordings, estimate, sorted(names)), estimate.names, richer, {})
+
+
+def considered(recordings: Sequence[Recording], estimate: ShootingEstimate) -> ShootingEstimate:
+    """The estimate with error bars that include omitted terms which cannot be ruled out."""
+    left_out = [name for name in unruled(estimate.model) if term_of(name).part not in NOT_HERE]
+    if not left_out:
+        return estimate
+    about = linearised(recordings, estimate, left_out)
+    return replace(estimate, covariance=widened(about, estimate.names, estimate.covariance, left_out))
+
+
+def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, names: Sequence[str]) -> Linearised:
+    """The weighted sum of squares about `estimate`, the segments' own states eliminated, by parameters and zeros.
+
+    `names`: parameters beside the estimate's, which are expanded about where they are absent.
+    """
+    problem = _posed(recordings, estimate)
+    every = (*estimate.names, *(name for name in names if name not in estimate.names))
+    values = {name: term_of(name).absent for name in every} | estimate.parameters
+    causes = len(every) + problem.zeros
+    normal, gradient = np.zeros((causes, causes)), np.zeros(causes)
+    offsets = estimate.zeros.reshape(-1) / ShootingOptions().angle_scale
+    size = np.maximum(estimate.residual_over_noise, 1e-12)[:, None]
+    correlation, samples = [], 0
+    for number, own in enumerate(estimate.own):
+        rows, columns = problem.derivative_by_values(number, values, offsets, own, every)
+        shape = problem.segments[number].position.shape
+        weight = np.broadcast_to(1.0 / size, shape).reshape(-1)
+        r, J = rows * weight, columns * weight[:, None]
+        mine, state = J[:, :causes], J[:, causes:]
+        # What the state at the segment's start explains is no news of the parameters.
+        Q = np.linalg.qr(state)[0]
+        mine, r = mine - Q @ (Q.T @ mine), r - Q @ (Q.T @ r)
+        normal += mine.T @ mine
+        gradient += mine.T @ r
+        samples += int(np.count_nonzero(rows))
+        correlation.append(colour(r.reshape(shape)))
+    sizes = _sizes(recordings, estimate)
+    spread = np.array([np.inf if term_of(n).spread is None else sizes.of(term_of(n).spread or 1.0) for n in every])
+    return Linearised(
+        every,
+        np.array([values[name] for name in every]),
+        normal,
+        gradient,
+        samples,
+        float(np.median(correlation)),
+        1.0 / spread**2,
+    )
+
+
+def held_out_errors(
+    recordings: Sequence[Recording], estimate: ShootingEstimate, of: slice = ALL
+) -> tuple[Array, float]:
+    """Error of predictions of segments, over the motion's RMS: of each joint (joints,), and of the usual segment.
+
+    The state at a segment's start is what its first third says; the rest is predicted by torque alone. The usual
+    segment is the median: where an arm turns over, one can be off by any amount.
+    """
+    problem = _posed(recordings, estimate, of)
+    values, joints = estimate.parameters, estimate.model.joints
+    offsets = estimate.zeros.reshape(-1) / ShootingOptions().angle_scale
+    motion = np.sqrt(np.mean([np.var(each.filled(), axis=1) for each in recordings], axis=0))
+    squares, counts = [], []
+    for number, segment in enumerate(problem.segments):
+        shape = segment.position.shape
+        measured = np.isfinite(segment.position)
+        early = measured & (np.arange(shape[1]) < max(KNOWN_SHARE * shape[1], FEWEST_ROWS * 2 * joints))
+        own = (segment.state / problem.state_scale).reshape(-1)
+        for _ in range(STATE_STEPS):
+            rows, columns = problem.derivative_by_values(number, values, offsets, own, ())
+            known = early.reshape(-1)
+            step = np.linalg.lstsq(columns[known, -own.size :], rows[known], rcond=None)[0]
+            own = own - np.clip(step, -1.0, 1.0)
+            if float(np.abs(step).max()) < 1e-4:
+                break
+        rows, _ = problem.derivative_by_values(number, values, offsets, own, ())
+        error = np.clip(np.nan_to_num(rows.reshape(shape) * problem.noise, nan=np.pi), -np.pi, np.pi)
+        later = measured & ~early
+        squares.append(np.sum(np.where(later, error, 0.0) ** 2, axis=1))
+        counts.append(np.maximum(later.sum(axis=1), 1))
+    relative = np.array(squares) / np.array(counts) / motion**2
+    whole = np.sqrt(np.sum(squares, axis=0) / np.sum(counts, axis=0)) / motion
+    return np.asarray(whole), float(np.median(np.sqrt(np.mean(relative, axis=1))))
+
+
+def predicted_positions(recordings: Sequence[Recording], estimate: ShootingEstimate) -> tuple[Array, ...]:
+    """Positions (joints, samples) [rad] of each recording, segment by segment from its estimated state; NaN between."""
+    problem = _posed(recordings, estimate)
+    offsets = estimate.zeros.reshape(-1) / ShootingOptions().angle_scale
+    predicted = tuple(np.full(each.position.shape, np.nan) for each in recordings)
+    for segment, own in zip(problem.segments, estimate.own, strict=True):
+        found = problem.position_by_values(segment, estimate.parameters, offsets, own)
+        predicted[segment.recording][:, segment.samples] = found
+    return predicted
+
+
+def _posed(recordings: Sequence[Recording], estimate: ShootingEstimate, of: slice | None = None) -> Shooting:
+    chosen = estimate.fitted if of is None else of
+    return Shooting(
+        recordings,
+        estimate.model,
+        estimate.segment_length,
+        zeros=estimate.zeros.size > 0,
+        of=chosen,
+        step=COARSE,
+    )
+
+
+def _sizes(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Sizes:
+    torque = float(np.sqrt(np.mean([np.mean(each.torque**2) for each in recordings])))
+    speed = [np.diff(each.filled(), axis=1) / np.diff(each.time) for each in recordings]
+    velocity = float(np.sqrt(np.mean([np.mean(each**2) for each in speed])))
+    return Sizes(torque, velocity, abs(estimate.parameters["inertia_1"]))

@@ -1,0 +1,58 @@
+"""The corners of a mesh: STL (binary or text) and OBJ, as far as a bounding box needs them."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MOST_BYTES = 200_000_000
+_HEADER, _TRIANGLE = 84, 50
+
+
+def find_mesh(name: str, urdf: Path) -> Path | None:
+    """The file that a URDF calls so: beside it, or for package://NAME/PATH in a folder above it; None if not there."""
+    for scheme in ("package://", "file://"):
+        if name.startswith(scheme):
+            name = name[len(scheme) :]
+            break
+    inside = Path(*Path(name).parts[1:]) if len(Path(name).parts) > 1 else Path(name)
+    for folder in (urdf.parent, *urdf.resolve().parents):
+        for path in (folder / name, folder / inside):
+            if path.is_file():
+                return path
+    return None
+
+
+def mesh_corners(path: Path) -> Array | None:
+    """Corner points (points, 3) in the file's units; None where the file cannot be read as a mesh."""
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            return None
+        found = {".stl": _stl, ".obj": _obj}.get(path.suffix.lower(), lambda _: None)(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+    if found is None or not len(found) or not np.isfinite(found).all():
+        return None
+    return np.asarray(found, dtype=np.float64)
+
+
+def _stl(data: bytes) -> Array | None:
+    count = int.from_bytes(data[80:_HEADER], "little") if len(data) >= _HEADER else -1
+    if len(data) == _HEADER + _TRIANGLE * count:
+        rows = np.frombuffer(
+            data, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("_", "<u2")]), offset=84
+        )
+        return np.asarray(rows["corners"].reshape(-1, 3), dtype=np.float64)
+    lines = (line.split() for line in data.decode("ascii", "replace").splitlines())
+    return _points([words[1:4] for words in lines if words[:1] == ["vertex"]])
+
+
+def _obj(data: bytes) -> Array | None:
+    lines = (line.split() for line in data.decode("utf-8", "replace").splitlines())
+    return _points([words[1:4] for words in lines if words[:1] == ["v"]])
+
+
+def _points(words: list[list[str]]) -> Array | None:
+    return np.array(words, dtype=np.float64).reshape(-1, 3) if words else None

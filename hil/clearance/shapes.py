@@ -1,0 +1,198 @@
+"""Capsules that enclose each link: from the collision geometry of its URDF, else from the distances between joints.
+
+A capsule is all that is nearer than its radius to a line segment. Spheres are exact; a cylinder is enclosed by one
+capsule, a box by one or a row of them, a mesh by those of its bounding box. A link of which nothing can be read gets a
+capsule from joint to joint, with a guessed radius, and is named.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.mesh import find_mesh, mesh_corners
+from hil.description.arm import ArmDescription, ArmFileError
+from hil.description.urdf import parse_urdf, rotation_of
+
+Array = NDArray[np.float64]
+Placed = tuple[int, Array, Array, ET.Element | None]
+
+GUESSED_SHARE, GUESSED_LEAST, GUESSED_MOST = 0.2, 0.015, 0.05
+"""Radius of a link without geometry: this share of its length, within these bounds [m]."""
+
+MOST_STRIPS = 4
+LONGEST_PIECE = 0.08  # m
+_NOTHING = 1e-6
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """link: 0 for what stands still, then 1 to the number of joints; ends (2, 3) [m] in that link's frame."""
+
+    link: int
+    ends: Array
+    radius: float
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """names: of the links, the base's first. guessed: links whose shape comes from the distances between joints."""
+
+    names: tuple[str, ...]
+    capsules: tuple[Capsule, ...]
+    guessed: tuple[str, ...]
+
+
+def shapes_of(arm: ArmDescription) -> Shapes:
+    """The capsules of an arm."""
+    names = (arm.base, *(joint.link for joint in arm.joints))
+    placed = _placed(arm)
+    capsules: list[Capsule] = []
+    guessed = []
+    for link in range(len(names)):
+        here = [each for each in placed if each[0] == link]
+        found, is_whole = _around(here, arm, link)
+        if not found or not is_whole:
+            guessed.append(names[link])
+            found += _from_joints(arm, link, [shift for _, _, shift, _ in here]) if link > 0 else []
+        capsules += [piece for each in found for piece in _pieces(each)]
+    for each in capsules:
+        if not (np.isfinite(each.ends).all() and 0.0 <= each.radius < np.inf):
+            raise ArmFileError(
+                f'{arm.path}: link "{names[each.link]}": its collision geometry has a size or origin that is no number'
+            )
+    return Shapes(names, tuple(capsules), tuple(guessed))
+
+
+def _pieces(capsule: Capsule) -> list[Capsule]:
+    """Shorter capsules that together are the same: the part next to a joint may touch what the rest must not."""
+    length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))
+    if not length < np.inf:
+        return [capsule]  # named later
+    at = np.linspace(0.0, 1.0, max(2, int(np.ceil(length / LONGEST_PIECE)) + 1))
+    points = capsule.ends[0] + at[:, None] * (capsule.ends[1] - capsule.ends[0])
+    return [Capsule(capsule.link, np.stack(ends), capsule.radius) for ends in pairwise(points)]
+
+
+def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], bool]:
+    """Capsules around all that one moving link carries, and whether all its geometry could be read."""
+    found, is_whole = [], True
+    for _, rotation, translation, element in here:
+        if element is None:
+            continue
+        for shape, turn, shift in _geometry(element):
+            around = _of_shape(shape, arm)
+            is_whole = is_whole and around is not None
+            for ends, radius in around or []:
+                found.append(Capsule(link, (ends @ turn.T + shift) @ rotation.T + translation, radius))
+    return found, is_whole
+
+
+def _placed(arm: ArmDescription) -> list[Placed]:
+    """Every link of the file: which moving link carries it, its frame there, its element. Empty for other formats."""
+    if b"<robot" not in arm.path.read_bytes():
+        return []
+    root = parse_urdf(arm.path)
+    elements = {element.get("name", ""): element for element in root.findall("link")}
+    number = {joint.name: index for index, joint in enumerate(arm.joints, start=1)}
+    frames = {arm.base: (0, np.eye(3), np.zeros(3))}
+    waiting = list(root.findall("joint"))
+    while waiting:
+        known = [joint for joint in waiting if _end(joint, "parent") in frames]
+        if not known:
+            break
+        for joint in known:
+            waiting.remove(joint)
+            link, rotation, translation = frames[_end(joint, "parent")]
+            turn, shift = _origin(joint)
+            frames[_end(joint, "child")] = (
+                (number[joint.get("name", "")], np.eye(3), np.zeros(3))
+                if joint.get("name") in number
+                else (link, rotation @ turn, rotation @ shift + translation)
+            )
+    return [(*frame, elements.get(name)) for name, frame in frames.items()]
+
+
+def _geometry(link: ET.Element) -> Iterator[tuple[ET.Element, Array, Array]]:
+    """Shapes of a link's collision geometry, and their frames in its own; where it has none, of what is shown."""
+    for element in link.findall("collision") or link.findall("visual"):
+        for shape in element.find("geometry") or ():
+            if isinstance(shape.tag, str):
+                yield shape, *_origin(element)
+
+
+def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float]] | None:
+    """Ends (2, 3) and radius of capsules around a shape; None where it cannot be read."""
+    if shape.tag == "sphere":
+        return [(np.zeros((2, 3)), float(shape.get("radius", "nan")))]
+    if shape.tag == "cylinder":
+        return [_of_cylinder(float(shape.get("radius", "nan")), float(shape.get("length", "nan")))]
+    if shape.tag == "capsule":
+        half = 0.5 * float(shape.get("length", "nan"))
+        return [(np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), float(shape.get("radius", "nan")))]
+    if shape.tag == "box":
+        return _of_box(np.zeros(3), np.array(_numbers(shape.get("size"), 3)))
+    if shape.tag == "mesh":
+        path = find_mesh(shape.get("filename", ""), arm.path)
+        corners = None if path is None else mesh_corners(path)
+        if corners is not None:
+            corners = corners * np.array(_numbers(shape.get("scale"), 3, 1.0))
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            return _of_box(0.5 * (low + high), high - low)
+    return None
+
+
+def _of_cylinder(radius: float, length: float) -> tuple[Array, float]:
+    """A flat one is enclosed by a sphere, others by a capsule of the same axis."""
+    half = 0.5 * length
+    if half < 0.5 * radius:
+        return np.zeros((2, 3)), float(np.hypot(radius, half))
+    return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), radius
+
+
+def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
+    """A row of capsules along the longest edge, beside each other across the second."""
+    third, second, longest = np.argsort(size)
+    strips = int(np.clip(np.round(size[second] / max(size[third], _NOTHING)), 1, MOST_STRIPS))
+    width = size[second] / strips
+    radius = 0.5 * float(np.hypot(width, size[third]))
+    along = np.zeros(3)
+    along[longest] = 0.5 * size[longest]
+    found = []
+    for strip in range(strips):
+        middle = centre.copy()
+        middle[second] += (strip - 0.5 * (strips - 1)) * width
+        found.append((np.stack((middle - along, middle + along)), radius))
+    return found
+
+
+def _from_joints(arm: ArmDescription, link: int, fixed: list[Array]) -> list[Capsule]:
+    """From the link's joint to the next one; of the last link to what is fixed to it, or twice as far as its centre."""
+    if link < len(arm.joints):
+        end = arm.joints[link].translation
+    else:
+        beyond = [*fixed, 2.0 * arm.joints[link - 1].body.centre]
+        end = max(beyond, key=lambda each: float(np.linalg.norm(each)))
+    radius = float(np.clip(GUESSED_SHARE * np.linalg.norm(end), GUESSED_LEAST, GUESSED_MOST))
+    return [Capsule(link, np.stack((np.zeros(3), end)), radius)]
+
+
+def _end(joint: ET.Element, end: str) -> str:
+    tag = joint.find(end)
+    return "" if tag is None else tag.get("link", "")
+
+
+def _origin(element: ET.Element) -> tuple[Array, Array]:
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(3), np.zeros(3)
+    return rotation_of(*_numbers(origin.get("rpy"), 3, 0.0)), np.array(_numbers(origin.get("xyz"), 3, 0.0))
+
+
+def _numbers(text: str | None, count: int, default: float = float("nan")) -> list[float]:
+    """`count` numbers; the default where there is no text."""
+    found = [default] * count if text is None else [float(word) for word in text.split()]
+    return found if len(found) == count else [float("nan")] * count

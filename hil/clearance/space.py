@@ -1,0 +1,232 @@
+"""An arm in space among what it must not touch: itself, the floor and the boxes of `[clearance]`."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.kernel import BOXES, FLOOR, all_distances, least_room
+from hil.clearance.shapes import Shapes, shapes_of
+from hil.config.chain import described_arm
+from hil.config.schema import Config
+from hil.description.arm import ArmDescription
+from hil.description.urdf import rotation_of
+from hil.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+ALWAYS_SHARE = 0.75
+"""Of all poses: capsules with one link between them that are nearer than BUILT_NEAR in as many meet at its joints."""
+
+ALWAYS_SHARE_OF_OTHERS = 0.98
+BUILT_NEAR = 0.02  # m beyond the margin
+
+RANDOM_POSES = 400
+AT_REST_SLACK = 0.008
+"""m by which an arm on its way may come nearer than it lies at rest, where it lies hardly farther than the margin."""
+
+LYING_RAD = 0.12
+"""An arm that is so near its rest pose in every joint lies, which its owner says is safe."""
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """The tightest moment of a motion. distance [m] of what `pair` names; needed [m] there; sample: its index."""
+
+    distance: float
+    needed: float
+    pair: tuple[str, str]
+    sample: int
+
+    @property
+    def room(self) -> float:
+        """Distance beyond what is needed [m]; negative where it is too near."""
+        return self.distance - self.needed
+
+    def __str__(self) -> str:
+        return f"{self.pair[0]} and {self.pair[1]}: {1e3 * self.distance:.0f} mm"
+
+
+@dataclass(frozen=True)
+class Space:
+    """Pairs of capsules that must keep apart, and by how much.
+
+    as_built: pairs of links of which some capsules are left out, since they touch in nearly every pose.
+    """
+
+    shapes: Shapes
+    obstacles: tuple[str, ...]
+    margin: float
+    as_built: tuple[tuple[str, str], ...]
+    rest: Array
+    """The rest pose (joints,) [rad]."""
+    at_rest: Array
+    """Distance of each pair in it (pairs,) [m]."""
+    _pairs: NDArray[np.int64]
+    _chain: tuple[Array, Array, Array]
+    _arrays: tuple[NDArray[np.int64], Array, Array, Array, Array]
+
+    @classmethod
+    def of(cls, config: Config) -> "Space":
+        """Raises ConfigError, ArmFileError."""
+        arm = described_arm(config)
+        return _space(_Key(config, arm))
+
+    def room(self, position: Array, on_the_way: bool = False) -> Array:
+        """Least distance beyond what is needed at each pose (samples,) [m] of a motion (joints, samples) [rad].
+
+        on_the_way: whether the motion leads from or to the rest pose, where the arm may lie nearer than the margin.
+        """
+        return self._least(position, on_the_way)[0]
+
+    def lies(self, position: Array) -> NDArray[np.bool_]:
+        """At which poses of a motion (joints, samples) [rad] the arm lies in its rest pose (samples,)."""
+        near: NDArray[np.bool_] = np.abs(position.T - self.rest).max(axis=1) < LYING_RAD
+        return near
+
+    def nearest(self, position: Array, on_the_way: bool = False) -> Nearest:
+        """The tightest moment of a motion (joints, samples) [rad]."""
+        room, worst = self._least(position, on_the_way)
+        sample = int(np.argmin(room))
+        if worst[sample] < 0:
+            return Nearest(np.inf, 0.0, ("nothing", "nothing"), sample)
+        needed = float(self._needed(on_the_way)[worst[sample]])
+        return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
+
+    def ends(self, position: Array) -> tuple[Array, Array]:
+        """Ends of all capsules in the base's frame (capsules, 2, 3) [m] in one pose (joints,), and their radii."""
+        rotation, translation, axis = self._chain
+        frames = [(np.eye(3), np.zeros(3))]
+        for turn, shift, around, angle in zip(rotation, translation, axis, position, strict=True):
+            former, origin = frames[-1]
+            frames.append((former @ turn @ _about(around, float(angle)), origin + former @ shift))
+        link, ends, radius, _, _ = self._arrays
+        placed = [each @ frames[at][0].T + frames[at][1] for at, each in zip(link, ends, strict=True)]
+        return np.array(placed).reshape(-1, 2, 3), radius
+
+    @property
+    def floor(self) -> tuple[Array, float]:
+        """The floor's normal in the base's frame (3,) and its height [m]; -inf where there is none."""
+        return self._arrays[3][:3], float(self._arrays[3][3])
+
+    @property
+    def links(self) -> NDArray[np.int64]:
+        """Which link each capsule belongs to, 0 the base's (capsules,)."""
+        return self._arrays[0]
+
+    def names_of(self, pair: int) -> tuple[str, str]:
+        """What a pair is made of, in words."""
+        link = self._arrays[0]
+        first, second = self._pairs[pair]
+        return self.shapes.names[link[first]], self._partner(int(second))
+
+    def _partner(self, second: int) -> str:
+        if second >= 0:
+            return str(self.shapes.names[self._arrays[0][second]])
+        return "floor" if second == FLOOR else self.obstacles[BOXES - second]
+
+    def _needed(self, on_the_way: bool) -> Array:
+        full = np.full(len(self._pairs), self.margin)
+        return np.minimum(full, self.at_rest - AT_REST_SLACK) if on_the_way else full
+
+    def _least(self, position: Array, on_the_way: bool) -> tuple[Array, NDArray[np.int64]]:
+        q = np.ascontiguousarray(position.T, dtype=np.float64)
+        room, worst = np.empty(len(q)), np.empty(len(q), dtype=np.int64)
+        least_room(self._chain, self._arrays, self._pairs, self._needed(on_the_way), q, room, worst)
+        if on_the_way:
+            lies = self.lies(position)
+            room[lies] = np.maximum(room[lies], 0.0)
+        return room, worst
+
+
+class _Key:
+    """A configuration and its description, the same as another with the same geometry and limits."""
+
+    def __init__(self, config: Config, arm: ArmDescription) -> None:
+        self.config, self.arm = config, arm
+        limits = tuple(tuple(joint.position_limit) for joint in config.joints)
+        self._said = repr((config.clearance, config.arm.base, config.arm.rest_pose, limits)), id(arm)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self._said == other._said
+
+    def __hash__(self) -> int:
+        return hash(self._said)
+
+
+@lru_cache(maxsize=8)
+def _space(key: _Key) -> Space:
+    config, arm, wanted = key.config, key.arm, key.config.clearance
+    shapes = shapes_of(arm)
+    link = np.array([capsule.link for capsule in shapes.capsules], dtype=np.int64)
+    upright = rotation_of(*config.arm.base)
+    floor = np.array([*upright[2], wanted.floor if isinstance(wanted.floor, float) else -np.inf])
+    boxes = np.zeros((max(1, len(wanted.boxes)), 5, 3))
+    for row, box in zip(boxes, wanted.boxes, strict=False):
+        row[:3] = upright.T @ rotation_of(*box.turned)
+        row[3], row[4] = upright.T @ np.array(box.centre), 0.5 * np.array(box.size)
+    chain = tuple(np.ascontiguousarray(each) for each in arm.geometry)
+    arrays = (
+        link,
+        np.array([capsule.ends for capsule in shapes.capsules]).reshape(-1, 2, 3),
+        np.array([capsule.radius for capsule in shapes.capsules]),
+        floor,
+        boxes,
+    )
+    obstacles = tuple(box.name for box in wanted.boxes)
+    ignored = _ignored(config, (*shapes.names, "floor", *obstacles))
+    pairs = np.array(_pairs(shapes, link, len(obstacles), np.isfinite(floor[3])), dtype=np.int64).reshape(-1, 2)
+    rest = np.array(config.arm.rest_pose)
+    space = Space(shapes, obstacles, wanted.margin, (), rest, np.zeros(len(pairs)), pairs, chain, arrays)  # type: ignore[arg-type]
+    kept = np.array([frozenset(space.names_of(pair)) not in ignored for pair in range(len(pairs))], dtype=bool)
+    touching = _touch_as_built(config, chain, arrays, pairs, wanted.margin)
+    as_built = sorted({space.names_of(int(pair)) for pair in np.flatnonzero(touching & kept)})
+    pairs = pairs[kept & ~touching]
+    at_rest = np.empty((1, len(pairs)))
+    all_distances(chain, arrays, pairs, rest[None], at_rest)
+    return Space(shapes, obstacles, wanted.margin, tuple(as_built), rest, at_rest[0], pairs, chain, arrays)  # type: ignore[arg-type]
+
+
+def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:
+    """Capsules of links that are no neighbours; with the floor those beyond the first link, which is on the base."""
+    count = len(shapes.capsules)
+    found = [(a, b) for a in range(count) for b in range(a + 1, count) if abs(link[a] - link[b]) > 1]
+    found += [(a, FLOOR) for a in range(count) if link[a] > 1 and has_floor]
+    return found + [(a, BOXES - box) for a in range(count) if link[a] > 0 for box in range(boxes)]
+
+
+def _touch_as_built(
+    config: Config, chain: object, arrays: tuple[Any, ...], pairs: NDArray[np.int64], margin: float
+) -> NDArray[np.bool_]:
+    """Of which pairs the capsules are near in nearly every pose within the limits (pairs,)."""
+    link = arrays[0]
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    poses = np.random.default_rng(1).uniform(low, high, (RANDOM_POSES, len(low)))
+    distance = np.empty((RANDOM_POSES, len(pairs)))
+    all_distances(chain, arrays, pairs, poses, distance)
+    second = np.maximum(pairs[:, 1], 0)
+    are_close = np.abs(link[pairs[:, 0]] - link[second]) == 2  # one link in between
+    needed = np.where(are_close, ALWAYS_SHARE, ALWAYS_SHARE_OF_OTHERS)
+    near = (distance < margin + BUILT_NEAR).mean(axis=0) >= needed
+    touching: NDArray[np.bool_] = near & (pairs[:, 1] >= 0)
+    return touching
+
+
+def _ignored(config: Config, names: tuple[str, ...]) -> set[frozenset[str]]:
+    for pair in config.clearance.ignore:
+        for name in pair:
+            if name not in names:
+                raise ConfigError(
+                    f"{config.path}: clearance.ignore: there is no {name!r}; there are {', '.join(names)}."
+                )
+    return {frozenset(pair) for pair in config.clearance.ignore}
+
+
+def _about(axis: Array, angle: float) -> Array:
+    """Rotation matrix about an axis."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return turned

@@ -1,0 +1,176 @@
+"""The experiment of an arm in space simulated on arms that could be it: peaks against limits, and clearance.
+
+Each arm plays the whole of every path: from the rest pose, in which it lies, there, two periods, back.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.space import Nearest, Space
+from hil.config.schema import Config
+from hil.dry_run.prediction import Prediction, limits_of, peaks_of
+from hil.estimator.chain.rollout import ChainArms, Loop, Motions, roll_out
+from hil.plan.chain_model import torque_limits
+from hil.plan.chain_plan import PathSegment
+from hil.plan.plan import Plan
+
+Array = NDArray[np.float64]
+Tell = Callable[[int, int], None]
+
+PERIODS = 2
+SHOWN = 30
+LOOKED_AT_HZ = 100.0
+"""Rate at which the clearance of a motion is computed [Hz]."""
+
+RAN_AWAY = 1e3
+"""Times its limit, which stands for the peaks of an arm that runs away."""
+
+
+@dataclass(frozen=True)
+class ChainPrediction:
+    """peaks: as of a planar arm. nearest: the tightest moment of all arms, at `moment` [s] of the segment of `role`.
+
+    distances: of each arm the least room beyond the margin (arms,) [m]. tracking: how far typical arms are from the
+    wanted path (joints,) [rad].
+    """
+
+    peaks: Prediction
+    nearest: Nearest
+    role: str
+    moment: float
+    rooms: Array
+    tracking: Array
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether every arm keeps clear."""
+        return bool((self.rooms >= 0.0).all())
+
+    def __str__(self) -> str:
+        where = f"{self.moment:.1f} s into {self.role!r}"
+        return f"{self.nearest}, at least {1e3 * self.nearest.needed:.0f} mm wanted, {where}"
+
+
+def predict_chain(
+    config: Config, plan: Plan, arms: ChainArms, tell: Tell | None = None, shown: int = 0
+) -> ChainPrediction:
+    """Play `plan` on every arm. tell: called with the number of arms simulated and that of all. Raises ArmFileError,
+    ConfigError."""
+    space = Space.of(config)
+    limits, rest = limits_of(config), np.array(config.arm.rest_pose)
+    values = np.zeros((arms.size, *limits.shape))
+    rooms = np.full(arms.size, np.inf)
+    worst: tuple[float, Nearest, str, float] | None = None
+    seen: list[Array] = []
+    tracking = np.zeros((arms.size, len(rest)))
+    done = 0
+    for number, segment in enumerate(plan.segments):
+        assert isinstance(segment, PathSegment)
+        loop = loop_of(config, segment, plan.rate)
+        ways = segment.ramp_samples
+        reference = np.concatenate(
+            [segment.paths[0].position, *[segment.paths[1].position] * PERIODS, segment.paths[2].position], axis=1
+        )
+        for arm in range(arms.size):
+            motions = roll_out(arms.chosen([arm]), loop, rest)
+            peaks = _peaks(config, motions, limits)
+            values[arm] = peaks if number == 0 else _extreme(values[arm], peaks)
+            position = motions.position[0].T
+            tracking[arm] = np.maximum(tracking[arm], np.nanmax(np.abs(position - reference), axis=1))
+            nearest, moment = _nearest(space, position, ways, plan.rate)
+            rooms[arm] = min(rooms[arm], nearest.room)
+            if worst is None or nearest.room < worst[0]:
+                worst = nearest.room, nearest, segment.role, moment
+            if number == 0 and arm < shown:
+                seen.append(position.copy())
+            done += 1
+            if tell is not None:
+                tell(done, arms.size * len(plan.segments))
+    assert worst is not None
+    together = np.stack(seen) if seen else np.empty((0, 0, 0))
+    prediction = Prediction(
+        values,
+        _shares(values, limits, rest, _centre(plan)),
+        limits,
+        np.ones(arms.size, dtype=np.int64),
+        together,
+        rest,
+        plan.rate,
+    )
+    return ChainPrediction(prediction, *worst[1:], rooms, np.median(tracking, axis=0))
+
+
+def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:
+    """What the software does while a segment is played."""
+    assert config.stabiliser is not None  # checked with the configuration
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    goals = np.concatenate((segment.ramp_in, *[segment.period_current] * PERIODS, segment.ramp_out))
+    return Loop(
+        rate,
+        goals * constants,
+        np.array(config.stabiliser.stiffness),
+        np.array(config.stabiliser.damping),
+        np.array(config.arm.rest_pose),
+        torque_limits(config),
+    )
+
+
+def _peaks(config: Config, motions: Motions, limits: Array) -> Array:
+    position, velocity, torque = (each[0].T for each in (motions.position, motions.velocity, motions.torque))
+    if not np.isfinite(position[:, -1]).all():
+        peaks = RAN_AWAY * np.abs(limits)
+        peaks[0] = -peaks[0]
+        return peaks
+    constants = np.array([joint.torque_per_goal for joint in config.joints])[:, None]
+    return peaks_of(config, position, velocity, torque / constants)
+
+
+def _extreme(before: Array, now: Array) -> Array:
+    most: Array = np.maximum(before, now)
+    most[0] = np.minimum(before[0], now[0])
+    return most
+
+
+def _centre(plan: Plan) -> Array:
+    segment = plan.segments[0]
+    assert isinstance(segment, PathSegment)
+    middle: Array = segment.paths[1].position.mean(axis=1)
+    return middle
+
+
+def _shares(values: Array, limits: Array, rest: Array, centre: Array) -> Array:
+    """Peaks as fractions of the distance to their limits, from rest or the path's centre, whichever is nearer them.
+
+    An arm may well rest close to a limit, where a fraction of what is left would say little."""
+    shares = np.abs(values / limits)
+    low, high = np.minimum(rest, centre), np.maximum(rest, centre)
+    shares[:, 0] = (high - values[:, 0]) / (high - limits[0])
+    shares[:, 1] = (values[:, 1] - low) / (limits[1] - low)
+    return shares
+
+
+def _nearest(space: Space, position: Array, ways: int, rate: float) -> tuple[Nearest, float]:
+    """The tightest moment of a motion with ways of so many samples, and when it is [s]."""
+    every = max(1, round(rate / LOOKED_AT_HZ))
+    count = position.shape[1]
+    parts = (slice(0, ways, every), slice(ways, count - ways, every), slice(count - ways, count, every))
+    found: tuple[Nearest, float] | None = None
+    for part, on_the_way in zip(parts, (True, False, True), strict=True):
+        poses = np.nan_to_num(position[:, part])
+        if on_the_way and poses.shape[1]:
+            kept = ~space.lies(poses)
+            moments = np.flatnonzero(kept)
+            poses = poses[:, kept]
+        else:
+            moments = np.arange(poses.shape[1])
+        if not poses.shape[1]:
+            continue
+        nearest = space.nearest(poses, on_the_way)
+        moment = (part.start + every * int(moments[nearest.sample])) / rate
+        if found is None or nearest.room < found[0].room:
+            found = nearest, moment
+    assert found is not None
+    return found

@@ -1,0 +1,127 @@
+"""What a stop does to an arm in space: lowered where its servos still take commands, fallen where they do not.
+
+From moments all along the planned motion, on arms of the ensemble: the way home as the stream would command it, and the
+fall without torque, up to the first thing that is hit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.space import Nearest, Space
+from hil.config.schema import Config
+from hil.estimator.chain.rollout import ChainArms, Loop, roll_out
+from hil.plan.chain_model import torque_limits
+from hil.plan.chain_plan import PathSegment
+from hil.plan.plan import Plan
+from hil.plan.way_home import WayHome
+
+Array = NDArray[np.float64]
+
+MOMENTS, ARMS = 16, 6
+FALL_S = 1.5
+HARDLY = 0.05  # rad: an arm that ends so near its rest pose lies
+
+
+@dataclass(frozen=True)
+class Fall:
+    """The hardest fall: from which moment [s] of the path, what meets what (None: nothing within FALL_S), after how
+    long [s], how far down [m] and how fast [m/s]; beyond: how far joints get past their limits in any fall (joints,)
+    [rad].
+    """
+
+    moment: float
+    hits: tuple[str, str] | None
+    seconds: float
+    height: float
+    speed: float
+    beyond: Array
+
+
+@dataclass(frozen=True)
+class LoweringForeseen:
+    """seconds: the longest; nearest: the tightest moment; lies: share that ends in the rest pose."""
+
+    seconds: float
+    nearest: Nearest
+    lies: float
+
+
+@dataclass(frozen=True)
+class ChainStops:
+    """Both, from the moments of a plan."""
+
+    fall: Fall
+    lowering: LoweringForeseen
+
+
+def foreseen_stops(config: Config, plan: Plan, arms: ChainArms) -> ChainStops:
+    """Simulate stops from all along the first path. Raises ConfigError, ArmFileError."""
+    segment = plan.segments[0]
+    assert isinstance(segment, PathSegment)
+    few = arms.first(ARMS)
+    path = segment.paths[1]
+    count = path.position.shape[1]
+    moments = np.linspace(0, count, MOMENTS, endpoint=False).astype(int)
+    starts = [(each / plan.rate, path.position[:, each], path.velocity[:, each]) for each in moments]
+    return ChainStops(_hardest(config, plan.rate, few, starts), _lowered(config, plan, segment, few, starts))
+
+
+def _hardest(config: Config, rate: float, arms: ChainArms, starts: list[tuple[float, Array, Array]]) -> Fall:
+    space = Space.of(config)
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    n = len(low)
+    nothing = np.zeros(n)
+    loop = Loop(rate, np.zeros((round(FALL_S * rate), n)), nothing, nothing, np.array(config.arm.rest_pose), nothing)
+    worst: Fall | None = None
+    beyond = np.zeros(n)
+    for moment, position, velocity in starts:
+        motions = roll_out(arms, loop, position, velocity)
+        for arm in range(arms.size):
+            q = motions.position[arm].T
+            q = q[:, np.isfinite(q).all(axis=0)]
+            room = space.room(q, on_the_way=True)
+            hit = np.flatnonzero(room < 0.0)
+            end = int(hit[0]) if hit.size else q.shape[1] - 1
+            until = q[:, : end + 1]
+            beyond = np.maximum(beyond, np.maximum(low - until.min(axis=1), until.max(axis=1) - high))
+            pair = space.nearest(q[:, end : end + 1], on_the_way=True).pair if hit.size else None
+            height, speed = _dropped(space, q[:, 0], q[:, max(end - 1, 0)], q[:, end], rate)
+            if worst is None or (hit.size > 0, speed) > (worst.hits is not None, worst.speed):
+                worst = Fall(moment, pair, end / rate, height, speed, beyond)
+    assert worst is not None
+    return Fall(worst.moment, worst.hits, worst.seconds, worst.height, worst.speed, np.maximum(beyond, 0.0))
+
+
+def _dropped(space: Space, first: Array, before: Array, last: Array, rate: float) -> tuple[float, float]:
+    """How far down the arm's lowest falling point came [m], and how fast its fastest point is [m/s]."""
+    up, _ = space.floor
+    top, former, bottom = (space.ends(pose)[0] for pose in (first, before, last))
+    if not top.size:
+        return 0.0, 0.0
+    return float(((top - bottom) @ up).max()), float(np.linalg.norm(bottom - former, axis=-1).max() * rate)
+
+
+def _lowered(
+    config: Config, plan: Plan, segment: PathSegment, arms: ChainArms, starts: list[tuple[float, Array, Array]]
+) -> LoweringForeseen:
+    assert config.stabiliser is not None  # checked with the configuration
+    way, space, rest = WayHome(config, plan), Space.of(config), np.array(config.arm.rest_pose)
+    stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
+    longest, lies, worst = 0.0, [], None
+    for _, position, velocity in starts:
+        home = way.path(position, velocity)
+        goal = segment.thought.of(home).T + stiffness * (home.position.T - rest) + damping * home.velocity.T
+        loop = Loop(plan.rate, goal, stiffness, damping, rest, torque_limits(config))
+        motions = roll_out(arms, loop, position, velocity)
+        longest = max(longest, len(goal) / plan.rate)
+        for arm in range(arms.size):
+            q = np.nan_to_num(motions.position[arm].T, nan=1e3)
+            lies.append(bool(np.abs(q[:, -1] - rest).max() < HARDLY))
+            kept = ~space.lies(q)
+            if kept.any():
+                nearest = space.nearest(q[:, kept], on_the_way=True)
+                worst = nearest if worst is None or nearest.room < worst.room else worst
+    nothing = Nearest(np.inf, 0.0, ("nothing", "nothing"), 0)
+    return LoweringForeseen(longest, nothing if worst is None else worst, float(np.mean(lies)))

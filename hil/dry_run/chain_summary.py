@@ -1,0 +1,167 @@
+"""A dry run of an arm in space in words and numbers."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from hil.config.schema import Config
+from hil.dry_run.chain_prediction import ChainPrediction
+from hil.dry_run.chain_stop import ChainStops
+from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction, quantities_of
+
+
+@dataclass(frozen=True)
+class ChainDryRun:
+    """share: of the designed path, 1 where [joint_path] gives it. config: with path and stabiliser as they would be
+    played.
+
+    shapes_guessed: links without readable geometry; as_built: pairs of which parts are taken to touch as built.
+    """
+
+    config: Config
+    source: str
+    arms: int
+    share: float
+    foreseen: ChainPrediction
+    stops: ChainStops
+    shapes_guessed: tuple[str, ...]
+    as_built: tuple[tuple[str, str], ...]
+    servos: tuple[str, ...]
+
+    @property
+    def prediction(self) -> Prediction:
+        """The peaks."""
+        return self.foreseen.peaks
+
+    @property
+    def peak_torque(self) -> tuple[float, ...]:
+        """Largest torque of each joint in the middle arm [N m]."""
+        return tuple(float(value) for value in self.prediction.median[QUANTITIES.index("torque")])
+
+    def is_safe(self, config: Config) -> bool:
+        """Whether no arm comes too near anything and the guard would hardly ever stop it."""
+        return not unsafe(config, self.foreseen)
+
+
+def unsafe(config: Config, foreseen: ChainPrediction) -> str:
+    """Why a motion is not safe; nothing where it is."""
+    peaks = foreseen.peaks
+    if not foreseen.is_clear:
+        return f"too near, {foreseen}"
+    touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
+    chance = peaks.limit_chance[:GUARDED]
+    if touched.any() or peaks.stop_chance > config.safety.limit_chance:
+        row, joint = np.unravel_index(int(np.argmax(touched + chance)), chance.shape)
+        return (
+            f"joint {config.joints[int(joint)].name!r} reaches {QUANTITIES[int(row)]} "
+            f"{peaks.quantile[row, joint]:.3g} of {peaks.limits[row, joint]:.3g} in 1 of 100 arms"
+        )
+    return ""
+
+
+def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
+    """One object: verdict, clearance, stops, and per joint every predicted quantity."""
+    config, peaks, fall, lowering = run.config, run.prediction, run.stops.fall, run.stops.lowering
+    median, quantile, chance = peaks.median, peaks.quantile, peaks.limit_chance
+    return {
+        "schema": 1,
+        "config": str(config.path),
+        "source": run.source,
+        "arms": run.arms,
+        "safe": run.is_safe(config),
+        "why_not": unsafe(config, run.foreseen) or None,
+        "limit_chance": config.safety.limit_chance,
+        "share_of_designed_path": run.share,
+        "guard_stop_chance": peaks.stop_chance,
+        "clearance": {
+            "least_m": round(run.foreseen.nearest.distance, 4),
+            "needed_m": round(run.foreseen.nearest.needed, 4),
+            "between": list(run.foreseen.nearest.pair),
+            "role": run.foreseen.role,
+            "time_s": round(run.foreseen.moment, 2),
+            "shapes_guessed": list(run.shapes_guessed),
+            "touch_as_built": [list(pair) for pair in run.as_built],
+        },
+        "lowering": {
+            "longest_s": round(lowering.seconds, 2),
+            "least_m": round(min(lowering.nearest.distance, 1e3), 4),
+            "between": list(lowering.nearest.pair),
+            "lies_share": lowering.lies,
+        },
+        "fall": {
+            "from_s": round(fall.moment, 2),
+            "after_s": round(fall.seconds, 2),
+            "hits": None if fall.hits is None else list(fall.hits),
+            "height_m": round(fall.height, 3),
+            "speed_m_s": round(fall.speed, 2),
+            "beyond_limits_rad": [round(float(value), 3) for value in fall.beyond],
+        },
+        "joints": {
+            joint.name: {
+                name: {
+                    "unit": unit,
+                    "median": float(median[row, index]),
+                    "quantile_99": float(quantile[row, index]),
+                    "limit": float(peaks.limits[row, index]),
+                    "chance": float(chance[row, index]),
+                }
+                for row, (name, unit) in enumerate(quantities_of(config))
+            }
+            for index, joint in enumerate(config.joints)
+        },
+        "servos": list(run.servos),
+    }
+
+
+def print_chain_dry_run(run: ChainDryRun, console: Console) -> None:
+    """Table and verdict for a person."""
+    console.print(_table(run))
+    for line in (*run.servos, *_lines(run)):
+        console.print(line, soft_wrap=True, markup=False)
+
+
+def _table(run: ChainDryRun) -> Table:
+    peaks = run.prediction
+    table = Table(
+        title=f"Dry run of {escape(run.config.path.name)}, {run.arms} arms drawn from the {run.source}",
+        title_justify="left",
+    )
+    for heading in ("joint", "predicted peak", "unit"):
+        table.add_column(heading)
+    for heading in ("median", "99 %", "limit"):
+        table.add_column(heading, justify="right")
+    median, quantile = peaks.median, peaks.quantile
+    for index, joint in enumerate(run.config.joints):
+        for row, (name, unit) in enumerate(quantities_of(run.config)):
+            numbers = (median[row, index], quantile[row, index], peaks.limits[row, index])
+            table.add_row(escape(joint.name) if row == 0 else "", name, unit, *(f"{value:.3g}" for value in numbers))
+        table.add_section()
+    return table
+
+
+def _lines(run: ChainDryRun) -> list[str]:
+    fall, lowering, why = run.stops.fall, run.stops.lowering, unsafe(run.config, run.foreseen)
+    hit = "nothing within 1.5 s" if fall.hits is None else f"{fall.hits[0]} meets {fall.hits[1]}"
+    lines = [
+        "99 %: in 99 of 100 arms, all peaks stay within these values.",
+        f"Least clearance: {run.foreseen}.",
+        f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated arms "
+        f"then lie in the rest pose; least clearance on the way: {lowering.nearest}.",
+        f"Without commands (cable out, program killed, a servo lost) it falls; hardest from {fall.moment:.1f} "
+        f"s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, at {fall.speed:.1f} m/s.",
+    ]
+    if run.shapes_guessed:
+        lines.append(
+            f"No collision geometry could be read of {', '.join(run.shapes_guessed)}: capsules from joint to joint "
+            "stand for it (for a base, nothing)."
+        )
+    if run.as_built:
+        pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
+        lines.append(f"Parts that meet at joints in nearly every pose are taken to be built so: {pairs}.")
+    if run.share < 1.0:
+        lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which this shows.")
+    return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

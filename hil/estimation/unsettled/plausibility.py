@@ -1,0 +1,74 @@
+"""Values of an estimate from a recording made elsewhere that no servo arm has: most often a unit."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hil.estimator.data.recording import Recording
+from hil.estimator.fit.multiple_shooting import ShootingEstimate
+from hil.estimator.models.terms import kind_of, term_of
+
+TORQUE = (2e-3, 300.0)  # N m at the most, of servos from the smallest to the largest
+PENDULUM = (3e-3, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
+SURE = 4.0  # standard errors
+UNKNOWN = 0.5  # standard error over value
+SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less is nothing
+
+
+def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: float) -> list[str]:
+    """One sentence for each value that cannot be. gravity: in the arm's plane [m/s^2]."""
+    return [*_torques(recordings), *_pendulum(estimate, gravity), *_weight(estimate, gravity)]
+
+
+def undetermined(estimate: ShootingEstimate) -> list[str]:
+    """One sentence that names the terms whose value says nothing, since their standard error is as large."""
+    found = [
+        f"{name} ({value:.3g} +- {std:.2g})"
+        for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True)
+        if term_of(name).standstill and not (std < UNKNOWN * abs(value)) and abs(value) > SHOWN
+    ]
+    if not found:
+        return []
+    return [
+        f"Not determined by this motion: {', '.join(found)}. Only together with the others do they describe friction "
+        "near standstill; do not use them by themselves."
+    ]
+
+
+def _torques(recordings: Sequence[Recording]) -> list[str]:
+    found = []
+    for joint in range(recordings[0].joints):
+        most = max(float(np.abs(each.torque[joint]).max()) for each in recordings)
+        if most > TORQUE[1]:
+            found.append(f"Joint {joint + 1}: its torque reaches {most:.3g} N m; no servo has that: check its unit.")
+        elif 0.0 < most < TORQUE[0]:
+            found.append(f"Joint {joint + 1}: its torque is at most {most:.2g} N m: check its unit.")
+    return found
+
+
+def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
+    """inertia gravity / weight is a length, whatever the unit of torque: wrong if those of time or angle are."""
+    if gravity <= 0.0:
+        return []
+    value, names = estimate.parameters, list(estimate.names)
+    weight, inertia = value["gravity_1"], value["inertia_1"]
+    if abs(weight) < SURE * float(estimate.std[names.index("gravity_1")]) or not weight:
+        return []
+    length = inertia * gravity / abs(weight)
+    if PENDULUM[0] < length < PENDULUM[1]:
+        return []
+    return [
+        f"Inertia and weight of joint 1 are those of a pendulum of {length:.2g} m: check the units of time and angle, "
+        "and arm.gravity."
+    ]
+
+
+def _weight(estimate: ShootingEstimate, gravity: float) -> list[str]:
+    found = []
+    for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True):
+        if kind_of(name) == "gravity" and gravity > 0.0 and value < -SURE * std:
+            found.append(
+                f"{name} is {value:.3g} N m, negative: the angle is counted from the other side (columns.zero), or a "
+                "sign is reversed."
+            )
+    return found

@@ -1,0 +1,199 @@
+"""From other tools' files to a folder with a result, as a run of this one has it."""
+
+import json
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hil.arm_model import JointFacts
+from hil.config.csv_columns import Columns, RecordingConfig, load_recording_config
+from hil.errors import ConfigError, CsvError
+from hil.estimation.physical import physical_of
+from hil.estimation.unsettled.estimate import Estimated, estimate_any
+from hil.estimator.baselines.zero import turned_zeros
+from hil.estimator.data.recording import Recording
+from hil.recordings.convert import Converted, convert
+from hil.recordings.files import read_tables
+from hil.recordings.periodic import mean_period
+from hil.recordings.units import split_head
+from hil.results.parts import ArmFacts
+from hil.results.result import ShootingResult
+from hil.runs.recording_folder import Predicted, describe, save
+from hil.runs.run_folder import write_json
+
+MOST_RECORDINGS = 200
+
+
+@dataclass(frozen=True)
+class _Read:
+    """All recordings of one arm. notes: what was guessed, put right or averaged, in sentences."""
+
+    recordings: tuple[Recording, ...]
+    names: tuple[str, ...]
+    stepped: tuple[bool, ...]
+    columns: Columns
+    notes: tuple[str, ...]
+
+
+def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder: Path | None) -> ShootingResult:
+    """The result of one or more files of the same arm, recorded apart; written into `folder`, which exists.
+
+    Raises HilError, EstimationError.
+    """
+    config = RecordingConfig() if config_path is None else load_recording_config(config_path)
+    read = _averaged(_zeroed(_read(paths, config.columns), config.arm.gravity))
+    columns, gravity = read.columns, config.arm.gravity
+    zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
+    shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
+    found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped)
+    result = _named(found, read, gravity)
+    if config.known is not None:
+        result = replace(result, physical=physical_of(result, config.known.quantities(), gravity))
+    if folder is not None:
+        _keep(folder, paths, config_path, config, read, found)
+        write_json(folder / "result.json", result.to_json())
+    return result
+
+
+def _read(paths: Sequence[Path], columns: Columns) -> _Read:
+    found = [convert(table, columns) for path in paths for table in read_tables(path)]
+    if len({len(each.columns.position or ()) for each in found}) > 1:
+        raise ConfigError("The files have different numbers of joints: give recordings of one arm.")
+    recordings = tuple(recording for each in found for recording in each.recordings)
+    if len(recordings) > MOST_RECORDINGS:
+        raise CsvError(f"{len(recordings)} recordings, more than {MOST_RECORDINGS}: give fewer files or episodes.")
+    names = tuple(name for each in found for name in each.names)
+    stepped = tuple(bool(all(flags)) for flags in zip(*(each.stepped for each in found), strict=True))
+    return _Read(_stepped_alike(recordings, found), names, stepped, found[0].columns, _notes(found))
+
+
+def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
+    """One encoder has one step: of what several recordings show, the smallest."""
+    if len(found) == 1:
+        return recordings
+    step = np.min([each.position_step for each in recordings], axis=0)
+    return tuple(replace(each, position_step=step) for each in recordings)
+
+
+def _notes(found: Iterable[Converted]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(note for each in found for note in each.notes))
+
+
+def _zeroed(read: _Read, gravity: float) -> _Read:
+    """Angles counted from the horizontal, where nobody said from where and gravity does."""
+    if gravity <= 0.0 or read.columns.zero is not None:
+        return read
+    zeros = turned_zeros(read.recordings)
+    if zeros is None:
+        return read
+    quarter = np.pi / 2.0
+    whole = np.round(zeros / quarter) * quarter
+    zeros = np.where(np.abs(zeros - whole) < 0.2, whole, zeros)
+    moved = tuple(replace(each, position=each.position + zeros[:, None]) for each in read.recordings)
+    listed = ", ".join(f"{zero:.4g}" for zero in zeros)
+    said = (
+        f"Gravity says that joint 1 is not counted from the horizontal: zero = [{listed}] rad was added. If that is "
+        "wrong, set columns.zero."
+    )
+    columns = read.columns.model_copy(update={"zero": zeros.tolist()})
+    return replace(read, recordings=moved, columns=columns, notes=(*read.notes, said))
+
+
+def _averaged(read: _Read) -> _Read:
+    recordings, notes = [], list(read.notes)
+    for name, recording in zip(read.names, read.recordings, strict=True):
+        mean = mean_period(recording) if read.columns.between == "held" else None
+        recordings.append(recording if mean is None else mean.recording)
+        if mean is not None:
+            notes.append(
+                f"{name}: periodic; the mean of {mean.periods} settled periods of {mean.seconds:g} s was used."
+            )
+    return replace(read, recordings=tuple(recordings), notes=tuple(notes))
+
+
+def _named(found: Estimated, read: _Read, gravity: float) -> ShootingResult:
+    result = found.result
+    zeros = result.zeros
+    if zeros is not None:
+        zeros = tuple(replace(zero, recording=name) for name, zero in zip(read.names, zeros, strict=True))
+    arm = _arm(read, gravity)
+    notes = [*read.notes, *_back_emf(read.columns, result)]
+    return replace(result, recordings=read.names, zeros=zeros, arm=arm, notes=tuple(notes))
+
+
+def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
+    """A motor on a voltage is braked by its own turning, which counts as viscous friction."""
+    gains = columns.gains
+    if columns.drive not in {"voltage", "pwm"} or gains is None:
+        return []
+    if columns.torque_constant is None:
+        return ["Driven by voltage: viscous friction includes the braking by back-EMF."]
+    parts = [
+        f"joint {joint + 1} {gain * constant:.3g} of {result.parameters[f'viscous_{joint + 1}'].value:.3g} N m s/rad"
+        for joint, (gain, constant) in enumerate(zip(gains, columns.torque_constant, strict=True))
+    ]
+    return [f"Driven by voltage: viscous friction includes the braking by back-EMF, {', '.join(parts)}."]
+
+
+def _arm(read: _Read, gravity: float) -> ArmFacts:
+    """What the recordings say of the joints: their limits are what was seen."""
+    columns = read.columns
+    gains = columns.gains or [1.0] * len(columns.position or ())
+    joints = []
+    for joint, (name, gain) in enumerate(zip(_joint_names(columns.position or ()), gains, strict=True)):
+        position = np.concatenate([each.position[joint] for each in read.recordings])
+        speed = np.concatenate([np.diff(each.filled()[joint]) / np.diff(each.time) for each in read.recordings])
+        goal = max(float(np.abs(each.torque[joint]).max()) for each in read.recordings) / gain
+        joints.append(
+            JointFacts(
+                name,
+                "unknown",
+                "pwm" if columns.drive in {"voltage", "pwm"} else "current",
+                gain,
+                0.0,
+                goal,
+                (float(np.nanmin(position)), float(np.nanmax(position))),
+                float(np.percentile(np.abs(speed), 99.9)),
+            )
+        )
+    rest = read.recordings[0].filled()[:, 0]
+    return ArmFacts(gravity, tuple(rest.tolist()), tuple(joints))
+
+
+def _joint_names(columns: Sequence[str]) -> list[str]:
+    """What the columns call the joints; numbers where they name none."""
+    last = [re.split(r"[./]", split_head(name)[0])[-1] for name in columns]
+    named = len(set(last)) == len(last) and not any(re.search(r"\d", name) for name in last) and len(last) > 1
+    return last if named else [f"joint_{number}" for number in range(1, len(columns) + 1)]
+
+
+def _keep(
+    folder: Path,
+    paths: Sequence[Path],
+    config_path: Path | None,
+    config: RecordingConfig,
+    read: _Read,
+    found: Estimated,
+) -> None:
+    kept = [
+        Predicted(name, each.time, each.torque, each.position, predicted)
+        for name, each, predicted in zip(read.names, read.recordings, found.predicted, strict=True)
+    ]
+    text = _as_toml(config, read.columns) if config_path is None else config_path.read_text(encoding="utf-8-sig")
+    save(folder, describe("" if config_path is None else str(config_path), paths, read.notes), text, kept)
+
+
+def _as_toml(config: RecordingConfig, columns: Columns) -> str:
+    """A configuration with which the same files give the same result."""
+    lines = [
+        "# What `hil estimate` took the columns for.",
+        "[arm]",
+        f"gravity = {config.arm.gravity!r}",
+        "",
+        "[columns]",
+    ]
+    given = columns.model_dump(exclude_none=True)
+    return "\n".join([*lines, *(f"{key} = {json.dumps(value)}" for key, value in given.items())]) + "\n"

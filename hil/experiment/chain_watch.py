@@ -1,0 +1,104 @@
+"""The dry run's model beside the experiment of an arm in space: could any arm of the ensemble have moved like this?
+
+Prior knowledge is the ensemble's mean and widened covariance: drawn about the description, or what the steps of a pilot
+left of it. While the arm lies in its rest pose, something else may carry it, and nothing is judged.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.state import State
+from hil.dry_run.chain_prior import prior_arms
+from hil.errors import Cause, SafetyStop
+from hil.estimator.chain.motion_observer import ChainObserver
+from hil.estimator.chain.rollout import ChainArms
+from hil.plan.chain_model import known_chain
+
+Array = NDArray[np.float64]
+
+ARMS = 96
+WIDENED = 1.5
+"""Times the ensemble's standard deviations: what its arms lack is none of their parameters."""
+
+LYING_RAD = 0.08
+_FRICTIONS = 8.0
+"""Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
+an alarm."""
+_RELATIVE_STD = 0.05
+_STILL_RAD_S = 0.06
+
+
+class ChainWatch:
+    """Looks at every sample; raises SafetyStop. planned: largest goal of each joint [A, or V under PWM]."""
+
+    def __init__(self, config: Config, planned: Sequence[float], arms: ChainArms | None = None) -> None:
+        arms = prior_arms(config, known_chain(config), ARMS) if arms is None else arms
+        self._constants = np.array([joint.torque_per_goal for joint in config.joints])
+        mean, covariance = observed_parameters(arms)
+        n = len(self._constants)
+        # A light joint's torque is hardly more than dry friction, whose behaviour near standstill is not in the model.
+        largest = np.maximum(self._constants * np.array(planned), _FRICTIONS * mean[len(mean) - 2 * n : len(mean) - n])
+        self._observer = ChainObserver(arms.base, mean, covariance, largest, 1.0 / config.experiment.rate)
+        self._names = [joint.joint.title for joint in config.joints]
+        self._rest = np.array(config.arm.rest_pose)
+        self._goal: Sequence[float] | None = None
+        self._seen_at = 0.0
+
+    def look(self, state: State) -> None:
+        """Process the latest sample; raises SafetyStop if no arm in the ensemble could have moved like this."""
+        if any(state.missing):
+            return
+        goal, self._goal = self._goal, state.goal_current
+        seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
+        if goal is None:
+            goal, seconds = state.goal_current, float("inf")
+        position = np.array(state.position)
+        is_free = bool(np.abs(position - self._rest).max() > LYING_RAD)
+        torque = self._constants * goal
+        joint = self._observer.observe(position, np.array(state.velocity), torque, seconds, is_free)
+        if joint >= 0:
+            self._raise(joint, state)
+
+    def _raise(self, joint: int, state: State) -> None:
+        lacking = self._observer.lacking[joint]
+        name = self._names[joint]
+        if abs(state.velocity[joint]) < _STILL_RAD_S:
+            said = (
+                f"{name} stands still although {abs(lacking):.3f} N m drive it, which would move any arm consistent "
+                "with the prior and the data so far. Something holds it, it is stuck, or its encoder is frozen."
+            )
+        else:
+            said = (
+                f"{name} does not move like any arm consistent with the prior and the data so far: "
+                f"{lacking:+.3f} N m of the commanded torque do not show in its motion. Its motor or its "
+                "encoder has failed, something pushes or holds it, or the arm is not the one described."
+            )
+        raise SafetyStop(said, Cause.UNEXPECTED)
+
+
+def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
+    """Mean and covariance of an ensemble's base parameters, viscous and dry friction and offsets, in units of the
+    commanded torque, widened."""
+    drawn = linear_parameters(arms)
+    mean = drawn.mean(axis=0)
+    covariance = WIDENED**2 * np.cov(drawn.T) + np.diag((_RELATIVE_STD * mean) ** 2 + 1e-12)
+    n = arms.drive.shape[2]
+    offset = slice(len(mean) - n, len(mean))
+    at = np.arange(len(mean))[offset]
+    covariance[at, at] += (0.5 * mean[len(mean) - 2 * n : len(mean) - n]) ** 2
+    return mean, np.asarray(covariance)
+
+
+def linear_parameters(arms: ChainArms) -> Array:
+    """Of each arm the base parameters, viscous and dry friction, offsets (arms, base + 3 joints) per commanded torque.
+
+    Torque constants that are all off alike scale everything. Where joints differ, a base parameter, which several
+    joints feel, is taken by the first of them.
+    """
+    scale = arms.drive[:, 4]
+    owner = np.array([int(name.rpartition("_")[2]) - 1 for name in arms.base.names])
+    drive = arms.drive[:, :3] / scale[:, None, :]
+    return np.concatenate((arms.rigid / scale[:, owner], drive.reshape(arms.size, -1)), axis=1)

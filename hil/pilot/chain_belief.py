@@ -1,0 +1,176 @@
+"""Arms in space that could be the real one, and what a run teaches of them.
+
+Torque is linear in base parameters and friction, so each arm is moved by a randomised maximum a posteriori step (Y.
+Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1): as if it were the prior's mean and the recording had other
+noise. What a motion says nothing of keeps its spread.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+
+from hil.config.schema import Config, StabiliserConfig
+from hil.dry_run.chain_prior import prior_arms
+from hil.estimator.chain.rollout import ChainArms, inertias, is_physical
+from hil.experiment.chain_watch import linear_parameters
+from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
+from hil.runs.recording import Phase
+
+Array = NDArray[np.float64]
+
+DRAWN = 400
+TAUGHT_HZ = 25.0  # rows a second that a recording is worth
+FREQUENCY, DAMPING_RATIO = 3.0, 0.7
+"""Of each joint on the stabiliser's spring [Hz]."""
+
+MOST_DAMPING = 0.2
+"""Of a joint's velocity, with the others free: the most that the damper takes away in a sample."""
+
+_CUT_OFF_TIMES = 6.0  # times the path's highest frequency
+_WIDTH = 0.05  # rad/s
+_LYING_RAD = 0.08
+_NOISE_TIMES = 2.0  # residuals are not white
+_LEAST_NOISE_SHARE = 0.005  # of a joint's largest torque
+_MODEL_SPREAD = 0.01  # of every parameter: what the model lacks
+_RIDGE = 1e-4
+_FEWEST_ROWS = 50
+_LEAST_FRICTION_SHARE = 1e-4
+_POSES = 12
+_ARMS = 40
+_HALVINGS = 6
+
+
+@dataclass(frozen=True)
+class ChainBelief:
+    """arms: as many as were drawn; to be simulated is a part of them."""
+
+    config: Config
+    arms: ChainArms
+
+    @classmethod
+    def prior(cls, config: Config) -> "ChainBelief":
+        """Before anything was played. Raises ArmFileError."""
+        return cls(config, prior_arms(config, known_chain(config), DRAWN))
+
+    @property
+    def torque(self) -> ChainTorque:
+        """What the arm in the middle takes for a motion, per commanded torque."""
+        mean = linear_parameters(self.arms).mean(axis=0)
+        count, n = self.arms.base.count, self.arms.drive.shape[2]
+        return ChainTorque(self.arms.base, mean[:count], *mean[count:].reshape(3, n))
+
+    def with_stabiliser(self, given: Config) -> Config:
+        """The configuration, with gains for the arms as they are thought to be unless it names its own."""
+        if given.stabiliser is not None:
+            return given
+        low, high = np.array([joint.position_limit for joint in given.joints]).T
+        poses = np.random.default_rng(2).uniform(low, high, (_POSES, len(low)))
+        held, free = inertias(self.arms.first(_ARMS), poses)
+        # A damper acts on what it feels a sample later: more than this and a light joint would shake.
+        turn = 2.0 * np.pi * FREQUENCY
+        damping = 2.0 * DAMPING_RATIO * turn * np.median(held, axis=0)
+        most = MOST_DAMPING * given.experiment.rate * np.maximum(free.min(axis=0), 0.0)
+        share = np.minimum(1.0, most / damping)
+        damping = share * damping
+        stiffness = share * turn**2 * np.median(held, axis=0)
+        gains = StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
+        return given.model_copy(update={"stabiliser": gains})
+
+    def learn(self, config: Config, samples: NDArray[np.void]) -> "ChainBelief":
+        """What is thought after this recording; the same where it says next to nothing."""
+        rows = _rows(self.arms, config, samples)
+        if rows is None:
+            return self
+        Y, torque = rows
+        drawn = linear_parameters(self.arms)
+        covariance = np.cov(drawn.T)
+        covariance += np.diag(_RIDGE * np.diag(covariance) + 1e-14)
+        known = np.linalg.inv(covariance)
+        mean = drawn.mean(axis=0)
+        noise = _LEAST_NOISE_SHARE * torque_limits(config)
+        for _ in range(3):  # the noise is that of what the fit leaves
+            weight = (1.0 / noise**2)[:, None, None]
+            spread = np.linalg.inv(known + np.einsum("jki,jkl->il", Y * weight, Y))
+            fitted = mean + spread @ np.einsum("jki,jk->i", Y * weight, torque - Y @ mean)
+            left = np.sqrt(np.mean((torque - Y @ fitted) ** 2, axis=1))
+            noise = np.maximum(_NOISE_TIMES * left, _LEAST_NOISE_SHARE * torque_limits(config))
+        random = np.random.default_rng(len(torque[0]))
+        weight = (1.0 / noise**2)[:, None, None]
+        moved = np.empty_like(drawn)
+        for arm, each in enumerate(drawn):
+            shaken = torque + noise[:, None] * random.standard_normal(torque.shape)
+            moved[arm] = each + spread @ np.einsum("jki,jk->i", Y * weight, shaken - Y @ each)
+        moved += _MODEL_SPREAD * np.abs(fitted) * random.standard_normal(moved.shape)
+        return ChainBelief(self.config, self._arms(moved))
+
+    def _arms(self, linear: Array) -> ChainArms:
+        """Arms of these parameters, per commanded torque; what could not move is drawn towards the mean."""
+        base, drive = self.arms.base, self.arms.drive.copy()
+        n = drive.shape[2]
+        least = _LEAST_FRICTION_SHARE * torque_limits(self.config)
+        mean = linear.mean(axis=0)
+        low, high = np.array([joint.position_limit for joint in self.config.joints]).T
+        poses = np.random.default_rng(3).uniform(low, high, (_POSES, n))
+        for _ in range(_HALVINGS):
+            arms = ChainArms(base, linear[:, : base.count], drive)
+            bad = ~is_physical(arms, poses)
+            if not bad.any():
+                break
+            linear = np.where(bad[:, None], 0.5 * (linear + mean), linear)
+        good = is_physical(ChainArms(base, linear[:, : base.count], drive), poses)
+        linear = linear[good] if good.any() else linear_parameters(self.arms)
+        drive = drive[good] if good.any() else drive
+        drive[:, :3] = linear[:, base.count :].reshape(-1, 3, n)
+        drive[:, :2] = np.maximum(drive[:, :2], least)
+        drive[:, 4] = 1.0
+        return ChainArms(base, linear[:, : base.count].copy(), drive)
+
+
+def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[Array, Array] | None:
+    """Regressor (joints, rows, parameters) and commanded torque (joints, rows) [N m] of the moving part."""
+    rate, n = config.experiment.rate, len(config.joints)
+    phases = (Phase.RAMP_IN, Phase.PERIODIC, Phase.RAMP_OUT)
+    rows = np.nonzero(np.isin(samples["phase"], phases) & (samples["segment"] == 0))[0]
+    band = config.experiment.band
+    highest = 1.0 if band is None else band[1]
+    if rows.size < 2 * rate / highest:
+        return None
+    played = samples[rows[0] : rows[-1] + 1]
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    cut_off = min(_CUT_OFF_TIMES * highest, 0.2 * rate)
+    smooth = butter(4, cut_off, fs=rate, output="sos")
+    position = sosfiltfilt(smooth, _filled(played["position"]), axis=0)
+    torque = sosfiltfilt(smooth, played["goal_current"] * constants, axis=0)
+    velocity = np.gradient(position, 1.0 / rate, axis=0)
+    acceleration = np.gradient(velocity, 1.0 / rate, axis=0)
+    is_free = np.abs(position - np.array(config.arm.rest_pose)).max(axis=1) > _LYING_RAD
+    some = np.nonzero(is_free)[0][:: max(1, round(rate / TAUGHT_HZ))]
+    if some.size < _FEWEST_ROWS:
+        return None
+    q, v, a = (np.ascontiguousarray(each[some].T) for each in (position, velocity, acceleration))
+    rigid = arms.base.regressor(q, v, a)
+    Y = np.zeros((n, some.size, rigid.shape[2] + 3 * n))
+    Y[:, :, : rigid.shape[2]] = rigid
+    for joint in range(n):
+        at = rigid.shape[2] + joint
+        Y[joint, :, at] = v[joint]
+        Y[joint, :, at + n] = np.tanh(v[joint] / _WIDTH)
+        Y[joint, :, at + 2 * n] = 1.0
+    return Y, torque[some].T
+
+
+def _filled(position: Array) -> Array:
+    """Missing samples by interpolation."""
+    filled = np.array(position, dtype=np.float64)
+    at = np.arange(len(filled))
+    for column in filled.T:
+        missing = np.isnan(column)
+        if missing.any() and not missing.all():
+            column[missing] = np.interp(at[missing], at[~missing], column[~missing])
+    return filled
+
+
+def _rounded(values: Array) -> list[float]:
+    return [float(f"{value:.3g}") for value in values]

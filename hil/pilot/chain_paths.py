@@ -1,0 +1,110 @@
+"""The paths of a pilot of an arm in space: designed once for all steps, played smaller in the first ones."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.space import Space
+from hil.config.schema import Config
+from hil.errors import NoSafeTorque
+from hil.estimator.chain.excitation import Path
+from hil.estimator.chain.path_design import Design, PathDesigner, PathLimits
+from hil.estimator.errors import ExcitationError
+from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
+from hil.plan.chain_plan import path_plan
+from hil.plan.plan import HELD_OUT, Plan
+
+Array = NDArray[np.float64]
+
+BAND = (0.1, 1.5)
+"""Hz, where the configuration names none."""
+
+POSITION_ROOM = 0.08  # of a joint's range, left to errors of what is known
+SPEED_SHARE = 0.6  # of velocity_limit
+TORQUE_SHARE = 0.65
+EXTRA_ROOM = 0.01  # m beyond the margin, left to the distance from the path
+RAMP_SPEED = 1.2  # rad/s, or this share of velocity_limit, on the way
+RAMP_SPEED_SHARE = 0.35
+_PEAK = 1.875
+_WAY_POSES = 40
+
+
+@dataclass(frozen=True)
+class Paths:
+    """The designed paths.
+
+    identify: optimised; held_out: around the same centre, with random phases; plain: worst relative standard errors of
+    random paths within the same limits.
+    """
+
+    config: Config
+    designer: PathDesigner
+    identify: Design
+    held_out: Design
+
+    @classmethod
+    def of(cls, config: Config, thought: ChainTorque) -> "Paths":
+        """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError."""
+        known, space = known_chain(config), Space.of(config)
+        most, rest = TORQUE_SHARE * torque_limits(config), np.array(config.arm.rest_pose)
+        low, high = np.array([joint.position_limit for joint in config.joints]).T
+        speed = SPEED_SHARE * np.array([joint.velocity_limit for joint in config.joints])
+        room = POSITION_ROOM * (high - low)
+        experiment = config.experiment
+        assert experiment.band is not None  # set by `chain_config`
+
+        def allowed(path: Path) -> bool:
+            if (np.abs(thought.of(path)).max(axis=1) > most).any():
+                return False
+            if space.room(path.position).min() < EXTRA_ROOM:
+                return False
+            return bool(
+                space.room(_ways(path, rest, experiment.ramp / experiment.period), on_the_way=True).min() >= 0.0
+            )
+
+        limits = PathLimits(low + room, high - room, speed, allowed)
+        try:
+            designer = PathDesigner(
+                known.base, known.prior, experiment.rate, experiment.period, experiment.band[1], limits
+            )
+            best = designer.design(experiment.seed)
+            other = designer.plain(best.centre, experiment.seed + 1)
+        except ExcitationError as error:
+            raise NoSafeTorque(
+                f"{config.path}: {error}. Widen position_limit, raise current_limit, correct [clearance], or give "
+                "[joint_path] and pilot = false."
+            ) from error
+        return cls(config, designer, best, other)
+
+    def plan(self, config: Config, thought: ChainTorque, share: float) -> Plan:
+        """What is played at this share of the amplitude."""
+
+        def path(_: Config, role: str, __: int) -> Path:
+            return self.designer.scaled(self.held_out if role == HELD_OUT else self.identify, share)
+
+        return path_plan(config, thought, path)
+
+
+def chain_config(config: Config) -> Config:
+    """The configuration with a band, and a ramp that reaches every pose within the limits at a calm speed."""
+    experiment = config.experiment
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    rest = np.array(config.arm.rest_pose)
+    farthest = np.maximum(high - rest, rest - low) * (1.0 - POSITION_ROOM)
+    fastest = np.minimum(RAMP_SPEED, RAMP_SPEED_SHARE * np.array([joint.velocity_limit for joint in config.joints]))
+    ramp = max(experiment.ramp, float((_PEAK * farthest / fastest).max()))
+    band = experiment.band or list(BAND)
+    ramp = float(np.ceil(min(ramp, 0.6 * experiment.period, 60.0) * 10) / 10)
+    return config.model_copy(update={"experiment": experiment.model_copy(update={"band": band, "ramp": ramp})})
+
+
+def _ways(path: Path, rest: Array, share: float) -> Array:
+    """Poses on the ways between the rest pose and a path (joints, poses), as `hil.plan.chain_plan` blends them."""
+    samples = path.position.shape[1]
+    s = np.linspace(0.0, 1.0, _WAY_POSES)
+    blend = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    before = np.round((s - 1.0) * share * samples).astype(int) % samples
+    after = np.round((1.0 - s) * share * samples).astype(int) % samples
+    ways = [rest[:, None] + blend * (path.position[:, at] - rest[:, None]) for at in (before, after)]
+    return np.concatenate(ways, axis=1)

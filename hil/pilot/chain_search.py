@@ -1,0 +1,204 @@
+"""From URDF, limits and rest pose to an identified arm in space: pilot, then up, then the full run.
+
+pilot     a small share of the designed path, safe for every arm that could be this one
+raise     the largest share that is safe for the arms that are left
+full      the designed path at that share, and one to be predicted
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
+from hil.dry_run.chain_summary import unsafe
+from hil.dry_run.prediction import peaks_of
+from hil.errors import ExperimentError, NoSafeTorque
+from hil.estimation.settled_estimate import estimate_run
+from hil.experiment.run import run_experiment
+from hil.experiment.stop_request import StopRequest
+from hil.experiment.stream import Watch
+from hil.pilot.chain_belief import ChainBelief
+from hil.pilot.chain_paths import Paths, chain_config
+from hil.pilot.steps import Say, Step, tells_of_the_arm
+from hil.plan.plan import Plan
+from hil.results.result import SettledResult
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
+from hil.setup.servo_session import servo_session
+
+Array = NDArray[np.float64]
+
+SEARCH_ARMS, ARMS = 24, 72
+"""Arms simulated while a share is looked for, and of the share that was found."""
+
+PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
+SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4)
+MOST_STEPS = 6
+AFTER_LIMIT = 0.7
+RAISED = 1.3
+"""Times the share of the run before: for less no step is made between the pilot and the full run."""
+
+MOST_RAISE = 2.5
+"""Largest ratio of a step's share of the amplitude to that of the previous run."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A safe share of the amplitude, with its plan and the predicted motion."""
+
+    share: float
+    plan: Plan
+    foreseen: ChainPrediction
+
+
+@dataclass
+class ChainSearch:
+    """Runs so far and the current belief."""
+
+    given: Config
+    run: RunFolder
+    shown_path: Path
+    watch: Watch
+    say: Say
+    belief: ChainBelief
+    paths: Paths
+    steps: list[Step] = field(default_factory=list)
+    cap: float = 1.0
+
+    @classmethod
+    def of(cls, config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> "ChainSearch":
+        """At the beginning: the paths designed. Raises NoSafeTorque, ConfigError, ArmFileError."""
+        config = chain_config(config)
+        belief = ChainBelief.prior(config)
+        paths = Paths.of(config, belief.torque)
+        say(
+            f"Designed a path that leaves the least certain base parameter {100 * paths.identify.worst:.2g} % of its "
+            f"prior spread; the held-out one, of random phases, {100 * paths.held_out.worst:.2g} %."
+        )
+        return cls(config, run, shown_path, watch, say, belief, paths)
+
+    @property
+    def config(self) -> Config:
+        """The configuration with a stabiliser for the arm as it is thought to be."""
+        return self.belief.with_stabiliser(self.given)
+
+    def safe(self, config: Config, shares: tuple[float, ...]) -> Found:
+        """The first of the shares that is safe for all arms. Raises NoSafeTorque."""
+        said = ""
+        for share in shares:
+            plan = self.paths.plan(config, self.belief.torque, share)
+            foreseen = predict_chain(config, plan, self.belief.arms.first(SEARCH_ARMS))
+            said = said or unsafe(config, foreseen)
+            if unsafe(config, foreseen):
+                continue
+            foreseen = predict_chain(config, plan, self.belief.arms.first(ARMS))
+            if not unsafe(config, foreseen):
+                return Found(share, plan, foreseen)
+            said = unsafe(config, foreseen)
+        raise NoSafeTorque(
+            f"{config.path}: no motion is safe for all arms that could be this one, not even {100 * shares[-1]:.0f} % "
+            f"of the designed path: {said}. Describe the arm's masses better, or leave it more room."
+        )
+
+    def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
+        """Play one step, compare with what was foreseen, learn."""
+        config = step_config(self.config)
+        found = self.safe(config, shares)
+        below = self.run.below(folder, config)
+        error = self.play(config, below, name, found)
+        if error is not None:
+            self.cap = min(self.cap, AFTER_LIMIT * found.share)
+        self.learn(config, below)
+        return found
+
+    def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
+        """Play a run; what ended it, where that tells of the arm alone. Raises what a run raises otherwise."""
+        error = None
+        try:
+            self.torque = run_experiment(config, folder, self.shown_path, self.watch, found.plan, self.belief.arms)
+        except ExperimentError as stopped:
+            if not tells_of_the_arm(stopped):
+                raise
+            self.torque, error = " ".join(getattr(stopped, "__notes__", [])), stopped
+        self._compare(config, folder, name, found, error)
+        return error
+
+    def learn(self, config: Config, folder: RunFolder) -> None:
+        """What the recording in a folder says of the arm."""
+        self.belief = self.belief.learn(config, load_samples(folder.samples_path, len(config.joints)))
+
+    def _compare(
+        self, config: Config, folder: RunFolder, name: str, found: Found, error: ExperimentError | None
+    ) -> None:
+        samples = load_samples(folder.samples_path, len(config.joints))
+        peaks = peaks_of(config, samples["position"].T, samples["velocity"].T, samples["goal_current"].T)
+        foreseen = found.foreseen.peaks
+        torque = found.plan.segments[0].peak_goal * np.array([joint.torque_per_goal for joint in config.joints])
+        step = Step(name, torque, foreseen.median, foreseen.quantile, peaks, str(error or ""))
+        self.steps.append(step)
+        self.say(f"{name}: {100 * found.share:.0f} % of the path. {step} Least clearance foreseen: {found.foreseen}.")
+        if error is not None:
+            self.say(f"{name} ended early: {error} {self.torque}")
+        elif not step.within:
+            self.say(
+                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
+                "assumed."
+            )
+
+
+def identify_chain_in_steps(
+    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
+) -> tuple[str, SettledResult]:
+    """Identify a spatial arm from its description, limits and rest pose. Returns the torque state and the result.
+
+    Raises what a run raises, and NoSafeTorque.
+    """
+    with StopRequest(), servo_session(config, run.path, say):
+        search = ChainSearch.of(config, run, shown_path, watch, say)
+        found = search.step("Pilot", "pilot", PILOT_SHARES)
+        last = found.share
+        while len(search.steps) < MOST_STEPS:
+            shares = tuple(search.cap * share for share in SHARES)
+            wanted = search.safe(step_config(search.config), shares)
+            if wanted.share <= RAISED * last and search.cap == 1.0:
+                break
+            if len(search.steps) > 1 and wanted.share <= MOST_RAISE * last:
+                break
+            number = len(search.steps) + 1
+            share = min(wanted.share, MOST_RAISE * last)
+            last = search.step(
+                f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6))
+            ).share
+        torque = _full(search)
+        result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
+    run.write_result(result)
+    return torque, result
+
+
+def _full(search: ChainSearch) -> str:
+    """The full run, smaller where it passes a limit or never settles."""
+    tries = 3
+    for number in range(1, tries + 1):
+        config = search.config
+        found = search.safe(config, tuple(search.cap * share for share in SHARES))
+        search.run.write_played(config)
+        error = search.play(config, search.run, "Full run", found)
+        if error is None:
+            return search.torque
+        if number == tries:
+            raise error
+        search.learn(config, search.run)
+        search.say("Repeating with less amplitude.")
+        search.run.set_aside(f"stopped-{number}", config)
+        search.cap = AFTER_LIMIT * found.share
+    raise AssertionError  # the loop returns or raises
+
+
+def step_config(config: Config) -> Config:
+    """The configuration of a step: one path, played for two periods whether or not it settles."""
+    update: dict[str, Any] = {"held_out": False, "max_settling_periods": 1, "periods": 1, "settle_within": 0.99}
+    return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})

@@ -1,0 +1,110 @@
+"""The way on which a stop lowers an arm in space: from any pose to the rest pose, clear of everything, in bounded time.
+
+Straight where that is clear; otherwise straight to the first pose of the planned way there from which that way leads
+home, since it has been foreseen as clear.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.space import Space
+from hil.config.schema import Config
+from hil.estimator.chain.excitation import Path
+from hil.plan.chain_plan import SETTLE_IN, PathSegment
+from hil.plan.plan import Plan
+
+Array = NDArray[np.float64]
+
+STATIONS = 16
+"""Poses of the planned way at which an arm may join it."""
+
+LOOKED_AT = 25  # poses of a straight line
+PEAK = 1.875  # of a fifth-order polynomial's speed over its mean
+SHORTEST_S = 0.6
+ROUNDED_S = 0.16  # over which a corner between two straight lines is rounded off
+BRAKING = 40.0  # rad/s^2
+SHORTEST_BRAKE_S, LONGEST_BRAKE_S = 0.05, 0.2
+_ALLOWED_M = 0.001
+
+
+class WayHome:
+    """Ways to the rest pose; made before torque is on."""
+
+    def __init__(self, config: Config, plan: Plan) -> None:
+        segment = plan.segments[0]
+        assert isinstance(segment, PathSegment)
+        self._rate = plan.rate
+        self._speed, self._longest = config.safety.lower_speed, config.safety.lower_time
+        self._rest = np.array(config.arm.rest_pose)
+        self._space = Space.of(config)
+        there = segment.paths[0].position
+        chosen = np.unique(np.linspace(0, there.shape[1] - 1, STATIONS).round().astype(int))
+        self._stations = there[:, chosen]
+        self.poses(self._rest)  # compiled
+
+    @property
+    def space(self) -> Space:
+        """What it keeps clear of."""
+        return self._space
+
+    def poses(self, pose: Array) -> Array:
+        """Corners of the way from a pose (joints,) to the rest pose (joints, corners)."""
+        least = min(0.0, float(self._space.room(pose[:, None], on_the_way=True)[0])) - _ALLOWED_M
+        best, best_room = 0, -np.inf
+        for station in range(self._stations.shape[1]):
+            room = float(self._space.room(_line(pose, self._stations[:, station]), on_the_way=True).min())
+            if room > best_room:
+                best, best_room = station, room
+            if room >= least:
+                break
+        return np.column_stack((pose, self._stations[:, best::-1], self._rest))
+
+    def path(self, pose: Array, velocity: Array) -> Path:
+        """The whole way: braked from `velocity`, then home, at the rate of the stream."""
+        slowing = np.clip(np.abs(velocity).max() / BRAKING, SHORTEST_BRAKE_S, LONGEST_BRAKE_S)
+        count = max(2, round(slowing * self._rate))
+        time = np.arange(count) / self._rate
+        fall = velocity[:, None] / (count / self._rate)
+        braked = pose[:, None] + velocity[:, None] * time - 0.5 * fall * time**2
+        stopped = pose + 0.5 * velocity * count / self._rate
+        home = self._along(self.poses(stopped))
+        speed, bend = self._slopes(home)
+        return Path(
+            np.column_stack((braked, home)),
+            np.column_stack((velocity[:, None] - fall * time, speed)),
+            np.column_stack((np.broadcast_to(-fall, braked.shape), bend)),
+        )
+
+    def seconds(self, corners: Array) -> float:
+        """How long the way over these corners takes."""
+        return float(np.clip(PEAK * _lengths(corners).sum() / self._speed, SHORTEST_S, self._longest))
+
+    def _along(self, corners: Array) -> Array:
+        """Positions (joints, samples) along straight lines, rounded off, from standstill to standstill."""
+        lengths = _lengths(corners)
+        at = np.concatenate(([0.0], np.cumsum(lengths)))
+        s = np.linspace(0.0, 1.0, max(2, round(self.seconds(corners) * self._rate)))
+        along = at[-1] * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        line = np.stack([np.interp(along, at, row) for row in corners])
+        width = max(1, round(ROUNDED_S * self._rate))
+        smooth = np.pad(line, ((0, 0), (width - 1, width - 1)), mode="edge")
+        for _ in range(2):  # twice: its speed, too, then changes without a jump
+            smooth = np.apply_along_axis(np.convolve, 1, smooth, np.full(width, 1.0 / width), "valid")
+        still = np.repeat(line[:, -1:], round(2 * SETTLE_IN * self._rate), axis=1)
+        return np.column_stack((smooth, still))
+
+    def _slopes(self, position: Array) -> tuple[Array, Array]:
+        speed = np.gradient(position, 1.0 / self._rate, axis=1)
+        return speed, np.gradient(speed, 1.0 / self._rate, axis=1)
+
+
+def _line(first: Array, last: Array) -> Array:
+    share = np.linspace(0.0, 1.0, LOOKED_AT)
+    line: Array = first[:, None] + share * (last - first)[:, None]
+    return line
+
+
+def _lengths(corners: Array) -> Array:
+    """Of the joint that moves most, from corner to corner (corners - 1,) [rad]."""
+    lengths: Array = np.abs(np.diff(corners, axis=1)).max(axis=0)
+    return lengths

@@ -1,0 +1,141 @@
+"""Rows as they come: without a time, twice, out of order, with gaps or holes. What is done about each is said."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.errors import CsvError
+from hil.estimator.data.recording import LONGEST_GAP, MOST_GAP
+
+Values = NDArray[np.float64]
+
+FEW = 0.02  # of the rows: what may be put right, if it is said
+LONGEST_HOLE = 0.05  # s of torque that are filled in
+RESTART = 0.2  # s: a time that goes back by more begins a new recording
+
+
+@dataclass(frozen=True)
+class Rows:
+    """time (rows,) [s]; torque, position (joints, rows) [N m, rad]; notes: what was done, in sentences."""
+
+    time: Values
+    torque: Values
+    position: Values
+    notes: tuple[str, ...] = ()
+
+    def kept(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice, *notes: str) -> "Rows":
+        """These rows alone."""
+        chosen_rows = self.time[chosen], self.torque[:, chosen], self.position[:, chosen]
+        return Rows(*chosen_rows, (*self.notes, *notes))
+
+
+def cleaned(source: str, rows: Rows, held: bool) -> list[Rows]:
+    """The recordings in the rows of `source`, each in the order of time. held: whether torque holds until the next.
+
+    Raises CsvError for what cannot be put right without guessing.
+    """
+    rows = _with_time(source, rows)
+    rows = _once(source, rows)
+    parts = _restarts(rows)
+    return [
+        piece for part in parts for piece in _apart(_filled(source, _ordered(source, _unrepeated(source, part)), held))
+    ]
+
+
+def _with_time(source: str, rows: Rows) -> Rows:
+    known = np.isfinite(rows.time)
+    lost = int((~known).sum())
+    if not lost:
+        return rows
+    if lost > 0.5 * known.size:
+        raise CsvError(f"{source}: {lost} of {known.size} rows have no time: check the column of time.")
+    return rows.kept(known, f"{source}: {lost} rows without a time were left out.")
+
+
+def _once(source: str, rows: Rows) -> Rows:
+    every = np.vstack((rows.time, rows.torque, rows.position))
+    same = np.all((every[:, 1:] == every[:, :-1]) | (np.isnan(every[:, 1:]) & np.isnan(every[:, :-1])), axis=0)
+    if not same.any():
+        return rows
+    return rows.kept(np.concatenate(([True], ~same)), f"{source}: {int(same.sum())} repeated rows were left out.")
+
+
+def _restarts(rows: Rows) -> list[Rows]:
+    step = np.diff(rows.time)
+    usual = float(np.median(np.abs(step))) if step.size else 0.0
+    ends = np.nonzero(step < -max(RESTART, 20.0 * usual))[0] + 1
+    edges = [0, *ends.tolist(), rows.time.size]
+    parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]
+    if len(parts) > 1:
+        said = f"Time goes back {len(parts) - 1} times: taken as {len(parts)} recordings."
+        parts[0] = parts[0].kept(slice(None), said)
+    return parts
+
+
+def _unrepeated(source: str, rows: Rows) -> Rows:
+    again = np.concatenate(([False], np.diff(rows.time) == 0.0))
+    count = int(again.sum())
+    if not count:
+        return rows
+    if count > FEW * rows.time.size:
+        raise CsvError(
+            f"{source}: {100 * count / rows.time.size:.0f} % of the times are the same as the one before, with other "
+            "values: they are too coarse. Write them with more digits, or, if the samples are equally spaced, set "
+            "columns.rate (samples per second) in place of columns.time."
+        )
+    return rows.kept(~again, f"{source}: of {count} pairs of rows with the same time the second was left out.")
+
+
+def _ordered(source: str, rows: Rows) -> Rows:
+    back = int(np.sum(np.diff(rows.time) < 0.0))
+    if not back:
+        return rows
+    if back > FEW * rows.time.size:
+        raise CsvError(
+            f"{source}: time goes back {back} times: it must increase. Check the column of time, or sort the rows."
+        )
+    order = np.argsort(rows.time, kind="stable")
+    sorted_rows = rows.kept(order, f"{source}: {back} rows out of order were sorted by time.")
+    return _unrepeated(source, sorted_rows)
+
+
+def _filled(source: str, rows: Rows, held: bool) -> Rows:
+    """Short holes in the torque are filled in; long ones are left out with the rows around them."""
+    hole = ~np.isfinite(rows.torque).all(axis=0)
+    if not hole.any():
+        return rows
+    torque, out = rows.torque.copy(), np.zeros(hole.size, dtype=bool)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], hole.astype(np.int8), [0]))))
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        inside = first > 0 and last < hole.size
+        if not inside or rows.time[last] - rows.time[first - 1] > LONGEST_HOLE:
+            out[first:last] = True
+    for row in torque:
+        known = np.isfinite(row)
+        if not known.any():
+            raise CsvError(f"{source}: a column of torque or current holds no numbers at all.")
+        before = np.maximum.accumulate(np.where(known, np.arange(row.size), 0))
+        row[~known] = row[before][~known] if held else np.interp(rows.time[~known], rows.time[known], row[known])
+    notes = []
+    if (hole & ~out).any():
+        notes.append(f"{source}: torque was filled in for {int((hole & ~out).sum())} rows that lack it.")
+    if out.any():
+        notes.append(f"{source}: {int(out.sum())} rows without a torque were left out.")
+    return Rows(rows.time, torque, rows.position, rows.notes).kept(~out, *notes)
+
+
+def _apart(rows: Rows) -> list[Rows]:
+    """Rows on either side of a long gap are recordings of their own."""
+    step = np.diff(rows.time)
+    usual = float(np.median(step)) if step.size else 0.0
+    if usual > MOST_GAP:
+        return [rows]  # of another unit, or much too slow: the recording says which
+    ends = np.nonzero(step > LONGEST_GAP)[0] + 1
+    edges = [0, *ends.tolist(), rows.time.size]
+    parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]
+    if len(parts) > 1:
+        said = f"{len(ends)} gaps of more than {LONGEST_GAP:g} s: taken as {len(parts)} recordings."
+        parts[0] = parts[0].kept(slice(None), said)
+    return parts

@@ -1,0 +1,130 @@
+"""A table with what its columns mean becomes recordings in SI units."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.csv_columns import TICKS, Columns
+from hil.errors import CsvError
+from hil.estimator.data.recording import FEWEST_SAMPLES, LONGEST_GAP, Recording
+from hil.recordings.clean import Rows, cleaned
+from hil.recordings.encoder import encoder_step
+from hil.recordings.guess import guessed, said
+from hil.recordings.table import Table
+from hil.recordings.units import UNITS, unit_of
+
+Values = NDArray[np.float64]
+
+SMALLEST_STEP = 1e-9  # rad, where readings show no steps: their noise is measured
+
+
+@dataclass(frozen=True)
+class Converted:
+    """recordings: in SI units. names: of each. stepped: whether the encoders' resolution is known, per joint.
+
+    columns: with what was guessed. notes: what was guessed or put right, in sentences.
+    """
+
+    recordings: tuple[Recording, ...]
+    names: tuple[str, ...]
+    stepped: tuple[bool, ...]
+    columns: Columns
+    notes: tuple[str, ...]
+
+
+def convert(table: Table, columns: Columns) -> Converted:
+    """The recordings in `table`. Raises CsvError for columns that are missing, unclear or no numbers, RecordingError
+    for data that cannot be a recording in these units."""
+    whole = guessed(table, columns)
+    notes = [] if whole == columns else [said(whole, table)]
+    assert whole.position is not None and whole.drive is not None  # or guessed would have raised
+    time = _time(table, whole)
+    ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn
+    position = np.stack([_quantity(table, name, "position", whole.position_unit, ticks) for name in whole.position])
+    torque = np.stack([_torque(table, whole, joint) for joint in range(len(whole.position))])
+    zero = np.array(whole.zero or [0.0] * len(position))[:, None]
+    steps = [whole.position_step or encoder_step(row) for row in position]
+    step = np.array([each or SMALLEST_STEP for each in steps])
+    held = whole.between == "held"
+    parts = cleaned(table.source, Rows(time, torque, position + zero), held)
+    notes += [note for part in parts for note in part.notes]
+    long = [part for part in parts if len(parts) == 1 or _is_long_enough(part, whole.segment)]
+    if len(long) < len(parts):
+        notes.append(f"{table.source}: {len(parts) - len(long)} pieces shorter than a segment were left out.")
+    if not long:
+        raise CsvError(
+            f"{table.source}: no piece without a gap of more than {LONGEST_GAP:g} s is as long as a segment, "
+            f"{whole.segment:g} s: record longer, or set columns.segment."
+        )
+    recordings = tuple(Recording(each.time, each.torque, each.position, step, whole.between) for each in long)
+    names = tuple(
+        table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)
+    )
+    return Converted(recordings, names, tuple(each is not None for each in steps), whole, tuple(notes))
+
+
+def _is_long_enough(part: Rows, segment: float) -> bool:
+    return part.time.size >= FEWEST_SAMPLES and float(part.time[-1] - part.time[0]) >= segment
+
+
+def _time(table: Table, columns: Columns) -> Values:
+    if columns.time is None:
+        assert columns.rate is not None
+        return np.arange(table.rows) / columns.rate
+    full, values, stated = table.find(columns.time)
+    unit = _unit(table, full, "time", stated, columns.time_unit)
+    finite = values[np.isfinite(values)]
+    # From the first sample on, or a count of nanoseconds since 1970 loses its last digits.
+    first = float(finite[0]) if finite.size else 0.0
+    return np.asarray((values - first) * UNITS["time"][unit])
+
+
+def _torque(table: Table, columns: Columns, joint: int) -> Values:
+    kind = columns.drive
+    assert kind is not None
+    name = getattr(columns, kind)[joint]
+    values = _quantity(table, name, kind, getattr(columns, f"{kind}_unit"))
+    if kind == "pwm":
+        assert columns.supply_voltage is not None
+        if float(np.nanmax(np.abs(values), initial=0.0)) > 1.5:
+            raise CsvError(
+                f"{table.source}: column {name!r} reaches {float(np.nanmax(np.abs(values))):.4g}; as a share of the "
+                'supply voltage it is at most 1: is it in percent (pwm_unit = "%")?'
+            )
+        values = values * columns.supply_voltage
+    gains = columns.gains
+    return values if gains is None else values * gains[joint]
+
+
+def _quantity(table: Table, name: str, kind: str, given: str | None, ticks: float = 0.0) -> Values:
+    full, values, stated = table.find(name)
+    unit = _unit(table, full, kind, stated, given)
+    if unit == TICKS and not ticks:
+        raise CsvError(
+            f"{table.source}: column {full!r} is in ticks: set columns.ticks_per_turn (4096 for X-series servos)."
+        )
+    return values * (ticks if unit == TICKS else UNITS[kind][unit])
+
+
+def _unit(table: Table, name: str, kind: str, stated: str | None, given: str | None) -> str:
+    """The unit of a column, by [columns] or the file; raises CsvError where these disagree or one is not known."""
+    possible = UNITS[kind]
+    read = None if stated is None else unit_of(stated)
+    if read == "1" and kind != "pwm":
+        read = None
+    if given is None:
+        if stated is None:
+            return next(iter(possible)) if kind != "pwm" else "1"
+        if read is None or read not in possible:
+            raise CsvError(
+                f"{table.source}: column {name!r} states the unit {stated!r}, which is none of {', '.join(possible)}: "
+                f"convert it, or set columns.{kind}_unit."
+            )
+        return read
+    if read is not None and read != given:
+        raise CsvError(
+            f"{table.source}: column {name!r} states the unit {read}, but columns.{kind}_unit says {given}: one of "
+            "them is wrong."
+        )
+    return given

@@ -1,0 +1,138 @@
+"""CSV as other programs write it: any delimiter, decimal commas, a byte order mark, remarks, a line of units."""
+
+import csv
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from hil.errors import CsvError
+from hil.recordings.table import Table, Values
+from hil.recordings.units import unit_of
+from hil.runs.file_size import MOST_CSV_BYTES
+
+_REMARKS = ("#", "%", "//")
+
+
+def read_csv_table(path: Path) -> Table:
+    """The table in `path`; raises CsvError. An empty field or `nan` is a missing value."""
+    lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), start=1) if line.strip()]
+    remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
+    rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
+    if not rows:
+        raise CsvError(f"{path}: is empty; it needs a header line and at least one line of numbers.")
+    delimiter = _delimiter([line for _, line in rows])
+    header, rows = _header(path, rows, remarks, delimiter)
+    double = {name for name in header if header.count(name) > 1}
+    if double:
+        raise CsvError(f"{path}: two columns are named {sorted(double)[0]!r}; rename one of them.")
+    fields = [(number, _split(line, delimiter)) for number, line in rows]
+    units: dict[str, str] = {}
+    if fields and all(_is_unit(field) for field in fields[0][1]) and any(field.strip() for field in fields[0][1]):
+        named = zip(header, fields[0][1], strict=False)
+        units = {name: field.strip(" []()") for name, field in named if field.strip(" []()")}
+        fields = fields[1:]
+    if not fields:
+        raise CsvError(f"{path}: is empty; it needs a header line and at least one line of numbers.")
+    wide = len(header)
+    if all(len(row) == wide + 1 and not row[-1].strip() for _, row in fields):  # each line ends in a delimiter
+        fields = [(number, row[:-1]) for number, row in fields]
+    for number, row in fields:
+        if len(row) != wide:
+            raise CsvError(f"{path}, line {number}: {len(row)} fields for {wide} columns.")
+    comma = delimiter != ","
+    columns = {name: _numbers([row[k] for _, row in fields], comma) for k, name in enumerate(header)}
+    return Table(str(path), columns, units, fields[0][0], "line")
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > MOST_CSV_BYTES:
+            raise CsvError(f"{path}: is larger than {MOST_CSV_BYTES // 2**20} MB, the most that is read. Split it.")
+        data = path.read_bytes()
+    except OSError as error:
+        raise CsvError(f"{path}: cannot be read: {error.strerror}.") from error
+    wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    if "\0" in text:
+        raise CsvError(f"{path}: cannot be read: it is not a text file but a binary one. Export it as CSV.")
+    return text
+
+
+def _delimiter(lines: list[str]) -> str | None:
+    """The one that cuts the first lines into equally many fields, and most; None for white space."""
+    some = lines[: min(len(lines), 20)]
+    best: tuple[int, str | None] = (0, None)
+    for each in (";", "\t", ",", "|"):
+        counts = {line.count(each) for line in some[1:]} or {some[0].count(each)}
+        least = min(counts)
+        # Decimal commas stand in every field: a semicolon that is there as often as another wins.
+        if least > 0 and some[0].count(each) > 0 and least > best[0] and not (each == "," and best[1] is not None):
+            best = (least, each)
+    if best[1] is None and any("," in line for line in some):
+        return ","
+    if best[1] is None and all(len(line.split()) > 1 for line in some):
+        return None
+    return best[1] or ","
+
+
+def _header(
+    path: Path, rows: list[tuple[int, str]], remarks: list[str], delimiter: str | None
+) -> tuple[list[str], list[tuple[int, str]]]:
+    first = [field.strip() for field in _split(rows[0][1], delimiter)]
+    if not all(_is_number(field) for field in first):
+        return first, rows[1:]
+    for remark in reversed(remarks):
+        names = [name.strip() for name in _split(remark.lstrip().lstrip("#%/").strip(), delimiter)]
+        if len(names) == len(first):
+            return names, rows
+    raise CsvError(
+        f"{path}: has no header line, only numbers. Put the names of the {len(first)} columns into its first line."
+    )
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    if delimiter is None:
+        return line.split()
+    return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field.replace(",", "."))
+    except ValueError:
+        return not field
+    return True
+
+
+def _is_unit(field: str) -> bool:
+    text = field.strip()
+    return not text or (unit_of(text.strip(" []()")) is not None and not text.isdigit())
+
+
+def _numbers(fields: list[str], decimal_comma: bool) -> Values:
+    try:
+        return np.array(fields, dtype=np.float64)
+    except ValueError:
+        pass
+    # Only a column that is used needs numbers: a remark beside them is no fault, and is infinite here.
+    return np.array([_number(field, decimal_comma) for field in fields])
+
+
+def _number(field: str, decimal_comma: bool) -> float:
+    text = field.strip()
+    if text.lower() in {"", "nan", "null", "none", "na", "n/a", "-"}:
+        return np.nan
+    if decimal_comma and text.count(",") == 1:
+        text = text.replace(".", "").replace(",", ".") if text.count(".") == 1 else text.replace(",", ".")
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except ValueError:
+        return np.inf

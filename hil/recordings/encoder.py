@@ -1,0 +1,50 @@
+"""The step of an encoder, as its readings show it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+
+FEWEST_LEVELS = 5
+MOST_OFF = 0.12  # of a step: how far readings may lie from whole steps, by the digits that were written
+MOST_SHARE = 0.7  # of the readings: more different ones than that are no steps
+
+
+def encoder_step(position: Values) -> float | None:
+    """The step that all readings (samples,) are whole multiples of, apart; None where there is none."""
+    finite = position[np.isfinite(position)]
+    if finite.size < FEWEST_LEVELS:
+        return None
+    levels = np.unique(finite)
+    apart = np.diff(levels)
+    resolution = 1e-9 * max(1.0, float(np.abs(levels).max()))
+    levels = levels[np.concatenate(([True], apart > resolution))]
+    apart = np.diff(levels)
+    if levels.size < FEWEST_LEVELS or levels.size > MOST_SHARE * finite.size:
+        return None
+    for guess in (float(np.median(apart)), float(np.min(apart))):
+        step = _refined(levels - levels[0], guess)
+        if step is not None:
+            return step
+    return None
+
+
+def _refined(away: Values, step: float) -> float | None:
+    """The step by regression on whole numbers, from near readings to far ones; None where they are no whole steps."""
+    reach = 20.0 * step
+    while True:
+        near = away <= reach
+        count = np.round(away[near] / step)
+        total = float(count @ count)
+        if total == 0.0:
+            return None
+        step = float(count @ away[near]) / total
+        if near.all():
+            break
+        reach *= 4.0
+    off = np.abs(away / step - np.round(away / step))
+    return (
+        step
+        if float(np.mean(off > MOST_OFF)) < 0.01 and np.unique(np.round(away / step)).size > 0.9 * away.size
+        else None
+    )

@@ -1,0 +1,35 @@
+"""Which files are recordings, and the tables in them."""
+
+from pathlib import Path
+
+from hil.errors import CsvError
+from hil.recordings.csv_file import read_csv_table
+from hil.recordings.mcap_file import is_bag, read_bag, read_mcap
+from hil.recordings.parquet_file import is_dataset, read_dataset, read_parquet
+from hil.recordings.table import Table
+
+TEXTS = (".csv", ".txt", ".tsv", ".dat")
+SUFFIXES = (*TEXTS, ".parquet", ".mcap")
+
+
+def is_recording(path: Path) -> bool:
+    """Whether `path` is a recording of another tool by its name, and not a run folder."""
+    if path.is_dir():
+        return is_dataset(path) or is_bag(path)
+    return path.suffix.lower() in SUFFIXES or path.suffix.lower() in {".db3", ".bag", ".h5", ".hdf5", ".xlsx", ".mat"}
+
+
+def read_tables(path: Path) -> list[Table]:
+    """The recordings in one file or folder; raises CsvError, which names it."""
+    if not path.exists():
+        raise CsvError(f"{path}: cannot be read: No such file or directory.")
+    if path.is_dir():
+        return read_dataset(path) if is_dataset(path) else read_bag(path)
+    kind = path.suffix.lower()
+    if kind in TEXTS:
+        return [read_csv_table(path)]
+    if kind == ".parquet":
+        return read_parquet(path)
+    if kind == ".mcap":
+        return read_mcap(path)
+    raise CsvError(f"{path}: {kind} files are not read. Convert it to CSV, Parquet or MCAP.")

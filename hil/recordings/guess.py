@@ -1,0 +1,128 @@
+"""What the columns of a table seem to hold, by their names: for what [columns] does not say."""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+
+from hil.config.csv_columns import Columns
+from hil.errors import CsvError
+from hil.recordings.table import Table
+from hil.recordings.units import split_head, unit_of
+
+_TIME = re.compile(r"(time|t|timestamp|stamp|time_?stamp|seconds|secs|elapsed|clock)(_?s|_?sec|_?ms|_?us|_?ns)?", re.I)
+_KINDS = {
+    "position": re.compile(r"(?<![a-z])(q|pos|position|angle|theta|phi|state)(?![a-z])", re.I),
+    "torque": re.compile(r"(?<![a-z])(tau|torque|effort|trq)(?![a-z])", re.I),
+    "current": re.compile(r"(?<![a-z])(i|cur|curr|current|amp|amps)(?![a-z])", re.I),
+    "voltage": re.compile(r"(?<![a-z])(u|volt|volts|voltage)(?![a-z])", re.I),
+    "pwm": re.compile(r"(?<![a-z])(pwm|duty)(?![a-z])", re.I),
+}
+_OF_UNIT = {
+    "position": {"rad", "mrad", "deg", "turns", "ticks"},
+    "torque": {"N m", "mN m", "N cm", "kgf cm"},
+    "current": {"A", "mA"},
+    "voltage": {"V", "mV"},
+    "pwm": {"%"},
+}
+# Not what was measured of the joint, or not of its angle.
+_NOT_MEASURED = re.compile(
+    r"(?<![a-z])(des|desired|ref|reference|goal|target|sp|setpoint|cmd|commanded|sim|est)(?![a-z])", re.I
+)
+_NOT_POSITION = re.compile(
+    r"(?<![a-z])(vel|velocity|speed|acc|accel|dq|qd|qdd|ddq|temp|temperature|err|error)(?![a-z])", re.I
+)
+_SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
+
+
+def guessed(table: Table, columns: Columns) -> Columns:
+    """`columns` with what it leaves out, where the table's names say it plainly. Raises CsvError where they do not."""
+    found: dict[str, object] = {}
+    if columns.time is None and columns.rate is None:
+        found["time"] = _time(table)
+    if columns.position is None:
+        found["position"] = _group(table, "position", columns)
+    if columns.drive is None:
+        for kind in ("torque", "current", "voltage", "pwm"):
+            names = _group(table, kind, columns, needed=False)
+            if names:
+                found[kind] = names
+                break
+        else:
+            raise _unclear(table, "torque, current, voltage or PWM", [])
+    try:
+        return Columns.model_validate(columns.model_dump(exclude_none=True) | found)
+    except ValueError as error:
+        said = str(error).split("Value error, ")[-1].split(" [type=")[0]
+        raise CsvError(f"{table.source}: {said}. Set [columns] in --config ARM.toml.") from error
+
+
+def said(columns: Columns, table: Table) -> str:
+    """What was taken for what, in one sentence."""
+    drive = columns.drive or "torque"
+    names = (columns.time or f"{columns.rate:g} samples a second", columns.position or [], getattr(columns, drive))
+    listed = [name if isinstance(name, str) else ", ".join(name) for name in names]
+    return f"{table.source}: taken as time {listed[0]}; position {listed[1]}; {drive} {listed[2]}."
+
+
+def _time(table: Table) -> str:
+    found = [name for name in table.columns if _TIME.fullmatch(_last(split_head(name)[0]))]
+    exact = [name for name in found if name == "time"]
+    if len(found) == 1 or exact:
+        return (exact or found)[0]
+    raise _unclear(table, "time", found)
+
+
+def _group(table: Table, kind: str, columns: Columns, needed: bool = True) -> list[str] | None:
+    """The columns of one kind that belong together, one per joint; None, or CsvError if needed, where it is unclear."""
+    named: dict[str, list[str]] = defaultdict(list)
+    for name in table.columns:
+        bare, unit = split_head(name)
+        stated = unit_of(table.units.get(name) or unit or "") or ""
+        words = _spaced(bare)
+        by_unit = stated in _OF_UNIT[kind]
+        if not (_KINDS[kind].search(words) or (by_unit and kind == "position")) or (stated and not by_unit):
+            continue
+        wrong = kind == "position" and (_NOT_POSITION.search(words) or _NOT_MEASURED.search(words))
+        if wrong or (kind == "voltage" and _SUPPLY.search(words)):
+            continue
+        named[_stem(bare)].append(name)
+    groups = [names for names in named.values() if len(names) <= 2]
+    if kind != "position" and columns.position is not None:
+        groups = [names for names in groups if len(names) == len(columns.position)]
+    if len(groups) == 1:
+        return groups[0]
+    if kind != "position" and len(groups) > 1:
+        commanded = [each for each in groups if _NOT_MEASURED.search(_spaced(each[0]))]
+        if len(commanded) == 1:  # what was commanded is an input; what was measured answers to the motion
+            return commanded[0]
+    if needed or len(groups) > 1 or (named and not groups):
+        raise _unclear(table, kind, [name for names in named.values() for name in names])
+    return None
+
+
+def _last(name: str) -> str:
+    return re.split(r"[./]", name)[-1]
+
+
+def _spaced(name: str) -> str:
+    """`pos_meas1` and `observation.state.0` as words, so that a word is found between them."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])|[_./\[\]\-]+", " ", name)
+
+
+def _stem(name: str) -> str:
+    """What the columns of several joints have in common: all but the joint's number, or its name after a dot."""
+    numbered = re.sub(r"\d+", "#", name)
+    if numbered != name:
+        return numbered
+    if "." in name:
+        return name.rsplit(".", 1)[0]
+    return re.sub(r"(^|_)(shoulder|elbow|hip|knee|base|upper|lower)(_|$)", "_", name, flags=re.IGNORECASE)
+
+
+def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
+    some = list(found)
+    seen = f"several may be meant ({', '.join(some[:12])})" if some else "none is called so"
+    return CsvError(
+        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Say it in --config ARM.toml:\n"
+        '[columns]\ntime = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
+    )

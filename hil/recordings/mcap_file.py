@@ -1,0 +1,168 @@
+"""MCAP files and ROS 2 bags of them: JSON messages as they are, ROS 2 messages decoded, topics brought together.
+
+Every number of a message is a column, `/topic.field`, an entry of a list `/topic.field[2]`; a message with a list
+`name` beside lists of numbers, such as sensor_msgs/JointState, has its joints' names there instead:
+`/joint_states.effort.elbow`.
+"""
+
+import json
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.errors import CsvError
+from hil.recordings.table import Table, Values
+
+TIME = "time"
+LARGEST_LIST = 64  # more is a picture or a cloud of points
+_PLAIN = (bool, int, float)
+
+
+@dataclass
+class _Topic:
+    """What one topic said: when [ns since 1970], and each number by its name."""
+
+    time: list[int] = field(default_factory=list)
+    values: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, time: int, numbers: Mapping[str, float]) -> None:
+        for name in numbers:
+            if name in self.values:
+                continue
+            self.values[name] = [np.nan] * len(self.time)
+        self.time.append(time)
+        for name, column in self.values.items():
+            column.append(numbers.get(name, np.nan))
+
+
+def is_bag(path: Path) -> bool:
+    """Whether the folder `path` is a ROS 2 bag."""
+    return (path / "metadata.yaml").is_file()
+
+
+def read_bag(folder: Path) -> list[Table]:
+    """The table of a ROS 2 bag whose storage is MCAP; raises CsvError."""
+    files = sorted(folder.glob("*.mcap"))
+    if not files:
+        kept = ", ".join(sorted({path.suffix for path in folder.iterdir() if path.suffix != ".yaml"})) or "nothing"
+        raise CsvError(
+            f"{folder}: is a ROS 2 bag without MCAP files (it holds {kept}). Convert it: ros2 bag convert, with "
+            "storage_id: mcap."
+        )
+    return [_table(str(folder), files)]
+
+
+def read_mcap(path: Path) -> list[Table]:
+    """The table in one MCAP file; raises CsvError."""
+    return [_table(str(path), [path])]
+
+
+def _table(source: str, files: list[Path]) -> Table:
+    topics: dict[str, _Topic] = {}
+    for path in files:
+        for topic, time, message in _messages(path):
+            topics.setdefault(topic, _Topic()).add(time, dict(_numbers(topic, message)))
+    topics = {name: each for name, each in topics.items() if each.values}
+    if not topics:
+        raise CsvError(f"{source}: holds no messages with numbers.")
+    # The topic with most samples gives the rows: every other is held until its next message.
+    first = max(topics, key=lambda name: len(topics[name].time))
+    order = np.argsort(topics[first].time, kind="stable")
+    at = np.array(topics[first].time)[order]
+    # Counted from the first, since nanoseconds since 1970 are too many digits for a float.
+    columns: dict[str, Values] = {TIME: (at - at[0]) * 1e-9}
+    for each in topics.values():
+        places = np.argsort(each.time, kind="stable")
+        when = np.array(each.time)[places]
+        same = when.shape == at.shape and np.array_equal(when, at)
+        row = np.arange(at.size) if same else np.searchsorted(when, at, side="right") - 1
+        for column, values in each.values.items():
+            held = np.array(values)[places][np.maximum(row, 0)]
+            columns[column] = np.where(row < 0, np.nan, held)
+    return Table(source, columns)
+
+
+def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
+    """(topic, time [ns since 1970], message) of what can be decoded; raises CsvError where nothing can."""
+    try:
+        from mcap.exceptions import McapError
+        from mcap.reader import make_reader
+    except ImportError as error:
+        raise CsvError("MCAP needs the package mcap: pip install 'hil[recordings]'.") from error
+    found = False
+    refused: set[str] = set()
+    try:
+        with path.open("rb") as file:
+            decoders: dict[int, Callable[[bytes], Any] | None] = {}
+            for schema, channel, message in make_reader(file).iter_messages():
+                if channel.id not in decoders:
+                    decoders[channel.id] = _decoder(schema, channel)
+                decode = decoders[channel.id]
+                if decode is None:
+                    refused.add(f"{channel.topic} ({channel.message_encoding})")
+                    continue
+                found = True
+                decoded = decode(message.data)
+                yield channel.topic, _stamp(decoded, message.log_time), decoded
+    except (OSError, McapError, ValueError, KeyError, struct.error) as error:
+        raise CsvError(f"{path}: cannot be read: {str(error).rstrip('.') or type(error).__name__}.") from error
+    if not found:
+        what = ", ".join(sorted(refused)) or "no messages"
+        raise CsvError(
+            f"{path}: holds nothing that can be decoded here: {what}. JSON is read, and ROS 2 (cdr) with "
+            "pip install 'hil[recordings]'."
+        )
+
+
+def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Any] | None:
+    if channel.message_encoding == "json":
+        return json.loads
+    try:
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError:
+        return None
+    decoder: Callable[[bytes], Any] | None = DecoderFactory().decoder_for(channel.message_encoding, schema)
+    return decoder
+
+
+def _stamp(message: Any, log_time: int) -> int:
+    """The time that the message's header gives, else when it was logged [ns since 1970]."""
+    stamp = _get(_get(message, "header"), "stamp")
+    seconds, nanoseconds = _get(stamp, "sec"), _get(stamp, "nanosec")
+    if isinstance(seconds, int) and isinstance(nanoseconds, int) and (seconds or nanoseconds):
+        return seconds * 10**9 + nanoseconds
+    return log_time
+
+
+def _get(message: Any, name: str) -> Any:
+    return message.get(name) if isinstance(message, Mapping) else getattr(message, name, None)
+
+
+def _fields(message: Any) -> list[tuple[str, Any]]:
+    if isinstance(message, Mapping):
+        return list(message.items())
+    return [(name, getattr(message, name)) for name in getattr(message, "__slots__", ()) if not name.startswith("_")]
+
+
+def _numbers(prefix: str, message: Any) -> Iterator[tuple[str, float]]:
+    fields = _fields(message)
+    labels = next((value for name, value in fields if name == "name" and isinstance(value, list)), None)
+    for name, value in fields:
+        full = f"{prefix}.{name}"
+        if isinstance(value, _PLAIN):
+            yield full, float(value)
+        elif value is None:
+            yield full, np.nan
+        elif hasattr(value, "__len__") and not isinstance(value, str | bytes | Mapping):
+            if len(value) > LARGEST_LIST:
+                continue
+            for k, entry in enumerate(value):
+                if isinstance(entry, _PLAIN):
+                    labelled = labels is not None and len(labels) == len(value)
+                    yield f"{full}.{labels[k]}" if labels and labelled else f"{full}[{k}]", float(entry)
+        elif not isinstance(value, str | bytes) and name != "header":
+            yield from _numbers(full, value)

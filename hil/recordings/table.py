@@ -1,0 +1,69 @@
+"""A table of named columns of numbers, wherever it was read from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.errors import CsvError
+from hil.recordings.units import split_head
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Table:
+    """One recording as it stands in a file.
+
+    columns: (rows,) by name, NaN where a value is missing and infinite where it is not a number. units: as stated in
+    the file, by column. first_row: the number that the file gives its first row, in the words of a message (a CSV
+    file's header is line 1).
+    """
+
+    source: str
+    columns: Mapping[str, Values]
+    units: Mapping[str, str] = field(default_factory=dict)
+    first_row: int = 1
+    row_word: str = "row"
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.columns.values()), ()))
+
+    def find(self, name: str) -> tuple[str, Values, str | None]:
+        """The column that `name` means: its full name, values, and the unit stated in the file, as written.
+
+        The name may stand without the unit, and in other letter case. Raises CsvError.
+        """
+        full = self._full_name(name)
+        values = self.columns[full]
+        bad = np.nonzero(np.isinf(values))[0]
+        if bad.size:
+            raise CsvError(
+                f"{self.source}, {self.row_word} {bad[0] + self.first_row}: column {full!r} is not a number."
+            )
+        return full, values, self.units.get(full) or split_head(full)[1]
+
+    def _full_name(self, name: str) -> str:
+        if name in self.columns:
+            return name
+        bare = {split_head(each)[0]: each for each in self.columns}
+        if name in bare:
+            return bare[name]
+        folded = [each for each in (*self.columns, *bare) if each.casefold() == name.casefold()]
+        if folded:
+            return bare.get(folded[0], folded[0])
+        near = get_close_matches(name, [*self.columns, *bare], 1)
+        meant = f" Did you mean {near[0]!r}?" if near else ""
+        raise CsvError(
+            f"{self.source}: has no column {name!r}; it has {self.listed()}.{meant} Set [columns] in the TOML."
+        )
+
+    def listed(self) -> str:
+        """The names of the columns for a message; of very many only the first."""
+        names = list(self.columns)
+        more = f" and {len(names) - 40} more" if len(names) > 40 else ""
+        return ", ".join(names[:40]) + more

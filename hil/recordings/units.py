@@ -1,0 +1,59 @@
+"""Units as people write them into the heads of their columns, and what each is in SI."""
+
+import re
+
+from hil.config.csv_columns import CURRENT_UNITS, POSITION_UNITS, PWM_UNITS, TIME_UNITS, TORQUE_UNITS, VOLTAGE_UNITS
+
+UNITS = {
+    "time": TIME_UNITS,
+    "position": POSITION_UNITS,
+    "torque": TORQUE_UNITS,
+    "current": CURRENT_UNITS,
+    "voltage": VOLTAGE_UNITS,
+    "pwm": PWM_UNITS,
+}
+"""The units of each kind of quantity, in SI (ticks: of an encoder, whose size [columns] says)."""
+
+_SPELLINGS = {
+    "s": "s sec secs second seconds",
+    "ms": "ms msec msecs millisecond milliseconds",
+    "us": "us µs μs usec microsecond microseconds",
+    "ns": "ns nsec nanosecond nanoseconds",
+    "rad": "rad rads radian radians",
+    "mrad": "mrad",
+    "deg": "deg degs degree degrees °",
+    "turns": "turn turns rev revs revolution revolutions",
+    "ticks": "tick ticks count counts step steps lsb pulse pulses",
+    "N m": "nm n·m n.m n*m newtonmetre newtonmeter newtonmetres newtonmeters",
+    "mN m": "mnm mn·m mn.m mn*m",
+    "N cm": "ncm n·cm n.cm n*cm",
+    "kgf cm": "kgcm kg·cm kg.cm kg*cm kgfcm kgf·cm kgf.cm kgf*cm",
+    "A": "a amp amps ampere amperes",
+    "mA": "ma milliamp milliamps milliampere",
+    "V": "v volt volts",
+    "mV": "mv millivolt millivolts",
+    "%": "% pct percent",
+    "1": "1 - duty fraction",
+}
+_KNOWN = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+_BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
+_SLASH = re.compile(r"^(.*?)\s*/\s*(\S+)$")
+# Only what nobody would call a joint: `q_a` is no current.
+_SUFFIX = re.compile(r"^(.+)_(deg|rad|mrad|ms|us|ns|sec|nm|mnm|ma|mv|ticks|turns|percent|pct)$", re.IGNORECASE)
+
+
+def unit_of(text: str) -> str | None:
+    """The unit that is meant by `text`; None for one that is not known here."""
+    return _KNOWN.get(text.strip().lower().replace(" ", ""))
+
+
+def split_head(head: str) -> tuple[str, str | None]:
+    """A column's head as its name and the unit it states, as written; None where it states none."""
+    bracketed = _BRACKETS.match(head)
+    if bracketed and bracketed[1]:
+        return bracketed[1].strip(), bracketed[2].strip()
+    for pattern in (_SLASH, _SUFFIX):
+        found = pattern.match(head)
+        if found and unit_of(found[2]) is not None:
+            return found[1].strip(), found[2]
+    return head.strip(), None

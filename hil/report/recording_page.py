@@ -1,0 +1,127 @@
+"""The report of an estimate from another tool's recordings: the sections that need no bus and no experiment."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hil.arm_model import ArmModel
+from hil.model_file import model_of, read_usable_result
+from hil.report.chart import BLUE, GREEN, ORANGE, Chart, Series, thin
+from hil.report.page import FILE_NAME, render, write_page
+from hil.report.section import Folded, Picture, Section, Table
+from hil.report.sections.correlation import correlation_of
+from hil.report.sections.friction import friction_curve, friction_interval
+from hil.report.sections.parameters import parameters_of
+from hil.report.sections.verdict import TITLES
+from hil.report.words import percent
+from hil.results.result import Result, ShootingResult
+from hil.runs.recording_folder import Predicted, RecordingRecord, load_record, load_recordings
+
+MOST_POINTS = 3000
+_CURVE = 401
+
+
+@dataclass(frozen=True)
+class _Shown:
+    folder: Path
+    record: RecordingRecord
+    result: Result
+    model: ArmModel
+    recordings: tuple[Predicted, ...]
+
+
+def write_recording_report(folder: Path, out: Path | None = None) -> Path:
+    """Write the report of such a folder, by default into it; its path. Raises RunFolderError, ResultError."""
+    result = read_usable_result(folder)
+    shown = _Shown(folder, load_record(folder), result, model_of(result, folder), load_recordings(folder))
+    sections = (
+        *(_verdict(shown), parameters_of(result), _prediction(shown), _friction(shown), correlation_of(result)),
+        _next(shown),
+        _provenance(shown),
+    )
+    title = Path(shown.record.config or shown.record.files[0].path).stem
+    path = out or folder / FILE_NAME
+    write_page(render(title, shown.record.started, [each for each in sections if each is not None]), path)
+    return path
+
+
+def _verdict(shown: _Shown) -> Section:
+    judged = shown.result.verdict
+    trust, sentences = ("with care", ()) if judged is None else (judged.trust, judged.sentences)
+    tone, title = TITLES[trust]
+    notes = shown.result.notes if isinstance(shown.result, ShootingResult) else ()
+    warnings = [f"Warning: {warning}" for warning in shown.result.warnings]
+    return Section("verdict", title, tone=tone, bullets=(*sentences, *warnings, *notes))
+
+
+def _prediction(shown: _Shown) -> Section:
+    """The longest recording: position and what the model leaves of it."""
+    longest = max(shown.recordings, key=lambda each: each.time.size)
+    pictures = []
+    for joint, facts in enumerate(shown.model.joints):
+        time, error = longest.time - longest.time[0], longest.position[joint] - longest.predicted[joint]
+        series = [
+            Series("measured", *thin(time, longest.position[joint], MOST_POINTS), BLUE, "broad"),
+            Series("model", *thin(time, longest.predicted[joint], MOST_POINTS), ORANGE),
+        ]
+        chart = Chart(f"position_{joint + 1}", f"Position of {facts.name}", "time [s]", "position [rad]", tuple(series))
+        said = f"{facts.name}: measured, and simulated segment by segment from estimated starting states."
+        pictures.append(Picture(chart, said))
+        torque = Series("", *thin(time, longest.torque[joint], MOST_POINTS), GREEN)
+        chart = Chart(f"torque_{joint + 1}", f"Torque of {facts.name}", "time [s]", "torque [N m]", (torque,))
+        pictures.append(Picture(chart, f"{facts.name}: torque that moved it."))
+        left = Series("measured minus model", *thin(time, 1000.0 * error, MOST_POINTS), BLUE, "dots")
+        chart = Chart(f"residual_{joint + 1}", f"Residual of {facts.name}", "time [s]", "mrad", (left,))
+        rms = 1000.0 * float(np.sqrt(np.nanmean(error**2)))
+        pictures.append(Picture(chart, f"{facts.name}: {rms:.3g} mrad RMS remain."))
+    held_out = shown.result.validation.held_out_rms
+    words = (
+        ()
+        if held_out is None
+        else (
+            "Segments that were not fitted are predicted to within "
+            f"{percent(max(held_out))} of the motion's RMS; drawn is the fit to all segments of {longest.name}.",
+        )
+    )
+    return Section("prediction", "Measured and simulated motion", words, pictures=tuple(pictures))
+
+
+def _friction(shown: _Shown) -> Section:
+    pictures = []
+    for joint, facts in enumerate(shown.model.joints):
+        at = facts.velocity_limit * np.linspace(-1, 1, _CURVE) ** 3
+        curve = friction_curve(shown.model, at)[:, joint]
+        low, high = friction_interval(shown.model, shown.result.covariance, at, joint)
+        series = (Series("95 % interval", at, high, BLUE, "area", low), Series("model", at, curve, BLUE))
+        chart = Chart(f"friction_{joint + 1}", f"Friction of {facts.name}", "speed [rad/s]", "friction [N m]", series)
+        pictures.append(Picture(chart, f"{facts.name}: friction versus speed, without the constant offset."))
+    return Section("friction", "Friction", pictures=tuple(pictures))
+
+
+def _next(shown: _Shown) -> Section:
+    folder = shown.folder
+    commands = (
+        ("the arm for MuJoCo, or as URDF", f"hil export {folder} --format mjcf --format urdf"),
+        ("the same against another recording", f"hil diff {folder} OTHER_RUN"),
+        ("once more, after a change of config.toml", f"hil estimate {folder}"),
+    )
+    return Section("next", "What next", tables=(Table(("", ""), commands, 2),))
+
+
+def _provenance(shown: _Shown) -> Section:
+    record = shown.record
+    rows = [
+        ("configuration", record.config or "none: taken from the columns' names"),
+        ("estimated", record.started),
+        *(("file", f"{file.path}{f', SHA-256 {file.sha256[:16]}' if file.sha256 else ''}") for file in record.files),
+        ("method", shown.result.method),
+        ("machine", f"{record.machine}, Python {record.python}"),
+        ("versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
+    ]
+    text = (shown.folder / "config.toml").read_text(encoding="utf-8")
+    return Section(
+        *("provenance", "What this was estimated from", ()),
+        tables=(Table(("", ""), tuple(rows), 2),),
+        folded=(Folded("Configuration", text),),
+    )

@@ -1,0 +1,68 @@
+"""A run with faults: whether the experiment went on or was stopped, by what, how late, and how far the arm got."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.config.schema import Config, load_config
+from hil.drivers.errors import DriverError, TorqueNotOff
+from hil.errors import ExperimentError, SafetyStop
+from hil.experiment.run import run_experiment
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
+
+
+def inject(arm: Path, folder: Path) -> dict[str, Any]:
+    """Play the experiment of `arm`, whose [[fake.faults]] happen in it.
+
+    Returns:
+        `fault.outcome`: "finished", "stopped" (the guard saw something), or "failed" (the experiment or the bus ended
+        it); `cause` and `message`, what the program said; `torque_off_confirmed`, whether all servos said so;
+        `samples`; `stopped_after_s`, from the first fault to the last sample, in the arm's time; `beyond_limit_rad`,
+        the farthest that a joint was beyond its limits.
+    """
+    config = load_config(arm)
+    run = RunFolder.create(folder, config)
+    outcome, cause, message, off = "finished", "", "", True
+    try:
+        run_experiment(config, run, config.path, lambda _: None)
+    except (ExperimentError, DriverError) as error:
+        seen = _first_stop(error)
+        outcome = "failed" if seen is None else "stopped"
+        cause = type(error).__name__ if seen is None else seen.cause.value
+        message, off = str(seen or error), not isinstance(error, TorqueNotOff)
+    return {
+        "fault": {
+            "outcome": outcome,
+            "cause": cause,
+            "message": message,
+            "torque_off_confirmed": off,
+            **_seen(config, run.samples_path),
+        }
+    }
+
+
+def _first_stop(error: BaseException | None) -> SafetyStop | None:
+    """What the guard saw, also where the bus failed after it."""
+    while error is not None and not isinstance(error, SafetyStop):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _seen(config: Config, path: Path) -> dict[str, Any]:
+    """What the recording says, where one was begun."""
+    samples = load_samples(path, len(config.joints)) if path.exists() else None
+    if samples is None or not len(samples):
+        return {"samples": 0, "stopped_after_s": None, "beyond_limit_rad": 0.0}
+    faults = () if config.fake is None else config.fake.faults
+    began = min((fault.at for fault in faults), default=None)
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    position = samples["position"]
+    beyond = np.nanmax(np.maximum(low - position, position - high), initial=0.0)
+    end = float(samples["time_before_write"][-1])
+    return {
+        "samples": len(samples),
+        "stopped_after_s": None if began is None else end - began,
+        "beyond_limit_rad": float(beyond),
+    }

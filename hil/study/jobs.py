@@ -1,0 +1,176 @@
+"""Independent jobs on the workers: few in flight at a time, results as they end, whatever becomes of a worker."""
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from uuid import uuid4
+
+from hil.errors import SchedulerLost
+from hil.study.engine import workers
+from hil.study.schema import EngineTable
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_AHEAD = 8
+"""Jobs given to each worker beyond the one it works on: enough that none waits, few enough that memory stays flat."""
+
+
+_TASK_S, _MOST_IN_A_TASK = 0.1, 50
+"""Jobs that are shorter than this go several together: a task costs some milliseconds, whatever it does."""
+
+
+_COUNTED_EVERY_S = 1.0
+"""How often workers are counted, which asks the scheduler."""
+
+
+@dataclass(frozen=True)
+class Ended(Generic[Item, Result]):
+    """A job that has ended: with a result, or with the error that it raised or that killed its workers."""
+
+    number: int
+    item: Item
+    result: Result | None
+    error: BaseException | None
+
+
+def run_jobs(
+    client: "Client", function: Callable[[Item], Result], items: Iterable[tuple[int, Item]]
+) -> Iterator[Ended[Item, Result]]:
+    """Call `function` on each item, on whichever worker is free; jobs as they end.
+
+    Args:
+        client: of `hil.study.engine.workers`.
+        function: one that a worker can import, or else picklable with all it refers to.
+        items: with a number each, which names the job; taken from as workers become free.
+
+    Raises:
+        SchedulerLost: the scheduler answers no more.
+    """
+    from distributed import as_completed
+
+    try:
+        flight = _Flight(client, function, iter(items))
+        futures: Any = as_completed(  # type: ignore[no-untyped-call]
+            flight.start(flight.room), loop=client.loop, with_results=True, raise_errors=False
+        )
+        for batch in futures.batches():
+            futures.update(flight.start(len(batch) + max(0, flight.room)))
+            for future, result in batch:
+                if future.cancelled() or isinstance(result, CancelledError):
+                    raise SchedulerLost(_LOST)
+                again, ended = flight.end(future.key, result, lost=future.status == "error")
+                future.release()
+                futures.update(again)
+                yield from ended
+    except (CancelledError, OSError, TimeoutError) as error:
+        raise SchedulerLost(_LOST) from error
+
+
+class _Flight(Generic[Item, Result]):
+    """The tasks that workers have: one job each, or several where jobs are short beside what a task costs."""
+
+    def __init__(
+        self, client: "Client", function: Callable[[Item], Result], waiting: Iterator[tuple[int, Item]]
+    ) -> None:
+        self._client = client
+        self._function = function
+        self._waiting = waiting
+        self._size = 1
+        self._submitted = 0
+        # A scheduler has one name space: two studies on it must not get each other's results.
+        self._name = f"job-{uuid4().hex[:12]}"
+        self._tasks: dict[str, list[tuple[int, Item]]] = {}
+        self._window, self._counted = 0, -math.inf
+
+    @property
+    def room(self) -> int:
+        """How many tasks more may be in flight. Workers may come at any time, and then they wait."""
+        if time.monotonic() - self._counted > _COUNTED_EVERY_S:
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+            self._window, self._counted = max(1, len(workers)) * (1 + _AHEAD), time.monotonic()
+        return self._window - len(self._tasks)
+
+    def start(self, count: int) -> list[Any]:
+        """Futures of so many tasks more, as far as there are jobs."""
+        taken = (list(islice(self._waiting, self._size)) for _ in range(count))
+        return self._submit([jobs for jobs in taken if jobs])
+
+    def _submit(self, tasks: list[list[tuple[int, Item]]]) -> list[Any]:
+        if not tasks:
+            return []
+        keys = [f"{self._name}-{self._submitted + index}" for index in range(len(tasks))]
+        self._submitted += len(tasks)
+        self._tasks.update(zip(keys, tasks, strict=True))
+        items = [[item for _, item in jobs] for jobs in tasks]
+        return self._client.map(_call, [self._function] * len(tasks), items, key=keys, pure=False)
+
+    def end(self, key: str, result: Any, *, lost: bool) -> tuple[list[Any], list[Ended[Item, Result]]]:
+        """Futures of jobs to be done again, and those that have ended."""
+        jobs = self._tasks.pop(key)
+        if lost and len(jobs) > 1:
+            return self._submit([[job] for job in jobs]), []  # one of them takes its worker with it
+        if lost:
+            return [], [Ended(*jobs[0], None, result[1])]
+        outcomes, seconds = result
+        self._size = max(1, min(_MOST_IN_A_TASK, int(_TASK_S * len(jobs) / max(seconds, 1e-6))))
+        return [], [Ended(*job, *outcome) for job, outcome in zip(jobs, outcomes, strict=True)]
+
+
+def _call(
+    function: Callable[[Item], Result], items: list[Item]
+) -> tuple[list[tuple[Result | None, Exception | None]], float]:
+    """On a worker: result or error of each; seconds that they took together."""
+    began, outcomes = time.perf_counter(), list[tuple[Result | None, Exception | None]]()
+    for item in items:
+        try:
+            outcomes.append((function(item), None))
+        except Exception as error:
+            outcomes.append((None, error))
+    return outcomes, time.perf_counter() - began
+
+
+_LOST = "The scheduler answers no more. What was done is kept: start it again, then go on with --resume."
+
+
+def each(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    count: int | None = None,
+    scheduler: str | None = None,
+    tell: Callable[[Result], None] = lambda _: None,
+) -> list[Result]:
+    """The results of `function` on each item, in the items' order, computed by the workers of a study.
+
+    Args:
+        function: as of `run_jobs`.
+        items: its arguments.
+        count: workers; one per core unless given; 0 computes in this process.
+        scheduler: as of `hil.study.engine.workers`.
+        tell: called with each result as it comes.
+
+    Raises:
+        Exception: the first that `function` raised.
+        ConfigError, MissingExtra, SchedulerLost: as of `workers` and `run_jobs`.
+    """
+    found: dict[int, Any] = {}
+    if count == 0:
+        for number, item in enumerate(items):
+            found[number] = function(item)
+            tell(found[number])
+        return list(found.values())
+    with workers(EngineTable(), scheduler, count) as client:
+        for ended in run_jobs(client, function, enumerate(items)):
+            if ended.error is not None:
+                raise ended.error
+            found[ended.number] = ended.result
+            tell(found[ended.number])
+    return [found[number] for number in sorted(found)]

@@ -1,0 +1,75 @@
+"""Workers as jobs of a Slurm queue, by dask-jobqueue."""
+
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from hil.errors import ConfigError, MissingExtra
+
+_ANSWERED_WITHIN_S = 30.0
+_CLOSED_WITHIN_S = 10.0
+_EVERY_S = 0.2
+
+
+@contextmanager
+def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> Iterator[Any]:
+    """A Dask cluster with `count` workers submitted.
+
+    Args:
+        count: workers, each a job of one core.
+        memory: of each, such as "2GiB".
+        environment: of each.
+
+    Raises:
+        MissingExtra: dask-jobqueue is not installed.
+        ConfigError: there is no queue here, or it does not take the jobs.
+    """
+    try:
+        from dask_jobqueue import SLURMCluster
+        from dask_jobqueue.slurm import SLURMJob
+    except ImportError as error:
+        raise MissingExtra("--scheduler slurm needs dask-jobqueue: pip install 'hil[slurm]'.") from error
+    if shutil.which("sbatch") is None:
+        raise ConfigError("--scheduler slurm: there is no sbatch here. Start the study where Slurm jobs are submitted.")
+    answers: list[str | None] = []
+
+    class Job(SLURMJob):  # type: ignore[misc]
+        """Remembers how the queue answered: dask-jobqueue only logs it, and waits for workers that never come."""
+
+        async def _submit_job(self, script_filename: str) -> Any:
+            try:
+                answer = await super()._submit_job(script_filename)
+            except (OSError, RuntimeError) as error:
+                answers.append(str(error))
+                raise
+            answers.append(None)
+            return answer
+
+    class Cluster(SLURMCluster):  # type: ignore[misc]
+        job_cls = Job
+
+    prologue = [f"export {name}={value}" for name, value in environment.items()]
+    try:
+        cluster = Cluster(cores=1, processes=1, memory=memory, job_script_prologue=prologue)
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        raise ConfigError(f"--scheduler slurm: dask-jobqueue cannot start: {error}") from error
+    cluster.scale(count)
+    try:
+        _wait_for_answer(answers)
+        yield cluster
+    finally:
+        with suppress(Exception):  # jobs that the queue refused fail again when they are cancelled
+            cluster.close(timeout=_CLOSED_WITHIN_S)
+
+
+def _wait_for_answer(answers: list[str | None]) -> None:
+    """Until the queue has answered the first submission; raises ConfigError if it refused."""
+    until = time.monotonic() + _ANSWERED_WITHIN_S
+    while not answers and time.monotonic() < until:
+        time.sleep(_EVERY_S)
+    refusal = answers[0] if answers else None
+    if refusal is not None:
+        lines = [line for line in refusal.splitlines() if line.strip()] or ["no reason given"]
+        raise ConfigError(f"--scheduler slurm: the queue does not take the workers: {lines[-1].strip()}")

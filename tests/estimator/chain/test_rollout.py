@@ -1,0 +1,55 @@
+"""Closed-loop simulation of many chains against a fine integration of the equations of motion."""
+
+import numpy as np
+
+from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.dynamics import inverse_dynamics, mass_matrix
+from hil.estimator.chain.rollout import ChainArms, Loop, is_physical, roll_out, weights
+from tests.support.chains import random_chain, random_parameters
+
+RATE = 400.0
+
+
+def arms_of(joints: int, seed: int, viscous: float = 0.0) -> tuple[ChainArms, np.ndarray]:
+    chain, parameters = random_chain(joints, seed), random_parameters(joints, seed)
+    base = BaseParameters.of(chain)
+    drive = np.zeros((1, 6, joints))
+    drive[:, 0], drive[:, 3], drive[:, 4] = viscous, 0.05, 1.0
+    return ChainArms(base, base.of_all(parameters)[None], drive), parameters
+
+
+def loop_of(goal: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> Loop:
+    n = goal.shape[1]
+    return Loop(RATE, goal, np.full(n, stiffness), np.full(n, damping), pose, np.full(n, 1e3))
+
+
+def test_a_free_motion_is_that_of_the_equations() -> None:
+    arms, parameters = arms_of(3, 4, viscous=0.3)
+    q, v = np.array([0.3, -0.4, 0.8]), np.zeros(3)
+    far = q + 3.0  # no rest pose near, so nothing carries the arm
+    found = roll_out(arms, loop_of(np.zeros((40, 3)), far, 0.0, 0.0), q)
+    h, still = 2e-5, np.zeros((3, 1))
+    for _ in range(round(39 / RATE / h)):
+        bias = inverse_dynamics(arms.base.chain, parameters, q[:, None], v[:, None], still)[:, 0]
+        v = v + h * np.linalg.solve(mass_matrix(arms.base.chain, parameters, q), -bias - 0.3 * v)
+        q = q + h * v
+    np.testing.assert_allclose(found.position[0, -1], q, atol=5e-3)
+    np.testing.assert_allclose(found.velocity[0, -1], v, rtol=0.03, atol=0.03)
+
+
+def test_held_up_it_stays_and_let_go_it_lies() -> None:
+    arms, _ = arms_of(3, 5, viscous=0.1)
+    pose = np.array([0.2, 0.1, -0.3])
+    held = weights(arms, pose)[0]
+    up = roll_out(arms, loop_of(np.tile(held, (200, 1)), pose, 50.0, 3.0), pose)
+    np.testing.assert_allclose(up.position[0, -1], pose, atol=1e-3)
+    limit = Loop(RATE, np.zeros((200, 3)), np.zeros(3), np.zeros(3), pose, 5.0 * np.abs(held))
+    lying = roll_out(arms, limit, pose)
+    assert np.abs(lying.position[0, -1] - pose).max() < 0.05
+
+
+def test_an_arm_of_no_mass_distribution_is_told() -> None:
+    arms, _ = arms_of(3, 6)
+    poses = np.random.default_rng(1).uniform(-1, 1, (5, 3))
+    assert is_physical(arms, poses).all()
+    assert not is_physical(ChainArms(arms.base, -arms.rigid, arms.drive), poses).any()

@@ -1,0 +1,90 @@
+"""Joints driven by voltage: the motion of a motor with a winding, and derivatives by what it is made of."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from hil.estimator.fit.simulated_run import SimulatedRun
+from hil.estimator.models.model import Model
+from hil.estimator.models.parameters import Physics
+
+RATE, SAMPLES = 400.0, 1600
+TIME = np.arange(SAMPLES) / RATE
+INERTIA, GRAVITY, VISCOUS, GENERATED, WINDING = 0.006, 0.18, 0.02, 0.24, 1.8e-3
+ARM = {
+    **{"inertia_1": 0.008, "coupling": 0.0003, "inertia_2": 0.0005, "armature_2": 0.003},
+    **{"gravity_1": 0.18, "gravity_2": 0.03, "viscous_1": 0.24, "viscous_2": 0.25},
+    **{"coulomb_1": 0.03, "coulomb_2": 0.03, "coulomb_width_1": 0.02, "coulomb_width_2": 0.02},
+    **{"stribeck_rise_1": 0.3, "stribeck_velocity_1": 0.2, "torque_scale_2": 1.1, "load_1": 0.05, "load_2": 0.06},
+    **{
+        "ripple_sin_1": 0.05,
+        "ripple_cycles_1": 5.0,
+        "ripple_sin_2": 0.05,
+        "ripple_cos_2": 0.02,
+        "ripple_cycles_2": 7.0,
+    },
+    **{"saturation_1": 0.3, "saturation_2": 0.2, "encoder_sin_once_1": 2e-3},
+    **{"back_emf_1": 0.9, "back_emf_2": 0.85, "lag": 2e-3, "lag_difference_2": -3e-4},
+}
+BRISTLES = {f"presliding_{what}_{j}": v for what, v in (("stiffness", 20.0), ("damping", 0.1)) for j in (1, 2)}
+
+
+def command() -> np.ndarray:
+    low, high = 2 * np.pi * 0.5 * TIME, 2 * np.pi * 4.0 * TIME
+    return np.stack((0.2 * np.sin(low) + 0.15 * np.sin(high), 0.2 * np.sin(2 * low) + 0.1 * np.cos(high)))
+
+
+def run_of(torque: np.ndarray) -> SimulatedRun:
+    return SimulatedRun(torque, np.zeros_like(torque), RATE, 0.0, 3, 16)
+
+
+def with_winding(torque: np.ndarray) -> np.ndarray:
+    """A pendulum whose current follows voltage less back-EMF through its winding."""
+
+    def slope(t: float, x: np.ndarray) -> list[float]:
+        voltage = torque[min(int(t * RATE + 1e-9), SAMPLES - 1)]
+        acceleration = (x[2] - VISCOUS * x[1] - GRAVITY * np.cos(x[0])) / INERTIA
+        return [x[1], acceleration, (voltage - GENERATED * x[1] - x[2]) / WINDING]
+
+    # Twice: the estimator's torque is that of a repeated period.
+    state, position = np.array([-np.pi / 2, 0.0, 0.0]), np.empty(0)
+    for _ in range(2):
+        found = solve_ivp(slope, (0.0, SAMPLES / RATE), state, t_eval=[*TIME, SAMPLES / RATE], max_step=5e-4, rtol=1e-8)
+        state, position, velocity = found.y[:, -1], found.y[0, :-1], found.y[1, :-1]
+    return np.stack((position, velocity))
+
+
+def test_the_motion_is_that_of_a_motor_with_a_winding() -> None:
+    torque = command()[0]
+    true = with_winding(torque)
+    # The lag that goes with a smaller inertia: lag' (J - b lag') = lag J.
+    late = (INERTIA - np.sqrt(INERTIA**2 - 4 * GENERATED * WINDING * INERTIA)) / (2 * GENERATED)
+    brake = GENERATED + VISCOUS
+    pendulum = {"inertia_1": INERTIA, "gravity_1": GRAVITY, "viscous_1": brake, "lag": late, "coulomb_width_1": 0.1}
+    run = run_of(torque[None])
+
+    def off(**given: float) -> float:
+        found = run.position(Physics.of(pendulum | given), true[:, :1])[0]
+        return float(np.sqrt(np.mean((found - true[0]) ** 2)) / np.std(true[0]))
+
+    assert off(back_emf_1=GENERATED / brake) < 1e-3
+    assert off(lag=WINDING) > 3e-3, "what was assumed before: an undelayed brake"
+
+
+@pytest.mark.parametrize("bristles", [{}, BRISTLES], ids=["dry", "presliding"])
+def test_derivatives_are_those_of_the_simulation(bristles: dict[str, float]) -> None:
+    values, start = {**ARM, **bristles}, np.array([[-1.5, 0.1], [0.0, 0.0]])
+    run = run_of(command())
+    names = tuple(name for name in values if "width" not in name and "cycles" not in name)
+    ((_, found, derivative),) = run.pieces(Physics.of(values), start, names)
+    assert np.allclose(found, run.position(Physics.of(values), start), atol=1e-12)
+    for index, name in enumerate(names):
+        change = 1e-5 * abs(values[name])
+        more, less = (run.position(Physics.of({**values, name: values[name] + c}), start) for c in (change, -change))
+        slope = (more - less) / (2 * change)
+        assert np.abs(derivative[:, :, index] - slope).max() < 1e-4 * np.abs(slope).max(), name
+
+
+def test_only_joints_driven_by_voltage_have_it() -> None:
+    assert "back_emf_2" in Model(2, by_voltage=(2,)).names and "back_emf_1" not in Model(2, by_voltage=(2,)).names
+    assert not any(name.startswith("back_emf") for name in Model(2).names)

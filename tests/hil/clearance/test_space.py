@@ -1,0 +1,131 @@
+"""Clearance of an arm in space: capsules around its links, distances to itself, the floor and boxes."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.clearance.mesh import find_mesh, mesh_corners
+from hil.clearance.shapes import shapes_of
+from hil.clearance.space import Space
+from hil.config.schema import Config, load_config
+from hil.description.arm import ArmFileError
+from hil.description.urdf import read_urdf
+from hil.errors import ConfigError
+from tests.support.paths import CONFIGS
+
+TEXT = (CONFIGS / "open_manipulator_x.toml").read_text(encoding="utf-8")
+
+
+def configured(folder: Path, text: str) -> Config:
+    urdf = "open_manipulator_x_like.urdf"
+    (folder / urdf).write_bytes((CONFIGS / urdf).read_bytes())
+    (folder / "arm.toml").write_text(text, encoding="utf-8")
+    return load_config(folder / "arm.toml")
+
+
+def points(ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Many points within capsules (capsules, points, 3): along their axes, the radius left to the test."""
+    share = np.linspace(0.0, 1.0, 60)[:, None]
+    return np.stack([a + share * (b - a) for a, b in ends])
+
+
+def test_distances_are_those_of_many_points() -> None:
+    config = load_config(CONFIGS / "viperx_300.toml")
+    space = Space.of(config)
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    for pose in np.random.default_rng(1).uniform(low, high, (20, len(low))):
+        ends, radius = space.ends(pose)
+        cloud = points(ends, radius)
+        least = np.inf
+        for a, b in space._pairs:
+            if b >= 0:
+                apart = np.linalg.norm(cloud[a][:, None] - cloud[b][None], axis=-1).min() - radius[a] - radius[b]
+            else:
+                apart = ends[a, :, 2].min() - radius[a]
+            least = min(least, apart)
+        assert space.nearest(pose[:, None]).distance == pytest.approx(least, abs=2e-3)
+
+
+def test_a_box_in_the_way_is_named(tmp_path: Path) -> None:
+    box = '\n[[clearance.boxes]]\nname = "camera"\ncentre = [0.25, 0.0, 0.2]\nsize = [0.1, 0.1, 0.1]\n'
+    space = Space.of(configured(tmp_path, TEXT.replace("\n[experiment]", f"{box}\n[experiment]", 1)))
+    reaching = np.array([[0.0, 0.0, 0.0, 0.0]]).T
+    nearest = space.nearest(reaching)
+    assert nearest.distance < 0.0
+    assert "camera" in nearest.pair
+    aside = np.array([[1.5, 0.0, 0.0, 0.0]]).T
+    assert space.nearest(aside).distance > 0.01
+
+
+def test_the_floor_can_be_elsewhere_or_missing(tmp_path: Path) -> None:
+    down = np.array([[0.0, 1.5, 0.3, 0.0]]).T
+    near = Space.of(configured(tmp_path, TEXT)).nearest(down)
+    assert near.pair[1] == "floor"
+    assert near.distance < 0.0
+    lower = Space.of(configured(tmp_path, TEXT.replace("floor = 0.0 ", "floor = -1.0 "))).nearest(down)
+    assert lower.distance > 0.0
+    none = Space.of(configured(tmp_path, TEXT.replace("floor = 0.0 ", 'floor = "none" ')))
+    assert none.nearest(down).pair[1] != "floor"
+
+
+def test_an_unknown_name_to_ignore_is_named(tmp_path: Path) -> None:
+    text = TEXT.replace("[clearance]\n", '[clearance]\nignore = [["hand", "flor"]]\n', 1)
+    with pytest.raises(ConfigError, match="no 'flor'"):
+        Space.of(configured(tmp_path, text))
+
+
+def test_where_it_lies_it_may_be_near_but_not_nearer(tmp_path: Path) -> None:
+    config = configured(tmp_path, TEXT)
+    space, rest = Space.of(config), np.array(config.arm.rest_pose)[:, None]
+    assert space.nearest(rest).room < 0.0
+    assert space.room(rest, on_the_way=True)[0] >= 0.0
+    folded = rest + np.array([[0.0], [-0.05], [0.05], [0.6]])
+    assert space.room(folded, on_the_way=True)[0] < 0.0
+
+
+def test_capsules_enclose_boxes_and_meshes(tmp_path: Path) -> None:
+    corners = np.array([[x, y, z] for x in (0.0, 0.2) for y in (-0.03, 0.03) for z in (-0.01, 0.01)])
+    triangles = corners[[[0, 1, 2], [3, 4, 5], [5, 6, 7]]]
+    stl = b"\0" * 80 + struct.pack("<I", 3)
+    stl += b"".join(np.zeros(3, "<f4").tobytes() + t.astype("<f4").tobytes() + b"\0\0" for t in triangles)
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "link.stl").write_bytes(stl)
+    assert find_mesh("package://robot/meshes/link.stl", tmp_path / "arm.urdf") == tmp_path / "meshes" / "link.stl"
+    found = mesh_corners(tmp_path / "meshes" / "link.stl")
+    assert found is not None
+    for geometry in ('<mesh filename="package://robot/meshes/link.stl"/>', '<box size="0.2 0.06 0.02"/>'):
+        origin = "0 0 0" if "mesh" in geometry else "0.1 0 0"
+        arm = one_joint(tmp_path, f'<collision><origin xyz="{origin}"/><geometry>{geometry}</geometry></collision>')
+        shapes = shapes_of(arm)
+        assert "tip" not in shapes.guessed
+        for corner in corners:
+            assert min(outside(corner, each.ends, each.radius) for each in shapes.capsules) < 1e-6
+
+
+def test_what_cannot_be_read_is_guessed_and_named(tmp_path: Path) -> None:
+    arm = one_joint(tmp_path, '<collision><geometry><mesh filename="package://a/b.dae"/></geometry></collision>')
+    assert "tip" in shapes_of(arm).guessed
+    assert shapes_of(arm).capsules
+    broken = one_joint(tmp_path, '<collision><geometry><sphere radius="wide"/></geometry></collision>')
+    with pytest.raises((ArmFileError, ValueError)):
+        shapes_of(broken)
+
+
+def one_joint(folder: Path, collision: str):  # type: ignore[no-untyped-def]
+    path = folder / "arm.urdf"
+    path.write_text(
+        '<robot name="a"><link name="base"/><joint name="j" type="revolute"><parent link="base"/><child link="tip"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint><link name="tip"><inertial>'
+        '<origin xyz="0.1 0 0"/><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>'
+        f"</inertial>{collision}</link></robot>",
+        encoding="utf-8",
+    )
+    return read_urdf(path, ["j"])
+
+
+def outside(point: np.ndarray, ends: np.ndarray, radius: float) -> float:
+    along = ends[1] - ends[0]
+    share = np.clip((point - ends[0]) @ along / max(along @ along, 1e-12), 0.0, 1.0)
+    return float(np.linalg.norm(point - ends[0] - share * along) - radius)

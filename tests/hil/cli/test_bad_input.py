@@ -1,0 +1,234 @@
+"""Bad inputs over all commands: the right exit code, one message that names it, no traceback, nothing lost."""
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.command_line import hil
+from tests.support.paths import CONFIGS
+
+ARM = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
+CSV = "t,q1,tau1\n" + "".join(f"{0.01 * k:.2f},{0.001 * (k * k % 97):.4f},{0.1 * (k % 7):.2f}\n" for k in range(100))
+
+# Files of the folder in which every command runs, by name.
+FILES: dict[str, bytes] = {
+    "arm.toml": ARM.encode(),
+    "binary.toml": bytes(range(128, 256)),
+    "empty.toml": b"",
+    "broken.toml": b"[arm\n",
+    "bom.toml": b"\xef\xbb\xbf[arm\n",
+    "typo.toml": ARM.replace("peak_torque", "peak_torqe").encode(),
+    "no_joints.toml": ARM.split("[[joints]]")[0].encode(),
+    "twice.toml": ARM.replace("id = 2", "id = 1").encode(),
+    "model.toml": ARM.replace('model = "XM430-W350"', 'model = "XM999"').encode(),
+    "baud.toml": ARM.replace("baud = 1_000_000", "baud = 1234567").encode(),
+    "band.toml": ARM.replace("band = [0.1, 5.0]", "band = [5.0, 0.1]").encode(),
+    "text.toml": ARM.replace("rate = 400.0", 'rate = "fast"').encode(),
+    "inf.toml": ARM.replace("gravity = 9.81", "gravity = inf").encode(),
+    "columns.toml": b'[columns]\nposition = ["q1"]\ntorque = ["tau1"]\n',
+    "joints.toml": b'[columns]\nposition = ["q1", "q2", "q3"]\ntorque = ["a", "b", "c"]\n',
+    "both.toml": b'[columns]\nposition = ["q1"]\ntorque = ["tau1"]\ncurrent = ["tau1"]\n',
+    "unit.toml": b'[columns]\nposition = ["q1"]\ntorque = ["tau1"]\nposition_unit = "grad"\n',
+    "good.csv": CSV.encode(),
+    "empty.csv": b"",
+    "header.csv": b"t,q1,tau1\n",
+    "no_header.csv": CSV.partition("\n")[2].encode(),
+    "ragged.csv": (CSV + "1,2\n").encode(),
+    "words.csv": CSV.replace("0.10,", "soon,", 1).encode(),
+    "twice.csv": CSV.replace("t,q1,tau1", "t,q1,q1").encode(),
+    "binary.csv": bytes(range(256)) * 9,
+    "backwards.csv": ("t,q1,tau1\n" + "\n".join(reversed(CSV.splitlines()[1:]))).encode(),
+    "still.csv": ("t,q1,tau1\n" + "".join(f"{0.01 * k:.2f},1.0,0.1\n" for k in range(100))).encode(),
+    "unknown.csv": b"a,b,c\n1,2,3\n",
+    "not.parquet": b"PAR0 no",
+    "not.mcap": b"MCAP no",
+    "old.db3": b"SQLite format 3",
+    "study.toml": b"[study]\n",
+    "notes.txt": b"t,q1\n",
+    "file": b"a file",
+    "result.json": b"{}",
+}
+
+# command line, exit code, what the message says; a run folder `run` is there, and broken copies of it (see `folder`).
+CASES: list[tuple[str, int, str]] = [
+    # configuration files, by every command that takes one
+    *((f"{command} nowhere.toml", 2, "nowhere.toml") for command in ("identify", "record", "check", "dry-run")),
+    *((f"{command} binary.toml", 2, "binary.toml") for command in ("identify", "record", "check", "dry-run")),
+    *((f"{command} empty.toml", 2, "empty.toml") for command in ("identify", "check", "dry-run")),
+    *((f"{command} broken.toml", 2, "not valid TOML") for command in ("identify", "record", "check", "dry-run")),
+    ("identify bom.toml", 2, "not valid TOML"),
+    ("identify typo.toml", 2, "peak_torqe"),
+    ("check typo.toml", 2, "peak_torqe"),
+    ("dry-run typo.toml", 2, "peak_torqe"),
+    ("identify no_joints.toml", 2, "joints"),
+    ("identify twice.toml", 2, "IDs 1, 1"),
+    ("identify model.toml", 2, "XM999"),
+    ("check baud.toml", 2, "1234567"),
+    ("identify band.toml", 2, "band"),
+    ("identify text.toml", 2, "rate"),
+    ("identify inf.toml", 2, "gravity"),
+    ("identify .", 2, "."),
+    ("identify", 2, "Missing argument"),
+    ("identify arm.toml broken.toml", 2, "unexpected extra argument"),
+    ("identify arm.toml --out run", 2, "not empty"),
+    ("identify arm.toml --out file", 2, "file"),
+    ("identify arm.toml --out file/below", 2, "file"),
+    ("record arm.toml --out run", 2, "not empty"),
+    ("identify arm.toml --outt run", 2, "No such option"),
+    ("identify run", 2, "run"),
+    ("nonsense", 2, "No such command"),
+    # recordings
+    ("estimate nowhere", 2, "nowhere"),
+    ("estimate nowhere.csv", 2, "nowhere.csv"),
+    ("estimate file", 2, "file"),
+    ("estimate .", 2, "not a run folder"),
+    ("estimate empty.csv", 2, "is empty"),
+    ("estimate header.csv", 2, "is empty"),
+    ("estimate no_header.csv", 2, "no header line"),
+    ("estimate ragged.csv", 2, "line 102: 2 fields for 3 columns"),
+    ("estimate words.csv", 2, "'t' is not a number"),
+    ("estimate twice.csv", 2, "two columns are named 'q1'"),
+    ("estimate binary.csv", 2, "binary"),
+    ("estimate backwards.csv", 2, "time goes back"),
+    ("estimate still.csv", 1, "joint 1 moved by 0 rad"),
+    ("estimate unknown.csv", 2, "a, b, c"),
+    ("estimate not.parquet", 2, "not.parquet"),
+    ("estimate not.mcap", 2, "not.mcap"),
+    ("estimate old.db3", 2, ".db3 files are not read"),
+    ("estimate notes.txt", 2, "is empty"),
+    ("estimate good.csv --config nowhere.toml", 2, "nowhere.toml"),
+    ("estimate good.csv --config binary.toml", 2, "binary.toml"),
+    ("estimate good.csv --config broken.toml", 2, "not valid TOML"),
+    ("estimate good.csv --config joints.toml", 2, "position"),
+    ("estimate good.csv --config both.toml", 2, "torque and current are both given"),
+    ("estimate good.csv --config unit.toml", 2, "position_unit"),
+    ("estimate good.csv --config columns.toml --out run", 2, "not empty"),
+    ("estimate good.csv --config columns.toml --out file", 2, "file"),
+    ("estimate good.csv run", 2, "not both"),
+    ("estimate run run", 2, "one run folder"),
+    ("estimate run --out other", 2, "--out is for"),
+    # damaged run folders
+    *((f"{command} cut_config", 2, "config.toml") for command in ("estimate", "report", "compare")),
+    *((f"{command} cut_samples", 2, "samples.npy") for command in ("estimate", "report", "compare")),
+    *((f"{command} cut_run", 2, "run.json") for command in ("estimate", "report", "compare")),
+    *((f"{command} cut_result", 2, "result.json") for command in ("report", "export --format toml", "diff run")),
+    *((f"{command} no_result", 2, "hil estimate") for command in ("report", "export --format toml", "diff run")),
+    ("estimate old_schema", 2, "schema"),
+    ("report new_result", 2, "newer"),
+    ("runs nowhere", 2, "nowhere"),
+    ("runs file", 2, "is not a folder"),
+    ("note nowhere --text x", 2, "nowhere"),
+    ("note file --text x", 2, "not a run folder"),
+    ("diff run nowhere", 2, "nowhere"),
+    ("diff run", 2, "Missing argument"),
+    ("diff run file", 2, "file"),
+    ("diff run result.json", 2, "result.json"),
+    # results
+    ("report nowhere", 2, "nowhere"),
+    ("report .", 2, "result.json"),
+    ("report run --out file/below.html", 2, "file"),
+    ("report run --svg file", 2, "file"),
+    ("export run --format step", 2, "'step' is not a format"),
+    ("export run", 2, "Missing option"),
+    ("export nowhere --format urdf", 2, "nowhere"),
+    ("export run --format urdf --format mjcf --out x", 2, "exactly one"),
+    ("export run --format toml --out nowhere/deep/arm.toml", 2, "nowhere/deep"),
+    ("export run --format mjcf --link-length -1", 2, "link-length"),
+    ("export run --format mjcf --samples 0 --out drawn", 2, "samples"),
+    ("export run --format mjcf --samples many", 2, "samples"),
+    ("export run --format csv --samples 3 --out drawn", 2, "csv"),
+    ("calibrate run", 2, "Missing argument"),
+    ("calibrate run run --mass 0.1 --distance 0.1", 2, "given twice"),
+    ("calibrate run nowhere --mass 0.1 --distance 0.1", 2, "nowhere"),
+    ("calibrate run no_result --mass 0 --distance 0.1", 2, "mass"),
+    ("calibrate run no_result --mass heavy --distance 0.1", 2, "mass"),
+    # the bus
+    ("scan nowhere.toml", 2, "nowhere.toml"),
+    ("scan /dev/ttyNOPE", 2, "/dev/ttyNOPE"),
+    ("scan /dev/null", 2, "not a serial port"),
+    ("scan file", 2, "file"),
+    ("scan /dev/ttyNOPE --baud 57600", 2, "there is no such device"),
+    ("setup /dev/ttyNOPE --baud 57600 --id 1 --new-id 2", 2, "/dev/ttyNOPE"),
+    ("setup /dev/null --baud 57600 --id 1 --new-id 2", 2, "/dev/null"),
+    ("setup /dev/ttyNOPE --id 300 --new-id 2", 2, "252"),
+    ("setup arm.toml --id 1 --new-id 999", 2, "252"),
+    ("init /dev/ttyNOPE --out new.toml", 2, "/dev/ttyNOPE"),
+    ("init /dev/null --out new.toml", 2, "/dev/null"),
+    ("init arm.toml --out arm.toml", 2, "arm.toml"),
+    # fakes, studies, schema
+    ("fake nowhere", 2, "nowhere"),
+    ("fake broken.toml --pty", 2, "is not TOML"),
+    ("fake arm.toml --pty --fault foo", 2, "there is no kind 'foo'"),
+    ("fake arm.toml --pty --fault silent:servo=9", 2, "9"),
+    ("fake arm.toml --pty --fault silent:at=soon", 2, "soon"),
+    ("fake arm.toml --pty --link file", 2, "file"),
+    ("hand nowhere 1:to=0.5", 2, "nowhere"),
+    ("study nowhere.toml", 2, "nowhere.toml"),
+    ("study study.toml", 2, "study.toml"),
+    ("study broken.toml", 2, "not valid TOML"),
+    ("schema --out nowhere/deep/schema.json", 2, "nowhere/deep"),
+    ("dry-run arm.toml --arms 0", 2, "arms"),
+    ("dry-run arm.toml", 2, "link_lengths"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, identified_once: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The files above, a run folder and broken copies of it (of links, but for what is broken)."""
+    here = tmp_path / "here"
+    here.mkdir()
+    for name, content in FILES.items():
+        (here / name).write_bytes(content)
+    broken: dict[str, dict[str, bytes | None]] = {
+        "run": {},
+        "cut_config": {"config.toml": b"\xff\xfe"},
+        "cut_samples": {"samples.npy": b"\x93NUMPY"},
+        "cut_run": {"run.json": b'{"schema": 1'},
+        "cut_result": {"result.json": b'{"schema": 1, "method"'},
+        "no_result": {"result.json": None},
+        "old_schema": {"run.json": b'{"schema": 0}'},
+        "new_result": {"result.json": json.dumps({"schema": 99}).encode()},
+    }
+    for name, changed in broken.items():
+        (here / name).mkdir()
+        for path in identified_once.iterdir():
+            if path.is_file() and path.name not in changed:
+                shutil.copy(path, here / name / path.name)
+        for file, content in changed.items():
+            if content is not None:
+                (here / name / file).write_bytes(content)
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    return here
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize(("line", "code", "said"), CASES, ids=[case[0] for case in CASES])
+def test_bad_input_is_named(line: str, code: int, said: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(folder)
+    found = hil(*line.split())
+    shown = capsys.readouterr()
+    error = " ".join(shown.err.replace("│", " ").split())
+    assert found == code, error
+    assert said in error, error
+    assert "Traceback" not in shown.err + shown.out
+    assert "errno" not in error.lower() and "object has no attribute" not in error
+    after = contents(folder)
+    assert {name: after.get(name) for name in before} == before, "what was there is there"
+    assert not [name for name in after.keys() - before.keys() if name.startswith("runs" + os.sep)]
+
+
+def test_there_are_at_least_a_hundred_and_twenty() -> None:
+    assert len(CASES) >= 120 and len({case[0] for case in CASES}) == len(CASES)

@@ -1,0 +1,88 @@
+"""A stop of an arm in space: it is lowered where its servos still take commands, and cut where they do not."""
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil.config.schema import load_config
+from hil.errors import SafetyStop, StopRequested
+from hil.experiment.run import run_experiment
+from hil.experiment.stream import Progress
+from hil.runs.recording import Phase, load_samples
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
+
+NAME = "fake_open_manipulator_x.toml"
+TEXT = (CONFIGS / NAME).read_text(encoding="utf-8").replace("period = 10.0", "period = 5.0")
+AT_S = 6.0
+
+
+def play(folder: Path, text: str, signals: tuple[float, ...] = ()) -> tuple[BaseException, NDArray[np.void]]:
+    """Run the arm of this text, Ctrl-C at these times [s]; what ended it and what was recorded."""
+    urdf = "open_manipulator_x_like.urdf"
+    (folder / urdf).write_bytes((CONFIGS / urdf).read_bytes())
+    (folder / NAME).write_text(text, encoding="utf-8")
+    config = load_config(folder / NAME)
+    run = RunFolder.create(folder / "run", config)
+    left = list(signals)
+
+    def watch(progress: Progress) -> None:
+        if left and progress.taken >= left[0] * config.experiment.rate:
+            left.pop(0)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises((SafetyStop, StopRequested)) as stopped:
+        run_experiment(config, run, config.path, watch)
+    return stopped.value, load_samples(run.samples_path, 4)
+
+
+def with_fault(text: str, fault: str) -> str:
+    return text.replace("[fake.chain]\n", f"[[fake.faults]]\n{fault}\n\n[fake.chain]\n", 1)
+
+
+def rest_of(text: str) -> NDArray[np.float64]:
+    line = next(line for line in text.splitlines() if line.startswith("rest_pose"))
+    return np.array([float(word) for word in line.split("[")[1].split("]")[0].split(",")])
+
+
+def test_ctrl_c_lowers_the_arm_to_its_rest_pose(tmp_path: Path) -> None:
+    error, samples = play(tmp_path, TEXT, (AT_S,))
+    lowered = samples[samples["phase"] == Phase.LOWERING]
+    assert isinstance(error, StopRequested)
+    assert any("lowered to its rest pose" in note for note in error.__notes__)
+    np.testing.assert_allclose(samples["position"][-1], rest_of(TEXT), atol=0.05)
+    assert np.abs(samples["velocity"][-1]).max() < 0.1
+    assert np.abs(lowered["goal_current"][-1]).max() < 0.1  # nothing is left to drop when torque is cut
+    assert np.abs(lowered["velocity"][120:]).max() < 1.0  # braked, then slowly
+    assert len(lowered) / 400 < 12.0
+
+
+def test_a_joint_held_for_a_moment_is_noticed_and_the_arm_lowered(tmp_path: Path) -> None:
+    text = with_fault(TEXT, f'kind = "stuck_joint"\nservo = 2\nat = {AT_S}\nduration = 0.2')
+    error, samples = play(tmp_path, text)
+    assert "joint2" in str(error)
+    stopped = samples["deadline"][np.argmax(samples["phase"] == Phase.LOWERING)] - samples["deadline"][0]
+    assert AT_S - 0.2 < stopped < AT_S + 0.2
+    np.testing.assert_allclose(samples["position"][-1], rest_of(TEXT), atol=0.05)
+
+
+def test_a_joint_that_stays_held_ends_the_lowering(tmp_path: Path) -> None:
+    error, samples = play(tmp_path, with_fault(TEXT, f'kind = "stuck_joint"\nservo = 2\nat = {AT_S}'))
+    assert any("off its way down" in note for note in error.__notes__)
+    assert (samples["phase"] == Phase.LOWERING).any()
+
+
+def test_a_lost_torque_is_cut_at_once(tmp_path: Path) -> None:
+    error, samples = play(tmp_path, with_fault(TEXT, f'kind = "overload"\nservo = 2\nat = {AT_S}'))
+    assert not (samples["phase"] == Phase.LOWERING).any()
+    assert not any("lowered" in note for note in error.__notes__)
+
+
+def test_cut_as_configured(tmp_path: Path) -> None:
+    text = TEXT.replace("[experiment]", '[safety]\nstop = "cut"\n\n[experiment]', 1)
+    _, samples = play(tmp_path, text, (AT_S,))
+    assert not (samples["phase"] == Phase.LOWERING).any()

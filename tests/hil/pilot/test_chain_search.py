@@ -1,0 +1,113 @@
+"""Arms in space from description, limits and rest pose to the result, on the fake bus; the smallest one here."""
+
+import numpy as np
+import pytest
+
+import hil
+from hil.config.schema import load_config, parse_config
+from hil.dry_run.chain_prediction import predict_chain
+from hil.dry_run.chain_prior import prior_arms
+from hil.dry_run.chain_summary import unsafe
+from hil.errors import NoSafeTorque
+from hil.estimator.chain.excitation import Path as Motion
+from hil.pilot.chain_belief import ChainBelief
+from hil.pilot.chain_paths import Paths, chain_config
+from hil.pilot.chain_search import step_config
+from hil.plan.chain_model import known_chain
+from hil.runs.recording import load_samples
+from tests.support.paths import CONFIGS
+
+LEG = CONFIGS / "leg.toml"
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> hil.Identification:
+    folder = tmp_path_factory.mktemp("leg")
+    text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 6.0")
+    (folder / "leg.urdf").write_bytes((CONFIGS / "leg.urdf").read_bytes())
+    (folder / "leg.toml").write_text(text, encoding="utf-8")
+    return hil.identify(folder / "leg.toml", out=folder / "run")
+
+
+def test_the_leg_is_identified_from_its_description_alone(found: hil.Identification) -> None:
+    assert found.verdict.trust in ("yes", "with care")
+    assert max(found.fit.residual_rms_ticks) < 0.31
+    assert found.truth is not None
+    away = [abs(each.value - found.truth[name]) / each.std for name, each in found.parameters.items()]
+    assert np.mean(np.array(away) < 1.96) > 0.8
+
+
+def test_each_step_says_what_was_foreseen_and_what_was_seen(found: hil.Identification) -> None:
+    assert found.steps[0].name == "Pilot"
+    assert found.steps[-1].name == "Full run"
+    last = found.steps[-1]
+    median, seen = np.array(last.predicted_median), np.array(last.seen)
+    np.testing.assert_allclose(seen[:3], median[:3], atol=0.15)  # after the pilot hardly anything is unknown
+
+
+def test_all_of_it_stays_within_limits_and_ends_at_rest(found: hil.Identification) -> None:
+    config = load_config(LEG)
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    for path in found.run.rglob("samples.npy"):
+        position = load_samples(path, 3)["position"]
+        assert ((position > low) & (position < high)).all()
+        assert np.abs(position[-1] - np.array(config.arm.rest_pose)).max() < 0.06
+
+
+def test_optimised_paths_are_twice_as_certain_as_random_ones() -> None:
+    config = chain_config(load_config(LEG))
+    paths = Paths.of(config, ChainBelief.prior(config).torque)
+    plain = [paths.designer.plain(paths.identify.centre, seed).worst for seed in range(5)]
+    assert paths.identify.worst < 0.5 * np.median(plain)
+    path = paths.identify.path
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    assert ((low < path.position.T) & (high > path.position.T)).all()
+    velocity = np.gradient(path.position, 1 / config.experiment.rate, axis=1)
+    np.testing.assert_allclose(velocity[:, 5:-5], path.velocity[:, 5:-5], atol=2e-3)
+
+
+def test_a_motion_that_could_meet_a_box_is_not_safe() -> None:
+    config = chain_config(load_config(LEG))
+    belief = ChainBelief.prior(config)
+    paths = Paths.of(config, belief.torque)
+    held = step_config(belief.with_stabiliser(config))
+    plan = paths.plan(held, belief.torque, 0.3)
+    arms = prior_arms(held, known_chain(held), 6)
+    free = predict_chain(held, plan, arms)
+    assert not unsafe(held, free)
+    motion = plan.segments[0].paths[1]  # type: ignore[attr-defined]
+    assert isinstance(motion, Motion)
+    foot = hil_foot(config, motion)
+    box = f'[[clearance.boxes]]\nname = "stone"\ncentre = {foot}\nsize = [0.03, 0.03, 0.03]\n\n[experiment]\n'
+    text = LEG.read_text(encoding="utf-8").replace("[experiment]\n", box, 1)
+    blocked = step_config(belief.with_stabiliser(chain_config(parse_config(text, LEG))))
+    why = unsafe(blocked, predict_chain(blocked, plan, arms))
+    assert "stone" in why
+    assert "s into 'identify'" in why
+
+
+def hil_foot(config: object, motion: Motion) -> list[float]:
+    """Where the lowest capsule's end is in the middle of a motion."""
+    from hil.clearance.space import Space
+
+    ends, _ = Space.of(config).ends(motion.position[:, motion.position.shape[1] // 2])  # type: ignore[arg-type]
+    return [float(value) for value in ends[-1, 1]]
+
+
+def test_no_room_is_said() -> None:
+    text = LEG.read_text(encoding="utf-8").replace("floor = -0.4 ", "floor = 0.02 ")
+    config = chain_config(parse_config(text, LEG))
+    with pytest.raises(NoSafeTorque, match="clearance"):
+        Paths.of(config, ChainBelief.prior(config).torque)
+
+
+def test_learning_moves_the_arms_to_what_was_seen(found: hil.Identification) -> None:
+    config = hil.load_run(found.run).config
+    before = ChainBelief.prior(config)
+    after = before.learn(config, load_samples(found.run / "samples.npy", 3))
+    assert found.truth is not None
+    index = list(before.arms.base.names).index("moment_z_2")
+    true = found.truth["moment_z_2"]
+    drawn = {key: belief.arms.rigid[:, index] for key, belief in (("before", before), ("after", after))}
+    assert abs(drawn["after"].mean() - true) < 0.05 * abs(true)
+    assert drawn["after"].std() < 0.2 * drawn["before"].std()

@@ -1,0 +1,242 @@
+"""Recordings as other programs write them, down to recordings in SI units."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.config.csv_columns import Columns
+from hil.errors import CsvError
+from hil.recordings.convert import Converted, convert
+from hil.recordings.encoder import encoder_step
+from hil.recordings.files import read_tables
+from hil.recordings.periodic import mean_period
+
+STEP = 2.0 * np.pi / 4096
+TIME = 0.005 * np.arange(800)
+ANGLES = np.round(np.stack((0.7 * np.sin(3.0 * TIME) - 1.5, 0.5 * np.cos(4.0 * TIME))) / STEP) * STEP
+TORQUES = np.stack((0.3 * np.sin(3.0 * TIME + 1.0), 0.1 * np.cos(4.0 * TIME)))
+HEAD = ("time", "q1", "q2", "tau1", "tau2")
+
+
+def write(
+    path: str,
+    head: tuple[str, ...] = HEAD,
+    scale: tuple[float, ...] = (1.0,) * 5,
+    delimiter: str = ",",
+    comma: str = ".",
+    before: str = "",
+    end: str = "",
+) -> Path:
+    """The recording as CSV; `scale` of each column."""
+    table = np.column_stack((TIME, ANGLES.T, TORQUES.T)) * scale
+    rows = [delimiter.join(f"{value:.9g}".replace(".", comma) for value in row) + end for row in table]
+    Path(path).write_text(before + delimiter.join(head) + end + "\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    return Path(path)
+
+
+def read(path: Path, columns: Columns | None = None) -> Converted:
+    (table,) = read_tables(path)
+    return convert(table, columns or Columns())
+
+
+def check(found: Converted) -> None:
+    (recording,) = found.recordings
+    assert recording.time == pytest.approx(TIME, abs=1e-9)
+    assert recording.position == pytest.approx(ANGLES, abs=1e-8)
+    assert recording.torque == pytest.approx(TORQUES, abs=1e-8)
+    assert recording.position_step == pytest.approx([STEP, STEP], rel=1e-4) and found.stepped == (True, True)
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: write("a.csv"),
+        lambda: write("a.csv", delimiter=";", comma=","),
+        lambda: write("a.csv", delimiter="\t", comma=","),
+        lambda: write("a.tsv", delimiter="\t"),
+        lambda: write("a.txt", delimiter=" "),
+        lambda: write("a.csv", before="\ufeff"),
+        lambda: write("a.csv", before="# rig 3, Tuesday\n# 200 Hz\n"),
+        lambda: write("a.csv", end=","),
+        lambda: write("a.csv", delimiter=";", end=";"),
+        lambda: write("a.csv", ("t [ms]", "q1 [deg]", "q2 [deg]", "tau1 [mNm]", "tau2 [mNm]"), deg(1e3, 1e3)),
+        lambda: write(
+            "a.csv", ("Time (s)", "Position 1 (°)", "Position 2 (°)", "Torque 1 (Nm)", "Torque 2 (Nm)"), deg()
+        ),
+        lambda: write(
+            "a.csv", ("timestamp_us", "pos_1_deg", "pos_2_deg", "effort_1_mNm", "effort_2_mNm"), deg(1e6, 1e3)
+        ),
+        lambda: write("a.csv", ("t", "q_shoulder", "q_elbow", "tau_shoulder", "tau_elbow")),
+        lambda: write("a.csv", HEAD, deg(), before="") and with_units("a.csv", "s,deg,deg,Nm,Nm"),
+    ],
+)
+def test_the_same_numbers_however_they_were_written(make: Callable[[], Path]) -> None:
+    check(read(make()))
+
+
+def deg(time: float = 1.0, torque: float = 1.0) -> tuple[float, ...]:
+    return (time, 180.0 / np.pi, 180.0 / np.pi, torque, torque)
+
+
+def with_units(path: str, units: str) -> Path:
+    head, _, rest = Path(path).read_text(encoding="utf-8").partition("\n")
+    Path(path).write_text(f"{head}\n{units}\n{rest}", encoding="utf-8")
+    return Path(path)
+
+
+def test_ticks_and_voltages_need_their_sizes() -> None:
+    path = write("a.csv", ("t", "q1", "q2", "u1", "u2"), (1.0, 1.0 / STEP, 1.0 / STEP, 10.0, 10.0))
+    given = {"position": ["q1", "q2"], "voltage": ["u1", "u2"], "torque_per_volt": [0.1, 0.1]}
+    check(read(path, Columns(**given, position_unit="ticks", ticks_per_turn=4096)))  # type: ignore[arg-type]
+    given = given | {"torque_per_volt": None, "torque_constant": [1.8, 1.8], "resistance": [18.0, 18.0]}
+    check(read(path, Columns(**given, position_unit="ticks", ticks_per_turn=4096)))  # type: ignore[arg-type]
+    pwm = {"position": ["q1", "q2"], "pwm": ["u1", "u2"], "torque_per_volt": [0.1, 0.1], "supply_voltage": 100.0}
+    check(read(path, Columns(**pwm, pwm_unit="%", position_unit="ticks", ticks_per_turn=4096)))  # type: ignore[arg-type]
+    with pytest.raises(CsvError, match="is it in percent"):
+        read(path, Columns(**pwm, position_unit="ticks", ticks_per_turn=4096))  # type: ignore[arg-type]
+
+
+def spoilt(change: Callable[[list[str]], list[str]]) -> Converted:
+    path = write("a.csv")
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join([head, *change(rows)]) + "\n", encoding="utf-8")
+    return read(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "recordings"),
+    [
+        (lambda rows: [each for row in rows for each in (row, row)], "800 repeated rows were left out", 1),
+        (lambda rows: [*rows[:300], *rows[340:]], "taken as time time", 1),
+        (lambda rows: [*rows[:300], "nan,,,,", *rows[300:]], "1 rows without a time", 1),
+        (lambda rows: [*rows[:300], rows[301], rows[300], *rows[302:]], "1 rows out of order were sorted", 1),
+        (lambda rows: [*rows[:300], rows[300].rpartition(",")[0] + ",", *rows[301:]], "torque was filled in for 1", 1),
+        (lambda rows: [*rows, *rows], "taken as 2 recordings", 2),
+        (lambda rows: [*rows[:300], rows[300].replace("1.5,", "1.5001,"), *rows[300:]], "taken as", 1),
+    ],
+)
+def test_rows_that_can_be_put_right_are_and_it_is_said(
+    change: Callable[[list[str]], list[str]], said: str, recordings: int
+) -> None:
+    found = spoilt(change)
+    assert said in " ".join(found.notes) and len(found.recordings) == recordings
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda rows: rows[::-1], "time goes back"),
+        (lambda rows: [row.replace(row.split(",")[0], row.split(",")[0][:3], 1) for row in rows], "too coarse"),
+        (lambda rows: ["x" + row for row in rows], "column 'time' is not a number"),
+        (lambda rows: [*rows[:9], "1,2,3", *rows[9:]], "line 11: 3 fields for 5 columns"),
+        (lambda rows: [], "is empty"),
+    ],
+)
+def test_rows_that_cannot_are_named(change: Callable[[list[str]], list[str]], said: str) -> None:
+    with pytest.raises(CsvError, match=said):
+        spoilt(change)
+
+
+def test_parquet_and_a_lerobot_dataset() -> None:
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(pa.table(dict(zip(HEAD, (TIME, *ANGLES, *TORQUES), strict=True))), "a.parquet")
+    check(read(Path("a.parquet")))
+    names = {"motors": ["shoulder.pos", "elbow.pos"]}
+    features = {"observation.state": {"names": names}, "action": {"names": ["shoulder.effort", "elbow.effort"]}}
+    Path("set/meta").mkdir(parents=True)
+    Path("set/data/chunk-000").mkdir(parents=True)
+    Path("set/meta/info.json").write_text(json.dumps({"features": features}), encoding="utf-8")
+    table = {"observation.state": ANGLES.T.tolist(), "action": TORQUES.T.tolist(), "timestamp": TIME}
+    both = pa.table(
+        {name: [*values, *values] for name, values in table.items()} | {"episode_index": [0] * 800 + [1] * 800}
+    )
+    parquet.write_table(both, "set/data/chunk-000/episode_000000.parquet")
+    columns = Columns(
+        position=["observation.state.shoulder.pos", "observation.state.elbow.pos"],
+        torque=["action.shoulder.effort", "action.elbow.effort"],
+    )
+    first, second = read_tables(Path("set"))
+    check(convert(first, columns))
+    check(convert(second, columns))
+    Path("b.parquet").write_text("no", encoding="utf-8")
+    with pytest.raises(CsvError, match=r"b\.parquet: cannot be read"):
+        read_tables(Path("b.parquet"))
+
+
+def test_mcap_with_joint_states_and_what_else_was_logged() -> None:
+    writer_of = pytest.importorskip("mcap.writer")
+    with Path("a.mcap").open("wb") as file:
+        writer = writer_of.Writer(file)
+        writer.start()
+        schema = writer.register_schema(name="x", encoding="jsonschema", data=b"{}")
+        topics = [writer.register_channel(t, "json", schema) for t in ("/joint_states", "/battery")]
+        for k, time in enumerate(TIME):
+            stamp = 1_700_000_000_000_000_000 + round(1e9 * time)
+            named = {"name": ["shoulder", "elbow"], "position": ANGLES[:, k].tolist(), "effort": TORQUES[:, k].tolist()}
+            messages = [named, {"voltage": 12.0, "note": "fine"}]
+            for channel, message in zip(topics, messages[: 1 + (k % 100 == 0)], strict=False):
+                writer.add_message(channel, stamp, json.dumps(message).encode(), stamp)
+        writer.finish()
+    (table,) = read_tables(Path("a.mcap"))
+    assert table.columns["/battery.voltage"] == pytest.approx(np.full(800, 12.0))
+    check(convert(table, Columns()))
+    Path("b.mcap").write_bytes(b"\x89MCAP0\r\nnothing")
+    with pytest.raises(CsvError, match=r"b\.mcap: cannot be read"):
+        read_tables(Path("b.mcap"))
+
+
+def test_a_ros_2_bag(tmp_path: Path) -> None:
+    ros2 = pytest.importorskip("mcap_ros2.writer")
+    definition = (
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+        + "=" * 80
+        + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+        + "=" * 80
+        + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+    )
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag/metadata.yaml").write_text("rosbag2_bagfile_information: {}\n", encoding="utf-8")
+    with (tmp_path / "bag/bag_0.mcap").open("wb") as file:
+        writer = ros2.Writer(file)
+        schema = writer.register_msgdef("sensor_msgs/msg/JointState", definition)
+        for k, time in enumerate(TIME):
+            stamp = 1_700_000_000_000_000_000 + round(1e9 * time)
+            header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": ""}
+            body = {"position": ANGLES[:, k].tolist(), "velocity": [], "effort": TORQUES[:, k].tolist()}
+            # Logged late by a tenth of a second now and then: the header says when it was.
+            logged = stamp + (k % 7) * 10_000_000
+            message = {"header": header, "name": ["shoulder", "elbow"], **body}
+            writer.write_message("/joint_states", schema, message, logged, logged)
+        writer.finish()
+    check(read(tmp_path / "bag"))
+
+
+def test_an_encoder_step_is_found_through_the_digits_that_were_written() -> None:
+    random = np.random.default_rng(1)
+    angle = np.cumsum(random.normal(0.0, 0.02, 3000))
+    for step in (STEP, 2.0 * np.pi / 1024):
+        assert encoder_step(np.round(np.round(angle / step) * step, 5)) == pytest.approx(step, rel=1e-3)
+    assert encoder_step(angle) is None
+    assert encoder_step(np.full(50, 1.0)) is None
+
+
+def test_a_periodic_recording_is_averaged() -> None:
+    time = 0.005 * np.arange(2200)
+    torque = 0.3 * np.sin(2.0 * np.pi * time / 2.0)[None] + 0.1 * np.sin(2.0 * np.pi * time / 0.5)[None]
+    settling = 0.4 * np.exp(-2.0 * time)
+    table = np.column_stack((time, np.sin(2.0 * np.pi * time / 2.0) + settling, torque[0]))
+    Path("a.csv").write_text(
+        "t,q1,tau1\n" + "\n".join(",".join(map(str, row)) for row in table.tolist()), encoding="utf-8"
+    )
+    (recording,) = read(Path("a.csv")).recordings
+    found = mean_period(recording)
+    assert found is not None and found.seconds == pytest.approx(2.0) and 3 <= found.periods <= 5
+    assert found.recording.position[0] == pytest.approx(np.sin(np.pi * (found.recording.time + 1.0)), abs=0.01)
