@@ -31,14 +31,11 @@ SHAPES = {
     "stribeck_velocity": (0.15, 0.7),
     "load": (0.03, 1.5),
 }
-"""Prior on the shape of friction near standstill: typical value [its unit] and standard deviation of its logarithm.
-
-A joint that is never slow provides no information on these parameters; without a prior they would drift arbitrarily.
-"""
-RESHAPING = 1.0  # maximum change of a shape's logarithm per step
-NARROWING, WIDENING = 0.8, 2.0  # maximum relative decrease and increase of a width per step
-LONGEST = 2.0  # maximum change of any coordinate per step
-NEAREST = 1e-3  # minimum distance of a width from its floor, as a fraction of the floor
+"""Shape of friction near standstill: what is likely [its unit] and the standard deviation of its logarithm. A joint
+that is never slow says nothing of it, and without that would let it go anywhere."""
+RESHAPING = 1.0  # of their logarithms, in one step
+NARROWING, WIDENING = 1.6, 1.1  # of a width's logarithm, in one step
+LONGEST = 2.0  # of any coordinate, in one step
 
 
 @dataclass(frozen=True)
@@ -49,44 +46,36 @@ class ChainCoordinates:
     scales: Array
     """Scales of the base parameters, at their indices; ignored for others (parameters,)."""
     width_floor: float
-    """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
+    """The least width of every Coulomb step [rad/s]."""
 
     def values(self, x: Array) -> Array:
-        """Return the parameters (parameters,) at the coordinates `x`."""
-        positive = np.exp(np.where(self._positive, x, 0.0)) + self._floors
-        value: Array = np.where(self._positive, positive, x * self._scales)
+        """Parameters (parameters,) at the coordinates `x`."""
+        value: Array = np.where(self._positive, np.exp(np.where(self._positive, x, 0.0)), x * self._scales)
         return value
 
     def coordinates(self, value: Array) -> Array:
-        """Return the coordinates of `value` (parameters,), moved into the physical range."""
-        above = np.maximum(value - self._floors, np.maximum(self._least, NEAREST * self._floors))
-        x: Array = np.where(self._positive, np.log(np.where(self._positive, above, 1.0)), value / self._scales)
+        """Coordinates of `value` (parameters,), moved into the physical range."""
+        positive = np.log(np.where(self._positive, np.maximum(value, self._least), 1.0))
+        x: Array = np.where(self._positive, positive, value / self._scales)
         return x
 
     def slopes(self, x: Array) -> Array:
-        """Return the derivative of each parameter by its coordinate (parameters,)."""
-        slope: Array = np.where(self._positive, self.values(x) - self._floors, self._scales)
+        """Derivative of each parameter by its coordinate (parameters,)."""
+        slope: Array = np.where(self._positive, self.values(x), self._scales)
         return slope
 
-    def limit(self, x: Array, least: Array, most: Array) -> None:
-        """Set, in place, the bounds on the change of each coordinate in one step from `x`."""
-        count = len(self.names)
-        bound = np.where([kind in SHAPES for kind in self._kinds], RESHAPING, LONGEST)
-        least[:count], most[:count] = -bound, bound
-        widths = np.flatnonzero(self._floors)
-        share = 1.0 + self.width_floor * np.exp(-x[widths])  # width relative to its distance from the floor
-        least[widths], most[widths] = np.maximum(-1.0, -NARROWING * share), WIDENING * share
-
-    def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` from `x`; both may be followed by coordinates of something else.
-
-        A step changes a width linearly rather than its logarithm, since the motion depends linearly on it; exponential
-        steps would never reach its floor.
+    def limit(self, x: Array, reach: float, least: Array, most: Array) -> None:
+        """Lower in place what coordinates may change by in one step from `x`, those of friction's shape to `reach` of
+        what they ever may: a width that has come to its floor stays there as long as the others' steps would narrow it.
         """
-        y: Array = x + step
-        widths = np.flatnonzero(self._floors)
-        y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), NEAREST * self.width_floor))
-        return y
+        count = len(self.names)
+        bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)
+        least[:count], most[:count] = -bound, bound
+        widths = self._widths
+        least[widths], most[widths] = (
+            np.clip(np.log(self.width_floor) - x[widths], -reach * NARROWING, 0.0),
+            reach * WIDENING,
+        )
 
     @cached_property
     def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
@@ -104,12 +93,14 @@ class ChainCoordinates:
         return np.array([kind in POSITIVE for kind in self._kinds])
 
     @cached_property
-    def _floors(self) -> Array:
-        return np.array([self.width_floor if kind == "coulomb_width" else 0.0 for kind in self._kinds])
+    def _widths(self) -> npt.NDArray[np.int64]:
+        return np.flatnonzero([kind == "coulomb_width" for kind in self._kinds])
 
     @cached_property
     def _least(self) -> Array:
-        return np.array([POSITIVE.get(kind, 0.0) for kind in self._kinds])
+        return np.array(
+            [self.width_floor if kind == "coulomb_width" else POSITIVE.get(kind, 0.0) for kind in self._kinds]
+        )
 
     @cached_property
     def _scales(self) -> Array:

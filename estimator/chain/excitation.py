@@ -1,22 +1,34 @@
 """Excitation of a chain by paths that are finite Fourier series of the joint angles.
 
-Swevers, Ganseman, Tukel, De Schutter, Van Brussel, IEEE Transactions on Robotics and Automation 13 (1997) 730. A path
-is played as the torque that a rough model of the arm needs for it, plus a software spring and damper. Among several
-paths with random phases, the one that best determines the base parameters as a whole is chosen.
+Played as the torque that a rough model of the arm needs for it, with a spring and a damper in software around it. The
+series is optimised for what is wanted of the result: the torque of other motions in the same range, worst joint. Every
+unknown of the regression takes part, friction and offsets too: a joint that moves little cannot tell gravity from an
+offset, and no criterion on the inertial parameters alone sees that.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.dynamics import mass_matrix
 from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.stage1 import columns_of_friction
+from hil.estimator.data.fourier import PeriodicMotion
 from hil.estimator.errors import ExcitationError
 
-CANDIDATES = 24
-LOOKED_AT = 200  # samples of each candidate that are evaluated
-NOISE = 0.02  # assumed residual of a candidate's regression, as a fraction of each joint's torque
+CANDIDATES = 24  # paths drawn at random
+IMPROVEMENTS = 96  # changes of the best one that are tried
+CHANGE, LEAST_CHANGE = 0.5, 0.1  # of its coefficients, at the beginning and at the end
+STEEPEST = 2.0  # power of a harmonic's number by which the drawn coefficients fall
+OTHERS = 3  # motions whose torque is to be foretold
+CHANGED = 0.3  # of them at a time
+SAMPLES_PER_HARMONIC = 12
+NOISE = 4.4e-4  # rad: of an angle, by the rounding of 4096 steps a turn
+SOFTNESS = 1.0  # Hz: of the observer in stage 2, which forgets what lies further back
 
 
 @dataclass(frozen=True)
@@ -26,6 +38,36 @@ class Path:
     position: Array
     velocity: Array
     acceleration: Array
+
+
+@dataclass(frozen=True)
+class Box:
+    """Where a path may go: each joint within `swing` (joints,) [rad] of `centre` (joints,) [rad] and no faster than
+    `speed` (joints,) [rad/s], in `period` [s], with `harmonics`."""
+
+    centre: Array
+    swing: Array
+    speed: Array
+    period: float
+    harmonics: int
+
+    def path(self, lines: NDArray[np.complex128], samples: int) -> Path:
+        """The path of coefficients `lines` (joints, harmonics), scaled to fill the box."""
+        spectrum = np.zeros((self.centre.size, samples // 2 + 1), dtype=np.complex128)
+        spectrum[:, 1 : self.harmonics + 1] = lines
+        turn = 2j * np.pi * np.arange(spectrum.shape[1]) / self.period
+        position, velocity, acceleration = (np.fft.irfft(spectrum * turn**order, samples, axis=1) for order in range(3))
+        most = np.abs(position).max(axis=1), np.abs(velocity).max(axis=1)
+        scale = np.minimum(self.swing / most[0], self.speed / most[1])[:, None]
+        return Path(self.centre[:, None] + scale * position, scale * velocity, scale * acceleration)
+
+    def draw(self, rng: np.random.Generator) -> NDArray[np.complex128]:
+        """Coefficients of random phases and amplitudes (joints, harmonics): of some joints slow and wide motions, of
+        others fast ones."""
+        shape = self.centre.size, self.harmonics
+        slower = np.arange(1, self.harmonics + 1) ** -rng.uniform(0.0, STEEPEST, (self.centre.size, 1))
+        lines = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+        return (slower * lines).astype(np.complex128)
 
 
 def design_path(
@@ -53,26 +95,94 @@ def design_path(
             "positive swing and speed"
         )
     rng = np.random.default_rng(seed)
-    paths = [_candidate(rng, rate, period, count, centre, swing, speed) for _ in range(CANDIDATES)]
-    return max(paths, key=lambda path: _certainty(base, prior, path))
+    box = Box(centre, swing, speed, period, count)
+    goal = Goal(base, prior, box, round(rate * period))
+    drawn = [box.draw(rng) for _ in range(CANDIDATES)]
+    errors = [goal.error(lines) for lines in drawn]
+    best, error = drawn[int(np.argmin(errors))], min(errors)
+    for k in range(IMPROVEMENTS):
+        size = CHANGE * (LEAST_CHANGE / CHANGE) ** (k / IMPROVEMENTS)
+        typical = np.sqrt(np.mean(np.abs(best) ** 2, axis=1, keepdims=True))
+        changed = best + size * typical * box.draw(rng) * (rng.random(best.shape) < CHANGED)
+        found = goal.error(changed)
+        if found < error:
+            best, error = changed, found
+    return box.path(best, round(rate * period))
 
 
-def _candidate(
-    rng: np.random.Generator, rate: float, period: float, count: int, centre: Array, swing: Array, speed: Array
-) -> Path:
-    samples = round(rate * period)
-    lines = np.zeros((centre.size, samples // 2 + 1), dtype=np.complex128)
-    lines[:, 1 : count + 1] = rng.standard_normal((centre.size, count)) + 1j * rng.standard_normal((centre.size, count))
-    turn = 2j * np.pi * np.arange(lines.shape[1]) / period
-    position, velocity, acceleration = (np.fft.irfft(lines * turn**order, samples, axis=1) for order in range(3))
-    scale = np.minimum(swing / np.abs(position).max(axis=1), speed / np.abs(velocity).max(axis=1))[:, None]
-    return Path(centre[:, None] + scale * position, scale * velocity, scale * acceleration)
+@dataclass(frozen=True)
+class Goal:
+    """How well a path determines the torque of other motions in its box, before anything is known but the prior."""
 
+    base: BaseParameters
+    prior: Prior
+    box: Box
+    readings: int
+    """Samples of the recording."""
 
-def _certainty(base: BaseParameters, prior: Prior, path: Path) -> float:
-    """Return the log determinant of the information about the base parameters, relative to that of the prior."""
-    some = slice(0, None, max(1, path.position.shape[1] // LOOKED_AT))
-    Y = base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
-    level = np.sqrt(np.mean((Y @ prior.value) ** 2, axis=1)) + 1e-9
-    rows = (Y * prior.std / (NOISE * level[:, None, None])).reshape(-1, base.count)
-    return float(np.linalg.slogdet(rows.T @ rows + np.eye(base.count))[1])
+    def error(self, lines: NDArray[np.complex128]) -> float:
+        """Expected RMS error of the rigid-body torque of other motions over its RMS, worst joint."""
+        rows = self._seen(self._columns(self.box.path(lines, self._samples))) * self._lengths
+        information = rows.T @ rows
+        information[np.diag_indices_from(information)] += 1.0
+        covariance = np.linalg.inv(information)[: self.base.count, : self.base.count]
+        wrong = np.einsum("jsa,ab,jsb->j", self._others, covariance, self._others)
+        return float(np.max(np.sqrt(wrong) / self._level))
+
+    @property
+    def _samples(self) -> int:
+        return SAMPLES_PER_HARMONIC * self.box.harmonics
+
+    def _columns(self, path: Path) -> Array:
+        """Regressor of base parameters, friction and offsets (joints, samples, unknowns)."""
+        rigid = self.base.regressor(path.position, path.velocity, path.acceleration)
+        motion = PeriodicMotion(path.position, path.velocity, path.acceleration)
+        return np.concatenate((rigid, columns_of_friction(motion)), axis=2)
+
+    def _seen(self, columns: Array) -> Array:
+        """What torques show in angles, in units of their noise (joints samples, unknowns): through the joint's inertia,
+        drawn to the measurements by the observer. Each of the few samples stands for several readings."""
+        spectrum = np.fft.rfft(columns, axis=1) * self._response[:, :, None]
+        noise = NOISE * np.sqrt(self._samples / self.readings)
+        shown: Array = np.fft.irfft(spectrum, self._samples, axis=1) / noise
+        return shown.reshape(-1, columns.shape[2])
+
+    @cached_property
+    def _response(self) -> Array:
+        """Of each joint's angle to torque (joints, lines) [rad/(N m)]."""
+        described = self.base.as_all(self.prior.value)
+        inertia = np.diag(mass_matrix(self.base.chain, described, self.box.centre))
+        turn = 2j * np.pi * np.arange(self._samples // 2 + 1) / self.box.period
+        soft = 2.0 * np.pi * SOFTNESS
+        response: Array = 1.0 / (np.maximum(inertia, 1e-6)[:, None] * (turn + soft) ** 2)
+        return response
+
+    @cached_property
+    def _lengths(self) -> Array:
+        """Of each unknown: standard deviation of its prior; friction's is a joint's torque."""
+        friction = np.repeat(self._level_of_joint[None, :], 3, axis=0).reshape(-1)
+        return np.concatenate((self.prior.std, friction))
+
+    @cached_property
+    def _motions(self) -> Array:
+        """Rigid columns of other motions (joints, samples, base parameters)."""
+        rng = np.random.default_rng(0)
+        paths = [self.box.path(self.box.draw(rng), self._samples) for _ in range(OTHERS)]
+        parts = [self.base.regressor(path.position, path.velocity, path.acceleration) for path in paths]
+        return np.concatenate(parts, axis=1)
+
+    @cached_property
+    def _level_of_joint(self) -> Array:
+        """RMS torque of those (joints,) [N m]."""
+        level: Array = np.sqrt(np.mean((self._motions @ self.prior.value) ** 2, axis=1)) + 1e-9
+        return level
+
+    @cached_property
+    def _level(self) -> Array:
+        level: Array = self._level_of_joint * np.sqrt(self._motions.shape[1])
+        return level
+
+    @cached_property
+    def _others(self) -> Array:
+        """The motions' columns in units of the prior (joints, samples, base parameters)."""
+        return self._motions * self.prior.std

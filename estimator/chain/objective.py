@@ -20,7 +20,10 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise
 from hil.estimator.fit.normal_equations import normal_equations
+from hil.estimator.options import MinimiserOptions
 from hil.estimator.simulation.drive import torque_and_slopes
+
+MINIMISER = MinimiserOptions()
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,9 @@ class ChainProblem:
     softness: float
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
-    """Number of smaller integration steps that replace one where a joint may be near standstill."""
+    """Integration steps in place of one where a joint may be near standstill."""
+    reach: float = 1.0
+    """Of one step in the shapes of friction, over what they may change by far from the minimum."""
 
     @property
     def count(self) -> int:
@@ -103,15 +108,23 @@ class ChainProblem:
             return Quadratic(np.inf, np.zeros_like(normal), np.zeros_like(gradient))
         return Quadratic(cost, normal, gradient)
 
-    def minimise(self, x: Array, ftol: float, damping: float | None = None) -> Minimum:
-        """Minimise the sum of squares from `x`, until its relative decrease is less than `ftol`."""
+    def minimise(
+        self,
+        x: Array,
+        ftol: float,
+        damping: float | None = None,
+        options: MinimiserOptions = MINIMISER,
+        at: Quadratic | None = None,
+    ) -> Minimum:
+        """Minimise the sum of squares from `x`, until its relative decrease is less than `ftol`; `at`: the sum there,
+        where it is known."""
 
         def limits(point: Array) -> tuple[Array, Array]:
             least, most = np.full(point.size, -LONGEST), np.full(point.size, LONGEST)
-            self.coordinates.limit(point[: self.count], least, most)
+            self.coordinates.limit(point[: self.count], self.reach, least, most)
             return least, most
 
-        return minimise(self.evaluate, x, ftol, damping, move=self.coordinates.moved, limits=limits)
+        return minimise(self.evaluate, x, ftol, damping, at, limits=limits, options=options)
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Return the predicted positions of each period (joints, samples) [rad]; None if a motion diverges."""
@@ -138,6 +151,24 @@ class ChainProblem:
                 scatter.add(np.einsum("sj,sjc->sc", weight[part] ** 2 * r, J))
             total[np.ix_(where, where)] += scatter.sum() * np.outer(slopes, slopes)
         return total
+
+    def weighted(self, x: Array, index: int, most: int) -> Iterator[tuple[Array, Array]]:
+        """Of each joint, at most `most` samples of a period's weighted residual (samples,) and its Jacobian by all
+        coordinates (samples, coordinates)."""
+        period, weight = self.periods[index], self.weights[index]
+        where, slopes = self._where(x, index)
+        residuals, jacobians = [], []
+        for part, r, J in self._pieces(x, index, period, self.parameters(x)):
+            assert r is not None  # the minimum's motion is finite
+            residuals.append(weight[part] * r)
+            jacobians.append(weight[part][:, :, None] * J * slopes)
+            if part.stop >= most:
+                break
+        residual, jacobian = np.concatenate(residuals), np.concatenate(jacobians)
+        for joint in range(period.joints):
+            every = np.zeros((len(residual), x.size))
+            every[:, where] = jacobian[:, joint]
+            yield residual[:, joint], every
 
     def softer(self, softness: float) -> "ChainProblem":
         """Return the same problem with another natural frequency of the observer [Hz]."""

@@ -57,13 +57,17 @@ def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior)
 def columns_of(model: ChainModel, motion: PeriodicMotion) -> Array:
     """Return the regressor of `ChainModel.linear_names` (joints, samples, names)."""
     rigid = model.base.regressor(motion.position, motion.velocity, motion.acceleration)
-    joints, samples, count = rigid.shape
-    Y = np.zeros((joints, samples, count + 3 * joints))
-    Y[:, :, :count] = rigid
-    for joint in range(joints):
-        Y[joint, :, count + joint] = motion.velocity[joint]
-        Y[joint, :, count + joints + joint] = np.tanh(motion.velocity[joint] / COULOMB_WIDTH)
-        Y[joint, :, count + 2 * joints + joint] = 1.0
+    return np.concatenate((rigid, columns_of_friction(motion)), axis=2)
+
+
+def columns_of_friction(motion: PeriodicMotion) -> Array:
+    """The regressor of viscous and Coulomb friction and of offsets (joints, samples, 3 joints), term by term."""
+    joints, samples = motion.velocity.shape
+    Y = np.zeros((joints, samples, 3 * joints))
+    for joint, velocity in enumerate(motion.velocity):
+        Y[joint, :, joint] = velocity
+        Y[joint, :, joints + joint] = np.tanh(velocity / COULOMB_WIDTH)
+        Y[joint, :, 2 * joints + joint] = 1.0
     return Y
 
 

@@ -16,11 +16,13 @@ from hil.estimator.chain.model import ChainModel
 from hil.estimator.chain.objective import ChainProblem
 from hil.estimator.chain.prior import Prior
 from hil.estimator.chain.stage1 import ChainLinear
+from hil.estimator.chain.uncertainty import coloured_covariance
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import (
     by_parameters,
     correlation_time,
+    larger_covariance,
     robust_covariance,
     structured_share,
 )
@@ -44,20 +46,23 @@ class ChainOptions:
     lost: float = 1.5
     """Cost increase, beyond what the softness explains, above which the previous observer is kept (a ratio)."""
     coarse_step: float = 2.6e-3
-    """Coarse integration step [s]."""
-    fine_step: float = 0.85e-3
-    """Fine integration step [s]."""
-    finer: int = 4
-    """Number of smaller integration steps that replace one near standstill."""
-    width_floor: float = 1e-3
-    """Lower bound of the width of every smoothed Coulomb step [rad/s], indistinguishable from stiction."""
+    """Of integration [s]."""
+    fine_step: float = 1.3e-3
+    """[s] Of the last iterations."""
+    finer: int = 16
+    """Steps in place of one of those near standstill, where friction changes fast."""
+    width_floor: float = 3e-4
+    """Least width of every Coulomb step [rad/s]: friction that sticks is hardly told from this."""
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     min_initial_lag: float = 5e-4
-    """Minimum initial time constant of the current loop [s]."""
+    """[s]"""
+    reach: float = 0.3
+    """Of the last steps in friction's shapes, in which the sum is far from quadratic."""
     ftol_coarse: float = 1e-2
     ftol_near: float = 3e-3
-    ftol: float = 1e-5
+    ftol_nearer: float = 1e-3
+    ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
     """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
     angle_scale: float = 0.1
@@ -67,7 +72,11 @@ class ChainOptions:
 
 
 DEFAULTS = ChainOptions()
+REPEATED = 4  # equal readings in a row that still count as that many: a joint in motion gives as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
+LAST = MinimiserOptions(max_damping=10.0)
+"""Of the last iterations. Where a joint just sticks or just does not, the sum of squares has small steps: what only
+heavily damped steps gain is such a step."""
 
 
 @dataclass(frozen=True)
@@ -125,14 +134,19 @@ def fit_periods(
             break
         found, softness = trial, frequency
     assert found is not None
-    fine = replace(problem, softness=softness, finer=options.finer)
-    near = fine.minimise(found.x, options.ftol_near)
-    positions = fine.positions(near.x)
+    sticking = replace(coarse, softness=softness, finer=options.finer)
+    near = sticking.minimise(found.x, options.ftol_near)
+    positions = sticking.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
     weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
-    last = replace(fine, weights=tuple(weight.T for weight in weights))
-    minimum = last.minimise(near.x, options.ftol, MINIMISER.min_damping)
-    return _fit(last, minimum, outliers, COVARIANCE, spent + near.iterations + minimum.iterations)
+    weights = tuple((weight * _repeated(each)).T for weight, each in zip(weights, periods, strict=True))
+    nearer = replace(sticking, weights=weights, reach=options.reach).minimise(near.x, options.ftol_nearer)
+    last = replace(sticking, weights=weights, steps=problem.steps, reach=options.reach)
+    damped = last.minimise(nearer.x, options.ftol, options=LAST)
+    # Damping holds back what is hardly determined; without it before, many limits of steps would stop the rest.
+    minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
+    spent += near.iterations + nearer.iterations + damped.iterations + minimum.iterations
+    return _fit(last, minimum, outliers, COVARIANCE, spent)
 
 
 def _problem(
@@ -151,7 +165,7 @@ def _problem(
     start = START | {"coulomb_width": options.initial_width}
     value = np.array([known.get(name, start.get(kind_of(name), 0.0)) for name in model.names])
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
-    weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0).T for period in periods)
+    weights = tuple(np.where(period.valid, _repeated(period) / period.noise[:, None], 0.0).T for period in periods)
     steps = _steps(periods, options.fine_step)
     problem = ChainProblem(
         tuple(periods), model, coordinates, prior, state_scale, weights, steps, softness=options.softness[0]
@@ -178,6 +192,21 @@ def _steps(periods: Sequence[SettledPeriod], longest: float) -> int:
     return max(steps_per_sample(period.rate, longest) for period in periods)
 
 
+def _repeated(period: SettledPeriod) -> Array:
+    """Weight of each sample (joints, samples) for what it shares with those beside it, 1 where they are independent.
+
+    While a joint sticks, its encoder repeats one reading with one rounding error. Counted as often as it is repeated,
+    that error would have the simulated joint creep towards it, through friction softened near standstill: a stretch of
+    equal readings counts as one reading.
+    """
+    weight = np.ones_like(period.position)
+    for row, position in zip(weight, period.position, strict=True):
+        first = np.flatnonzero(np.concatenate(([True], np.diff(position) != 0.0)))  # NaN differs from itself
+        length = np.diff(np.concatenate((first, [position.size])))
+        row[:] = np.repeat(np.minimum(1.0, np.sqrt(REPEATED / length)), length)
+    return weight
+
+
 def _fit(
     problem: ChainProblem, minimum: Minimum, outliers: int, options: CovarianceOptions, iterations: int
 ) -> ChainFit:
@@ -191,15 +220,18 @@ def _fit(
     lags = correlation_time(residuals, options)
     longest = max(period.samples for period in problem.periods)
     window = max(lags, min(options.max_lag, int(options.min_window_share * longest)))
-    samples = int(sum(period.valid.sum() for period in problem.periods))
+    samples = int(sum(float(np.sum(np.where(period.valid, _repeated(period) ** 2, 0.0))) for period in problem.periods))
     slopes = np.diag(problem.coordinates.slopes(x[:count]))
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
-    robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
     white = robust_covariance(minimum.at, None, samples, count)
+    covariance = coloured_covariance(problem, x, minimum.at.normal)[:count, :count]
+    if structured > 0.0:  # a model's error repeats itself: it may also be larger at some times than at others
+        robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
+        covariance = _larger(covariance, robust)
     value = problem.coordinates.values(x[:count])
     return ChainFit(
         value,
-        by_parameters(robust, slopes, value),
+        by_parameters(covariance, slopes, value),
         by_parameters(white, slopes, value),
         tuple(problem.start(x, index) for index in range(len(problem.periods))),
         positions,
@@ -208,3 +240,13 @@ def _fit(
         iterations,
         problem.softness,
     )
+
+
+def _larger(one: Array, other: Array) -> Array:
+    """A covariance at least as large as both; infinite where one is."""
+    length = np.sqrt(np.maximum(np.diag(one), np.diag(other)))
+    known = np.flatnonzero(np.isfinite(length) & (length > 0.0))
+    at, lengths = np.ix_(known, known), np.outer(length[known], length[known])
+    covariance = np.where(np.isfinite(one), other, one)
+    covariance[at] = larger_covariance(other[at] / lengths, one[at] / lengths) * lengths
+    return covariance

@@ -33,8 +33,9 @@ JOINT_TERMS = (
     *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
     *("torque_scale", "zero"),
 )
-NEAR = 6.0  # widths of the smoothed Coulomb step within which a joint counts as near standstill
-WORST = 1e4  # rad or rad/s beyond which a simulation has diverged
+NEAR = 6.0  # widths of friction's step, from standstill
+CROSSED = 1.0  # of these widths in one step
+WORST = 1e4  # rad or rad/s: a simulation that comes here has run away
 
 
 def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
@@ -183,13 +184,15 @@ def _follow(
             direct[i, column] = work[6][i, j]
 
 
-def _near_standstill(p: Any, v: Any, k: Any, step: float) -> bool:
-    """Return whether a joint is, or may come within this step, near standstill; k: last accelerations."""
+def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
+    """Into how many steps this one must be cut, so that a joint that may come through the steep part of its friction
+    crosses a width in one; k: last accelerations. A joint that sticks needs no shorter steps."""
+    needed = 1.0
     for j in range(v.size):
         ahead = v[j] + 2.0 * step * k[j]
         if p[COULOMB, j] > 0.0 and (min(abs(v[j]), abs(ahead)) < NEAR * p[WIDTH, j] or v[j] * ahead < 0.0):
-            return True
-    return False
+            needed = max(needed, step * abs(k[j]) / (CROSSED * p[WIDTH, j]))
+    return int(min(math.ceil(needed), most))
 
 
 def _run_loop(  # noqa: PLR0912
@@ -208,12 +211,9 @@ def _run_loop(  # noqa: PLR0912
     position: Any,
     derivative: Any,
 ) -> bool:
-    """Simulate all samples of `torque` (samples, steps, joints) from `state` (2, joints).
-
-    The result is written to `position` (samples, joints) and, unless it is empty, `derivative` (samples, joints,
-    causes). A step in which a joint may come near standstill is divided into `finer` steps. Returns False if the motion
-    diverges.
-    """
+    """Simulate as many samples as `torque` (samples, steps, joints) has, from state (2, joints), into position
+    (samples, joints) and derivative (samples, joints, causes); without derivatives where there are no causes. A step in
+    which a joint may come near standstill is cut into as many as `finer`."""
     work, solve, motion, by, zq, zv, dk, dl, R, direct, twice = room
     q1, v1, k, m, nothing, ahead = motion
     q, v = state[0], state[1]
@@ -237,7 +237,7 @@ def _run_loop(  # noqa: PLR0912
                         zq[j, c] *= 1.0 - gain[0, j]
         for s in range(torque.shape[1]):
             t = torque[sample, s]
-            pieces = finer if _near_standstill(p, v, k, step) else 1
+            pieces = _pieces(p, v, k, step, finer)
             h = step / pieces
             gh = GAMMA * h
             for _ in range(pieces):
@@ -281,7 +281,7 @@ def _run_loop(  # noqa: PLR0912
 _inner: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True
 )
-_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _near_standstill = map(
-    _inner, (_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _near_standstill)
+_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _pieces = map(
+    _inner, (_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _pieces)
 )
 run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"})

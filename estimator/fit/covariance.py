@@ -125,7 +125,7 @@ def robust_covariance(
     if scatter is not None:
         scores = (scatter - prior)[np.ix_(seen, seen)] / lengths
         robust = inverse @ scores @ inverse * (samples / freedom)
-        found = _larger(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
+        found = larger_covariance(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
         found = found + 0.5 * structured * inverse
     if prior.any():
         size, directions = np.linalg.eigh(prior[np.ix_(seen, seen)] / lengths)
@@ -139,8 +139,8 @@ def robust_covariance(
     return covariance[:count, :count]
 
 
-def _larger(robust: Array, white: Array) -> Array:
-    """Return a covariance at least as large as both along the directions in which they differ."""
+def larger_covariance(robust: Array, white: Array) -> Array:
+    """A covariance at least as large as both along the directions in which they differ."""
     size, directions = np.linalg.eigh(white)
     root = directions * np.sqrt(np.maximum(size, 1e-300))
     ratio = np.linalg.solve(root, np.linalg.solve(root, robust).T)

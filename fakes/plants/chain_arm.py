@@ -7,7 +7,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hil.description.arm import ArmDescription, Body
-from hil.description.urdf import read_urdf, rotation_of
+from hil.description.files import read_arm
+from hil.description.urdf import rotation_of
 from hil.fakes.plants.arm import Drive, Finite, NotNegative, Positive
 
 MOST_JOINTS = 7
@@ -60,8 +61,8 @@ class ChainArm(BaseModel):
 
     @property
     def description(self) -> ArmDescription:
-        """The arm as the URDF describes it; raises ArmFileError."""
-        return read_urdf(Path(self.urdf), self.joints)
+        """The URDF's arm; raises ArmFileError."""
+        return read_arm(Path(self.urdf), self.joints)
 
     @property
     def bodies(self) -> tuple[Body, ...]:

@@ -48,6 +48,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "estimate": (experiment.estimate, "runs/20261121-153000-fake_two_link"),
     "scan": (bus.scan, "/dev/ttyUSB0"),
     "check": (bus.check, "configs/my_arm.toml"),
+    "pose": (bus.pose, "configs/fake_viperx_300.toml --guide"),
     "setup": (bus.setup, "/dev/ttyUSB0 --baud 57600 --id 1 --new-id 2 --new-baud 1000000 --return-delay-us 0"),
     "report": (results.report, "runs/20261121-153000-fake_two_link --png pictures"),
     "export": (results.export, "runs/20261121-153000-fake_two_link --format urdf --format mjcf"),

@@ -63,6 +63,43 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
         raise typer.Exit(1)
 
 
+def pose(
+    config: ConfigPath,
+    guide: Annotated[
+        bool, typer.Option("--guide", help="Ask for each joint to be moved by hand, and compare.")
+    ] = False,
+    json_only: Json = False,
+) -> None:
+    """Show the arm of a URDF or MJCF as the bus sees it, with --guide while a hand moves it. Torque stays off."""
+    from hil import fakes
+    from hil.cli.views.pose_view import moved_values, pose_values, print_moved, print_pose
+    from hil.config.schema import load_config
+    from hil.drivers.bus import ServoBus
+    from hil.errors import ConfigError
+    from hil.setup.by_hand import guided, pose_of
+
+    arm = load_config(config)
+    if arm.arm.urdf is None:
+        raise ConfigError(f"{config}: arm.urdf is missing: there is no description to compare the arm with.")
+    fakes.register_for(arm.url)
+    with ServoBus.connect(arm.bus) as bus:
+        bus.check_identity()
+        bus.release_held()
+        here = pose_of(arm, bus.read_positions())
+        if not json_only:
+            print_pose(arm, here)
+        ask = (lambda text: print(text, file=sys.stderr)) if json_only else print
+        found = []
+        for each in guided(arm, bus.read_positions, bus.port.clock, ask) if guide else ():
+            found.append(each)
+            if not json_only:
+                print_moved(each)
+    if json_only:
+        print(json.dumps(pose_values(arm, here) | {"moved": [moved_values(each) for each in found]}))
+    if not all(each.well for each in found):
+        raise typer.Exit(1)
+
+
 def setup(
     port: PortOrFile,
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's current ID.")],

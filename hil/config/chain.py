@@ -5,8 +5,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hil.description.arm import ArmDescription, ArmFileError
-from hil.description.urdf import read_urdf
+from hil.description.files import read_arm
+from hil.description.planar import is_planar
+from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -21,6 +26,21 @@ def described_arm(config: "Config") -> ArmDescription:
     """Describe the arm of `[arm] urdf` with the joints of the configuration. Raises ArmFileError."""
     assert config.arm.urdf is not None
     return _read(config.arm.urdf, tuple(joint.name for joint in config.joints), _changed(config.arm.urdf))
+
+
+def base_gravity(config: "Config") -> NDArray[np.float64]:
+    """In the base's frame (3,) [m/s^2]."""
+    down = np.array([0.0, 0.0, -config.arm.gravity])
+    turned: NDArray[np.float64] = rotation_of(*config.arm.base).T @ down
+    return turned
+
+
+def describes_planar(config: "Config") -> bool:
+    """Whether the arm of `[arm] urdf` is a planar one; False where the file cannot be read."""
+    try:
+        return is_planar(described_arm(config), base_gravity(config))
+    except ArmFileError:
+        return False
 
 
 def only_planar(config: "Config", what: str) -> None:
@@ -47,6 +67,8 @@ def chain_slips(config: "Config") -> Iterator[str]:
         described_arm(config)
     except ArmFileError as error:
         yield f"arm.urdf: {error}"
+        return
+    if not config.is_chain:
         return
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
@@ -102,4 +124,4 @@ def _changed(path: str) -> float:
 
 @lru_cache(maxsize=8)
 def _read(path: str, joints: tuple[str, ...], _changed_at: float) -> ArmDescription:
-    return read_urdf(Path(path), joints)
+    return read_arm(Path(path), joints)

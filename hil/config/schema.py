@@ -21,7 +21,7 @@ from pydantic import (
 
 from hil import fakes
 from hil.config.bundled import find_config
-from hil.config.chain import MOST_JOINTS, chain_slips
+from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.clearance import ClearanceConfig
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
 from hil.config.joint import JointConfig
@@ -75,7 +75,7 @@ class ArmConfig(Table):
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     urdf: str | None = Field(
-        None, description="for a spatial arm: URDF file relative to this one; [[joints]] use its joint names"
+        None, description="URDF or MJCF of a spatial arm: a file beside this one; [[joints]] use its joint names"
     )
     base: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
         [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of the base, rad"
@@ -235,8 +235,8 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is described by a URDF."""
-        return self.arm.urdf is not None
+        """Whether the arm is one in space: described by a file, unless that describes a planar arm without a path."""
+        return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
     def url(self) -> str:

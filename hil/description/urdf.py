@@ -66,7 +66,7 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
             ArmJoint(joint.name, joint.child, rotation, translation, joint.axis, joint.limits, body, tuple(fixed))
         )
         rotation, translation = np.eye(3), np.zeros(3)
-    _check_units(arm, path)
+    check_units(arm, path)
     doubts = tuple(
         f'link "{each.link}": no mass distribution can have this inertia; it is used only as an initial guess'
         for each in arm
@@ -267,7 +267,8 @@ def _rigid(
     return body, fixed, held
 
 
-def _check_units(arm: Sequence[ArmJoint], path: Path) -> None:
+def check_units(arm: Sequence[ArmJoint], path: Path) -> None:
+    """Raise ArmFileError where lengths, masses or inertias look like millimetres or grams."""
     for joint in arm:
         length = float(np.linalg.norm(joint.translation))
         if length > MOST_LENGTH:

@@ -27,6 +27,7 @@ from hil.runs.timing import timing
 EXPLAINED = 1.2  # ratio of residual to encoder rounding up to which the model counts as complete
 PREDICTED = 0.01  # held-out prediction error relative to the motion, up to which the model is trusted
 WRONG = 0.05  # the same, beyond which the model is rejected
+UNMOVED = 0.03  # range of motion [rad] below which a joint shows neither friction nor inertia
 
 
 def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> SettledResult:
@@ -67,7 +68,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             held_out_rms=None if held_out is None else tuple(map(float, held_out)),
             residual_over_floor=tuple(over_floor.tolist()),
         ),
-        verdict=_verdict(config, estimate, known, held_out),
+        verdict=_verdict(config, estimate, known, held_out, unmoved(config, period.position)),
         warnings=tuple(warnings_of(config, facts, samples, period)),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
@@ -121,8 +122,18 @@ def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quan
     }
 
 
+def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
+    """Names of the joints whose motion (joints, samples) [rad] says nothing of them."""
+    reach = np.ptp(np.where(np.isnan(position), np.nanmean(position, axis=1, keepdims=True), position), axis=1)
+    return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
+
+
 def _verdict(
-    config: Config, estimate: ChainEstimate, known: KnownChain, held_out: NDArray[np.float64] | None
+    config: Config,
+    estimate: ChainEstimate,
+    known: KnownChain,
+    held_out: NDArray[np.float64] | None,
+    still: list[str],
 ) -> Verdict:
     """Decide whether the result can be trusted, name the least well identified base parameter, and give the reasons."""
     count = known.base.count
@@ -143,6 +154,12 @@ def _verdict(
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
+    if still:
+        trust = "no"
+        sentences.append(
+            f"{', '.join(still)} hardly moved, which tells nothing of its inertia and friction: widen joint_path.swing "
+            "and speed there, and check that nothing blocks it."
+        )
     if estimate.from_prior:
         trust = "with care" if trust == "yes" else trust
         sentences.append(

@@ -12,6 +12,7 @@ import numpy as np
 from hil import __version__
 from hil.chain_model import ChainArmModel
 from hil.description.arm import Body
+from hil.description.files import is_mjcf
 from hil.description.urdf import parse_urdf
 from hil.export.chain_links import ChainLinks, chain_links
 from hil.export.source import Source, write_text
@@ -21,6 +22,8 @@ from hil.export.xml_text import comment, numbers, to_text
 def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
     """Write the URDF `path`; return what URDF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
+    if is_mjcf(found.path):
+        return _export_own_urdf(found, model, path)
     root = parse_urdf(found.path)
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
@@ -39,6 +42,33 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
     left = [*rotors, *found.left_out]
     _describe(root, model, found, left)
+    write_text(path, to_text(root))
+    return left
+
+
+def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> list[str]:
+    """Of an arm that was described by MJCF: its joints, frames and names of bodies."""
+    root = ET.Element("robot", name=found.path.stem)
+    rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
+    left = ["the MJCF's shapes", *rotors, *found.left_out]
+    _describe(root, model, found, left)
+    ET.SubElement(root, "link", name=found.arm.base)
+    parent = found.arm.base
+    for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
+        _replace_inertial(ET.SubElement(root, "link", name=joint.link), body)
+        element = ET.SubElement(root, "joint", name=joint.name, type="revolute")
+        ET.SubElement(element, "parent", link=parent)
+        ET.SubElement(element, "child", link=joint.link)
+        ET.SubElement(element, "origin", xyz=numbers(*joint.translation), rpy=numbers(*_roll_pitch_yaw(joint.rotation)))
+        ET.SubElement(element, "axis", xyz=numbers(*joint.axis))
+        facts = model.joints[index]
+        low, high = facts.position_limit
+        effort = facts.goal_limit * model.torque_per_goal(index + 1)
+        bounds = {"lower": low, "upper": high, "velocity": facts.velocity_limit, "effort": effort}
+        ET.SubElement(element, "limit", {key: numbers(value) for key, value in bounds.items()})
+        friction = {"damping": f"viscous_{index + 1}", "friction": f"coulomb_{index + 1}"}
+        ET.SubElement(element, "dynamics", {key: numbers(model.values[name]) for key, name in friction.items()})
+        parent = joint.link
     write_text(path, to_text(root))
     return left
 
@@ -98,6 +128,12 @@ def _replace_inertial(link: ET.Element, body: Body) -> None:
 def _remove(parent: ET.Element, tag: str) -> None:
     for element in parent.findall(tag):
         parent.remove(element)
+
+
+def _roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_euler("xyz"))
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from hil.chain_model import ChainArmModel
 from hil.description.arm import ArmDescription, ArmFileError, Body
-from hil.description.urdf import read_urdf
+from hil.description.files import read_arm
 from hil.errors import ExportError
 from hil.estimator.chain.base_parameters import BaseParameters
 from hil.estimator.chain.geometry import Chain
@@ -35,7 +35,7 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     assert source.result.chain is not None
     path = source.run / source.result.chain.urdf
     try:
-        arm = read_urdf(path, [joint.name for joint in model.joints])
+        arm = read_arm(path, [joint.name for joint in model.joints])
     except ArmFileError as error:
         raise ExportError(f"The URDF used for the run is needed: {error}.") from error
     geometry = model.geometry

@@ -20,7 +20,10 @@ def change(old: str, new: str) -> str:
 def test_every_ready_file_is_right(path: Path) -> None:
     config = load_config(path)
     assert len(config.joints) == len(
-        config.experiment.peak_torque or config.arm.link_lengths or config.joint_path.centre
+        config.experiment.peak_torque
+        or config.arm.link_lengths
+        or (config.joint_path and config.joint_path.centre)
+        or config.arm.rest_pose
     )
 
 

@@ -13,6 +13,7 @@ from hil.chain_model import ChainArmModel
 from hil.config.schema import Config, load_config, parse_config
 from hil.description.urdf import read_urdf
 from hil.errors import ConfigError
+from hil.estimation.chain_estimate import unmoved
 from hil.estimation.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimation.unsettled.estimate import estimate_unsettled
@@ -68,6 +69,13 @@ def test_residual_prediction_and_verdict(result: SettledResult) -> None:
     assert result.validation.held_out_rms is not None
     assert max(result.validation.held_out_rms) < 0.01
     assert result.verdict.trust in ("yes", "with care")
+
+
+def test_a_joint_that_hardly_moves_is_named(run: RunFolder) -> None:
+    config = run.load_config()
+    position = np.sin(np.linspace(0.0, 6.0, 50)) * np.array([0.5, 0.5, 0.01, 0.5])[:, None]
+    position[2, 7] = np.nan
+    assert unmoved(config, position) == ["joint3"]
 
 
 def test_it_starts_and_ends_where_the_arm_lies(run: RunFolder) -> None:

@@ -1,0 +1,50 @@
+"""What `hil pose` prints: where the arm is, joint by joint, and what came of moving it by hand."""
+
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from hil.config.chain import described_arm
+from hil.config.schema import Config
+from hil.description.motion import moves
+from hil.setup.by_hand import Moved, Pose
+
+
+def print_pose(config: Config, pose: Pose) -> None:
+    """Angles in the description's convention, which way each joint moves the end, and where that is."""
+    arm, angles = described_arm(config), np.array(pose.angles)
+    table = Table(title=f"{escape(arm.path.name)} as the bus sees it", title_justify="left")
+    for heading in ("joint", "ID", "angle rad", "degrees", "limits rad", "a positive angle"):
+        table.add_column(heading)
+    for index, joint in enumerate(config.joints):
+        low, high = joint.position_limit
+        name, angle = escape(joint.name), pose.angles[index]
+        cells = f"{angle:+.3f}", f"{np.degrees(angle):+.1f}", f"{low:g} to {high:g}"
+        table.add_row(name, str(joint.id), *cells, moves(arm, angles, index))
+    console = Console(highlight=False)
+    console.print(table)
+    x, y, z = pose.end
+    console.print(f"The end link's centre of mass is at x {x:+.3f}, y {y:+.3f}, z {z:+.3f} m from the base.")
+    console.print("Does the arm stand like that? If not: zero_ticks, direction or the description is wrong.")
+
+
+def print_moved(moved: Moved) -> None:
+    """One joint's outcome."""
+    style = "green" if moved.well else "red"
+    Console(highlight=False).print(f"[{style}]{'as it should' if moved.well else 'WRONG'}[/]: {escape(moved.found)}.")
+
+
+def pose_values(config: Config, pose: Pose) -> dict[str, Any]:
+    """As plain values."""
+    names = [joint.name for joint in config.joints]
+    return {"angles": dict(zip(names, pose.angles, strict=True)), "end": list(pose.end)}
+
+
+def moved_values(moved: Moved) -> dict[str, Any]:
+    """As plain values."""
+    return {"joint": moved.joint, "asked": moved.asked, "angles": list(moved.angles), "well": moved.well} | {
+        "found": moved.found
+    }

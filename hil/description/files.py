@@ -1,0 +1,24 @@
+"""An arm from a file, URDF or MJCF, as its root element says."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from hil.description.arm import ArmDescription
+from hil.description.mjcf import read_mjcf
+from hil.description.urdf import read_urdf
+
+_MJCF = re.compile(r"<mujoco[\s>]")
+
+
+def read_arm(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
+    """The arm of these joints, from the base outwards; of all that turn if none are named. Raises ArmFileError."""
+    return read_mjcf(path, joints) if is_mjcf(path) else read_urdf(path, joints)
+
+
+def is_mjcf(path: Path) -> bool:
+    """Whether the file is MJCF; one that cannot be read is not."""
+    try:
+        return _MJCF.search(path.read_text(encoding="utf-8")) is not None
+    except (OSError, UnicodeDecodeError):
+        return False

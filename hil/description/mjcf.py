@@ -1,0 +1,199 @@
+"""Serial arms from MJCF, as MuJoCo itself reads it: defaults, included files and shapes' inertias are its business."""
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body
+from hil.description.motion import rotation_about
+from hil.description.urdf import check_units
+
+WORLD = 0
+PIVOTS = {0: "free", 1: "ball", 2: "slide", 3: "hinge"}
+HINGE = 3
+LOOPS = {0: "connect", 1: "weld"}
+COUPLED = 2  # an equality of two joints' angles
+
+
+def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
+    """The arm of these joints, from the base outwards; of all hinges if none are named. The base is MuJoCo's world.
+
+    Raises ArmFileError as `hil.description.urdf.read_urdf` does, and where mujoco is not installed.
+    """
+    tree = _Tree(_compiled(path), path)
+    names = list(joints) if joints is not None else tree.hinges
+    chosen = tree.branch(names)
+    arm = []
+    held: list[str] = []
+    before = WORLD
+    for name, body in zip(names, chosen, strict=True):
+        joint = int(tree.model.body_jntadr[body])
+        rotation, translation = tree.frame(body, before)
+        axis = np.array(tree.model.jnt_axis[joint])
+        merged, fixed, stiff = tree.rigid(body, set(chosen))
+        if not merged.mass > 0.0:
+            raise ArmFileError(
+                f'{path}: body "{tree.name(body)}", moved by joint "{name}", has no mass: give it an <inertial>'
+            )
+        held += stiff
+        back = rotation @ rotation_about(axis, -float(tree.model.qpos0[tree.model.jnt_qposadr[joint]]))
+        arm.append(ArmJoint(name, tree.name(body), back, translation, axis, tree.limits(joint), merged, tuple(fixed)))
+        before = body
+    check_units(arm, path)
+    doubts = tuple(
+        f'body "{each.link}": no mass distribution can have this inertia; the data will decide'
+        for each in arm
+        if not each.body.is_physical
+    )
+    return ArmDescription(path, "world", tuple(arm), tuple(held), doubts)
+
+
+def _compiled(path: Path) -> Any:
+    try:
+        mujoco: Any = importlib.import_module("mujoco")
+    except ImportError as error:
+        raise ArmFileError(f"{path}: reading MJCF needs MuJoCo: pip install 'hil[mujoco]', or give a URDF") from error
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ArmFileError(f"{path}: MuJoCo cannot read it: {error}") from error
+
+
+@dataclass(frozen=True)
+class _Tree:
+    model: Any
+    path: Path
+
+    def name(self, body: int) -> str:
+        """Of a body; its number where it has none."""
+        return str(self.model.body(body).name) or f"body {body}"
+
+    @property
+    def hinges(self) -> list[str]:
+        """All of them, in MuJoCo's order, which is from the base outwards."""
+        return [str(self.model.joint(j).name) for j in range(self.model.njnt) if self.model.jnt_type[j] == HINGE]
+
+    def branch(self, names: list[str]) -> list[int]:
+        """The bodies that these joints move. Raises ArmFileError unless they lie on one branch, in this order."""
+        if not names:
+            raise ArmFileError(f"{self.path}: has no hinge, so there is no arm")
+        moved = [self._moved(name) for name in names]
+        self._check_equalities(names)
+        way = self._way(moved[-1])
+        for name, body, before in zip(names, moved, [WORLD, *moved], strict=False):
+            if body not in way:
+                raise ArmFileError(
+                    f'{self.path}: joint "{name}" does not lie between base and "{names[-1]}": the joints must form '
+                    "one branch, from the base outwards"
+                )
+            between = [other for other in self._way(body) if other not in self._way(before) and other != body]
+            loose = [other for other in between if self.model.body_jntnum[other]]
+            if before not in (WORLD, *self._way(body)) or loose:
+                where = self.name(loose[0]) if loose else name
+                raise ArmFileError(
+                    f'{self.path}: before "{name}" lies a joint that is not among the arm\'s, at "{where}": name all, '
+                    "in order from the base"
+                )
+        return moved
+
+    def _moved(self, name: str) -> int:
+        found = [j for j in range(self.model.njnt) if self.model.joint(j).name == name]
+        if not found:
+            raise ArmFileError(
+                f'{self.path}: has no joint "{name}"; the rotating joints are {", ".join(self.hinges) or "none"}'
+            )
+        kind = int(self.model.jnt_type[found[0]])
+        if kind != HINGE:
+            raise ArmFileError(f'{self.path}: joint "{name}" is {PIVOTS[kind]}: only rotating joints can be identified')
+        body = int(self.model.jnt_bodyid[found[0]])
+        if self.model.body_jntnum[body] != 1:
+            raise ArmFileError(
+                f'{self.path}: body "{self.name(body)}" has several joints: give each a body of its own, without mass'
+            )
+        return body
+
+    def _check_equalities(self, names: list[str]) -> None:
+        for index in range(self.model.neq):
+            kind = int(self.model.eq_type[index])
+            if kind in LOOPS:
+                raise ArmFileError(
+                    f"{self.path}: an equality {LOOPS[kind]} closes a loop, which a serial arm does not have: remove it"
+                )
+            joint = int(self.model.eq_obj1id[index])
+            if kind == COUPLED and self.model.joint(joint).name in names:
+                raise ArmFileError(
+                    f'{self.path}: joint "{self.model.joint(joint).name}" is coupled to another by an equality, so it '
+                    "has no motor of its own: leave it out"
+                )
+
+    def _way(self, body: int) -> list[int]:
+        """From a body to the world, without that."""
+        way = []
+        while body != WORLD:
+            way.append(body)
+            body = int(self.model.body_parentid[body])
+        return way
+
+    def frame(self, body: int, before: int) -> tuple[Array, Array]:
+        """Rotation and place of a body's joint in the frame of the moving body before, whose origin is its joint."""
+        rotation, translation = np.eye(3), np.zeros(3)
+        for part in self._way(body):
+            if part == before:
+                break
+            turn, place = self._placed(part)
+            rotation, translation = turn @ rotation, turn @ translation + place
+        return rotation, translation + rotation @ self._pivot(body) - self._pivot(before)
+
+    def rigid(self, body: int, chosen: set[int]) -> tuple[Body, list[str], list[str]]:
+        """A body about its joint, merged with all that does not move against it; names of those, and of joints held."""
+        merged, fixed, held = self._merged(body, chosen)
+        return merged.moved(np.eye(3), -self._pivot(body)), fixed, held
+
+    def _merged(self, body: int, chosen: set[int]) -> tuple[Body, list[str], list[str]]:
+        turn = _rotation(self.model.body_iquat[body])
+        inertia = turn @ np.diag(self.model.body_inertia[body]) @ turn.T
+        merged = Body(float(self.model.body_mass[body]), np.array(self.model.body_ipos[body]), inertia)
+        fixed: list[str] = []
+        held: list[str] = []
+        for child in range(1, self.model.nbody):
+            if int(self.model.body_parentid[child]) != body or child in chosen:
+                continue
+            first = int(self.model.body_jntadr[child])
+            held += [str(self.model.joint(first + j).name) for j in range(int(self.model.body_jntnum[child]))]
+            part, names, more = self._merged(child, chosen)
+            merged = merged.joined(part.moved(*self._placed(child)))
+            fixed += [self.name(child), *names]
+            held += more
+        return merged, fixed, held
+
+    def _placed(self, body: int) -> tuple[Array, Array]:
+        return _rotation(self.model.body_quat[body]), np.array(self.model.body_pos[body])
+
+    def _pivot(self, body: int) -> Array:
+        """Of its joint, in its own frame (3,) [m]."""
+        if body == WORLD or not self.model.body_jntnum[body]:
+            return np.zeros(3)
+        return np.array(self.model.jnt_pos[int(self.model.body_jntadr[body])])
+
+    def limits(self, joint: int) -> tuple[float, float] | None:
+        """[rad], None for one without."""
+        if not self.model.jnt_limited[joint]:
+            return None
+        low, high = map(float, self.model.jnt_range[joint])
+        return low, high
+
+
+def _rotation(quaternion: Array) -> Array:
+    """Of w, x, y, z."""
+    w, x, y, z = map(float, quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

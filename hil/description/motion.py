@@ -1,0 +1,55 @@
+"""Where a described arm is, and which way each joint moves it: what a person can see and compare."""
+
+import numpy as np
+
+from hil.description.arm import ArmDescription, Array
+
+DIRECTIONS = (("forwards (+x)", "backwards (-x)"), ("to the left (+y)", "to the right (-y)"), ("up (+z)", "down (-z)"))
+"""Of the base's x, y and z axis."""
+LEAST_LEVER = 0.01  # m: an end nearer to an axis than this shows no direction
+
+
+def end_point(arm: ArmDescription, angles: Array) -> Array:
+    """The arm's end (3,) [m] in the base's frame at these angles (joints,) [rad]: the last link's centre of mass."""
+    place, turn = _frames(arm, angles)[-1]
+    point: Array = place + turn @ arm.joints[-1].body.centre
+    return point
+
+
+def axis_of(arm: ArmDescription, angles: Array, joint: int) -> tuple[Array, Array]:
+    """A point on a joint's axis [m] and its direction (3,), in the base's frame."""
+    place, turn = _frames(arm, angles)[joint]
+    direction: Array = turn @ arm.joints[joint].axis
+    return place, direction
+
+
+def moves(arm: ArmDescription, angles: Array, joint: int) -> str:
+    """In words: which way the positive angle of a joint moves the arm's end, or turns it."""
+    place, direction = axis_of(arm, angles, joint)
+    velocity = np.cross(direction, end_point(arm, angles) - place)
+    if float(np.linalg.norm(velocity)) < LEAST_LEVER:
+        return f"turns the end about its own axis, {_towards(direction)}, counter-clockwise seen from where that points"
+    return f"moves the end {_towards(velocity)}"
+
+
+def _towards(vector: Array) -> str:
+    main = int(np.argmax(np.abs(vector)))
+    return DIRECTIONS[main][0 if vector[main] > 0.0 else 1]
+
+
+def _frames(arm: ArmDescription, angles: Array) -> list[tuple[Array, Array]]:
+    """Of each link: the place of its joint [m] and its rotation, in the base's frame."""
+    place, turn, found = np.zeros(3), np.eye(3), []
+    for joint, angle in zip(arm.joints, angles.tolist(), strict=True):
+        place = place + turn @ joint.translation
+        turn = turn @ joint.rotation @ rotation_about(joint.axis, angle)
+        found.append((place, turn))
+    return found
+
+
+def rotation_about(axis: Array, angle: float) -> Array:
+    """Rotation matrix (3, 3) about `axis` (3,) of length 1 by `angle` [rad]."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return turned

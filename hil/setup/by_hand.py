@@ -1,0 +1,114 @@
+"""The arm as the bus sees it, compared with its description: joint after joint is moved by hand, torque off.
+
+Wrong IDs, directions, zeros and axes cannot be seen by an identification: a chain's parameters do not absorb a wrong
+geometry, they become wrong. A person sees them at once.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.chain import described_arm
+from hil.config.schema import Config
+from hil.description.motion import end_point, moves
+from hil.drivers.clock import Clock
+
+MOVED = 0.15  # rad: a joint that a hand has moved
+STILL = 0.02  # rad in STILL_S: a hand that holds
+STILL_S = 0.6
+POLL_S = 0.05
+PATIENCE_S = 60.0
+SEVERAL = 0.4  # of the largest motion: what another joint may move along with it
+Array = NDArray[np.float64]
+Read = Callable[[], tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the arm is."""
+
+    angles: tuple[float, ...]
+    """In the description's convention [rad]."""
+    end: tuple[float, float, float]
+    """The end link's centre of mass in the base's frame [m]."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What came of one joint's motion by hand."""
+
+    joint: str
+    asked: str
+    """What the user was asked to do with it."""
+    angles: tuple[float, ...]
+    """By which all joints moved [rad]."""
+    well: bool
+    found: str
+    """In words, with what to change where it is not as described."""
+
+
+def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
+    """The pose of these angles [rad]."""
+    x, y, z = end_point(described_arm(config), np.array(angles)).tolist()
+    return Pose(angles, (x, y, z))
+
+
+def guided(config: Config, read: Read, clock: Clock, ask: Callable[[str], None]) -> Iterator[Moved]:
+    """Ask for each joint in turn to be moved in its positive direction, and compare."""
+    arm = described_arm(config)
+    for index, joint in enumerate(config.joints):
+        before = np.array(read())
+        asked = f"Move {joint.name!r} by hand by about 0.3 rad in the direction that {moves(arm, before, index)}."
+        ask(asked)
+        change = _awaited(read, clock, before)
+        yield judge(config, index, asked, change)
+
+
+def judge(config: Config, asked_for: int, asked: str, change: Array) -> Moved:
+    """Compare a motion `change` (joints,) [rad] with the one that was asked for."""
+    joint = config.joints[asked_for]
+    most = int(np.argmax(np.abs(change)))
+    angles = tuple(change.tolist())
+    if abs(change[most]) < MOVED:
+        found = (
+            f"{joint.name!r} did not move: is ID {joint.id} its servo? If another joint did that is not in [[joints]], "
+            "the IDs are wrong"
+        )
+        return Moved(joint.name, asked, angles, False, found)
+    if most != asked_for:
+        other = config.joints[most]
+        found = (
+            f"{other.name!r} (ID {other.id}) moved by {change[most]:+.2f} rad instead: swap the ids of the two, or "
+            "their names, in [[joints]]"
+        )
+        return Moved(joint.name, asked, angles, False, found)
+    if change[most] < 0.0:
+        found = (
+            f"{joint.name!r} moved by {change[most]:+.2f} rad, so its angle counts the other way than the "
+            f"description's axis: set direction = {-joint.direction} and give zero_ticks anew, or correct the axis"
+        )
+        return Moved(joint.name, asked, angles, False, found)
+    along = [
+        other.name
+        for number, other in enumerate(config.joints)
+        if number != most and abs(change[number]) > SEVERAL * abs(change[most])
+    ]
+    found = f"{joint.name!r} moved by {change[most]:+.2f} rad, as described"
+    return Moved(joint.name, asked, angles, True, found + (f"; {', '.join(along)} moved with it" if along else ""))
+
+
+def _awaited(read: Read, clock: Clock, before: Array) -> Array:
+    """How all joints have moved once a hand has moved one and holds it; nothing if nobody does."""
+    end = clock.now() + PATIENCE_S
+    held_since, last = clock.now(), before
+    while clock.now() < end:
+        clock.wait_until(clock.now() + POLL_S)
+        here = np.array(read())
+        if np.abs(here - last).max() > STILL:
+            held_since, last = clock.now(), here
+        elif np.abs(here - before).max() > MOVED and clock.now() - held_since > STILL_S:
+            break
+    change: Array = np.array(read()) - before
+    return change

@@ -1,0 +1,85 @@
+"""MJCF as MuJoCo reads it, against the same arm's URDF, and what is wrong with a file."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from hil.description.arm import ArmFileError
+from hil.description.files import read_arm
+from hil.estimator.chain.dynamics import inverse_dynamics
+from hil.estimator.chain.geometry import Chain
+from tests.support.chains import random_urdf
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="upper" pos="0 0 0.1" euler="0 0.3 0">
+<joint name="one" axis="0 0 2" pos="0.01 0.02 0" ref="0.4"/>
+<inertial pos="0 0 0.1" mass="0.3" diaginertia="1e-3 2e-3 2e-3"/>
+<body name="lower" pos="0.2 0 0" quat="0.9 0.1 0.2 0"><joint name="two" axis="0 1 0" pos="0 0 -0.03" range="-1 1"/>
+<inertial pos="0.1 0 0" mass="0.2" diaginertia="1e-3 1e-3 1e-3"/>
+<body name="jaw" pos="0.1 0 0"><joint name="gripper" type="slide" axis="1 0 0"/>
+<inertial pos="0 0.01 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/></body></body></body></worldbody>{more}</mujoco>"""
+
+
+def torque(path: Path, joints: list[str], q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    arm = read_arm(path, joints)
+    every = np.column_stack((arm.parameters, np.zeros(len(joints)))).reshape(-1)
+    return inverse_dynamics(Chain(*arm.geometry, GRAVITY), every, q, v, a)
+
+
+def test_an_arm_is_the_same_from_urdf_and_from_mjcf(tmp_path: Path) -> None:
+    names = [f"joint_{n + 1}" for n in range(5)]
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(random_urdf(5, 3))
+    model = mujoco.MjModel.from_xml_path(str(urdf))
+    mujoco.mj_saveLastXML(str(tmp_path / "arm.xml"), model)
+    motion = np.random.default_rng(1).standard_normal((3, 5, 20))
+    right = torque(urdf, names, *motion)
+    np.testing.assert_allclose(torque(tmp_path / "arm.xml", names, *motion), right, rtol=2e-3, atol=2e-3)
+
+
+def test_pivots_references_and_a_held_gripper_are_those_of_mujoco(tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.format(more=""))
+    arm = read_arm(path, ["one", "two"])
+    assert arm.held == ("gripper",)
+    assert arm.joints[1].limits == (-1.0, 1.0)
+    assert arm.joints[1].fixed == ("jaw",)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        q, v, a = rng.standard_normal((3, 2))
+        data.qpos[:], data.qvel[:], data.qacc[:] = [*q, 0.0], [*v, 0.0], [*a, 0.0]
+        model.opt.disableflags = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        mujoco.mj_inverse(model, data)
+        found = torque(path, ["one", "two"], *(each[:, None] for each in (q, v, a)))
+        np.testing.assert_allclose(found[:, 0], data.qfrc_inverse[:2], atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("more", "joints", "message"),
+    [
+        ("", ["one", "three"], 'has no joint "three"; the rotating joints are one, two'),
+        ("", ["one", "two", "gripper"], 'joint "gripper" is slide'),
+        ("", ["two"], 'before "two" lies a joint'),
+        ("", ["two", "one"], 'joint "two" does not lie'),
+        ('<equality><connect body1="jaw" body2="upper" anchor="0 0 0"/></equality>', ["one", "two"], "closes a loop"),
+        ('<equality><joint joint1="two" joint2="one"/></equality>', ["one", "two"], "coupled to another"),
+        ("<actuator", ["one"], "MuJoCo cannot read it"),
+    ],
+)
+def test_what_is_wrong_is_named(more: str, joints: list[str], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.format(more=more))
+    with pytest.raises(ArmFileError, match=message):
+        read_arm(path, joints)
+
+
+def test_without_mujoco_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.format(more=""))
+    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
+    with pytest.raises(ArmFileError, match="pip install"):
+        read_arm(path)

@@ -1,0 +1,100 @@
+"""The arm moved by hand, compared with its description."""
+
+import json
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hil.cli.app import app
+from hil.config.chain import described_arm
+from hil.config.schema import load_config
+from hil.description.motion import end_point, moves
+from hil.setup.by_hand import MOVED, Moved, guided, judge
+from tests.support.paths import CONFIGS
+
+ARM = load_config(CONFIGS / "fake_viperx_300.toml")
+
+
+class VirtualClock:
+    """Time passes when somebody waits."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def wait_until(self, deadline: float) -> None:
+        self.time = max(self.time, deadline)
+
+
+def change(**by: float) -> np.ndarray:
+    return np.array([by.get(joint.name, 0.0) for joint in ARM.joints])
+
+
+@pytest.mark.parametrize(
+    ("moved", "well", "words"),
+    [
+        (change(elbow=0.4), True, "'elbow' moved by +0.40 rad, as described"),
+        (change(elbow=-0.4), False, "set direction = -1"),
+        (change(shoulder=0.4), False, "'shoulder' (ID 2) moved by +0.40 rad instead: swap the ids"),
+        (change(elbow=0.02), False, "'elbow' did not move: is ID 3 its servo?"),
+        (change(elbow=0.4, wrist_angle=0.3), True, "wrist_angle moved with it"),
+    ],
+)
+def test_what_a_hand_moved_is_judged(moved: np.ndarray, well: bool, words: str) -> None:
+    found = judge(ARM, 2, "", moved)
+    assert found.well is well
+    assert words in found.found
+
+
+def test_words_are_those_of_the_motion() -> None:
+    arm, angles = described_arm(ARM), np.array([0.1, -0.5, 0.6, 0.0, 0.4, 0.0])
+    for joint in range(5):
+        step = np.zeros(6)
+        step[joint] = 1e-4
+        way = end_point(arm, angles + step) - end_point(arm, angles)
+        told = moves(arm, angles, joint)
+        if "about its own axis" not in told:
+            main = int(np.argmax(np.abs(way)))
+            assert f"({'+' if way[main] > 0 else '-'}{'xyz'[main]})" in told
+
+
+def test_every_joint_is_asked_for_and_waited_for() -> None:
+    """Each is moved in 0.5 s after it is asked for, and held; the fourth is moved the wrong way."""
+    clock, asked = VirtualClock(), list[tuple[float, str]]()
+
+    def read() -> tuple[float, ...]:
+        angles = np.zeros(6)
+        for index, (since, _) in enumerate(asked):
+            angles[index] = (-1 if index == 3 else 1) * 0.3 * min(1.0, (clock.now() - since) / 0.5)
+        return tuple(angles.tolist())
+
+    found = list(guided(ARM, read, clock, lambda text: asked.append((clock.now(), text))))
+    assert [each.well for each in found] == [True, True, True, False, True, True]
+    assert all(abs(each.angles[index]) > 0.99 * 0.3 > MOVED for index, each in enumerate(found))
+    assert all(joint.name in text for joint, (_, text) in zip(ARM.joints, asked, strict=True))
+    assert clock.now() < 12.0
+
+
+def test_patience_ends() -> None:
+    clock = VirtualClock()
+    moves_: Iterator[Moved] = guided(ARM, lambda: (0.0,) * 6, clock, lambda _: None)
+    assert "did not move" in next(moves_).found
+    assert clock.now() < 61.0
+
+
+def test_the_pose_of_the_fake_arm_is_its_rest_pose() -> None:
+    shown = CliRunner().invoke(app, ["pose", str(ARM.path), "--json"])
+    assert shown.exit_code == 0, shown.output
+    angles = json.loads(shown.stdout)["angles"]
+    np.testing.assert_allclose(list(angles.values()), ARM.arm.rest_pose, atol=0.02)
+    table = CliRunner().invoke(app, ["pose", str(ARM.path)], env={"COLUMNS": "200"})
+    assert "moves the end" in table.output
+
+
+def test_an_arm_without_description_has_none_to_compare() -> None:
+    shown = CliRunner().invoke(app, ["pose", str(CONFIGS / "fake_two_link.toml")])
+    assert "arm.urdf is missing" in str(shown.exception)
