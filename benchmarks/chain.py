@@ -20,7 +20,6 @@ iterations             simulations with all sensitivities
 share_of_classic       torque error over the classic's, same recording
 classic                the same of filtered inverse dynamics least squares: the best of three cut-offs, chosen with the
                        truth known; it has no one-step-ahead residual
-mujoco_sysid           the same of mujoco.sysid, with --peers; null without, or where it is not installed
 
 `--json` prints {"arms": {"4": {...}, "6": {...}}} and nothing else.
 """
