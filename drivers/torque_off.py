@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType
 
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import DriverError, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.port import Port
@@ -82,7 +82,7 @@ def cut_torque(
     interrupts: receives every interrupt that arrives meanwhile.
     """
     left = dict(servos)
-    why: dict[Joint, str] = {}
+    why: dict[Joint, Exception] = {}
 
     def confirm(asked: Mapping[Joint, Servo], attempts: int | None) -> None:
         _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
@@ -98,13 +98,15 @@ def cut_torque(
         _uninterrupted(lambda: port.clock.wait_until(port.clock.now() + seconds), interrupts)
 
     confirm({joint: servo for joint, servo in servos.items() if joint not in silent}, attempts=1)
-    if left:
+    if any(isinstance(error, PortLost) for error in why.values()):
+        confirm({joint: servo for joint, servo in left.items() if joint not in why}, attempts=1)
+    elif left:
         for _ in range(_REPEATS):
             wait(_REPEAT_S)
             _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
         wait(watchdog + _TRIP_S)
         confirm(dict(left), attempts=None)
-    return tuple(joint for joint in servos if joint not in left), tuple((joint, why[joint]) for joint in left)
+    return tuple(joint for joint in servos if joint not in left), tuple((joint, _text(why[joint])) for joint in left)
 
 
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
@@ -126,13 +128,13 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
         _uninterrupted(lambda servo=servo: servo.write("Bus Watchdog", 0), interrupts)  # type: ignore[misc]
 
 
-def _confirm(servo: Servo, attempts: int | None, interrupts: list[BaseException]) -> str | None:
-    """Write torque off and read it back; return None, or the reason for the failure."""
+def _confirm(servo: Servo, attempts: int | None, interrupts: list[BaseException]) -> Exception | None:
+    """Write torque off and read it back; return None, or the failure."""
     return _uninterrupted(lambda: servo.write("Torque Enable", 0, attempts), interrupts)
 
 
-def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> str | None:
-    """Run `action`; return None, or the reason for the failure.
+def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> Exception | None:
+    """Run `action`; return None, or the failure.
 
     An interrupt is appended to `interrupts` and the action is run again.
     """
@@ -140,12 +142,16 @@ def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) 
         try:
             action()
         except Exception as error:  # whatever fails on one servo, the next must still be tried
-            return str(error) or type(error).__name__
+            return error
         except BaseException as interrupt:
             interrupts.append(interrupt)
         else:
             return None
-    return "The write was interrupted repeatedly."
+    return DriverError("The write was interrupted repeatedly.")
+
+
+def _text(error: Exception) -> str:
+    return str(error) or type(error).__name__
 
 
 @contextmanager

@@ -30,6 +30,7 @@ from hil.config.schema import Config, parse_config
 from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.errors import HilError
+from hil.estimator.excitation.multisine import Multisine, design_multisine
 from hil.plan import plan as plan_module
 from hil.plan.plan import make_plan
 from hil.runs.recording import load_samples
@@ -99,10 +100,6 @@ def prepare(setting: Setting, period: float = PERIOD_S) -> Ready:
     """Play the configuration once without faults. Raises DoesNotRun if that fails."""
     if _PACKAGE not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append(_PACKAGE)
-    # Cache the waves, which are always the same: designing them takes as long as playing them.
-    if not hasattr(plan_module.design_multisine, "cache_info"):
-        plan_module.design_multisine = _cached(plan_module.design_multisine)
-    bus_rate.CYCLES = _CHECKED_CYCLES
     folder = Path(tempfile.mkdtemp(prefix="campaign-"))
     path = folder / f"{setting.name}.toml"
     path.write_text(arms.dump(arms.make_document(setting, period)), encoding="utf-8")
@@ -144,7 +141,7 @@ def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str
 
     assert ready.config.fake is not None
     Bench.lay(ready.config.fake, opened)
-    with tempfile.TemporaryDirectory() as name, _environment(Path(name) / "state"), _signals_ignored():
+    with tempfile.TemporaryDirectory() as name, _environment(Path(name) / "state"), _quick(), _signals_ignored():
         folder = Path(name) / "run"
         code, text = _command("record", str(ready.path), "--out", str(folder))
         port = Bench.port
@@ -233,16 +230,24 @@ def _allowed(ready: Ready) -> Any:
     return _allowed_of(ready.path)
 
 
-def _cached(design: Any) -> Any:
-    @cache
-    def designed(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Any:
-        return design(rate, period, lines, peaks, seed)
+@cache
+def _designed(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Multisine:
+    return design_multisine(rate, period, lines, peaks, seed)
 
-    def design_multisine(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Any:
-        return designed(rate, period, tuple(map(tuple, lines)), tuple(peaks), seed)
 
-    design_multisine.cache_info = designed.cache_info  # type: ignore[attr-defined]
-    return design_multisine
+@contextlib.contextmanager
+def _quick() -> Iterator[None]:
+    """Play with cached waves, whose design takes as long as the run, and with a short measurement of the bus."""
+
+    def remembered(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Multisine:
+        return _designed(rate, period, tuple(map(tuple, lines)), tuple(peaks), seed)
+
+    kept = plan_module.design_multisine, bus_rate.CYCLES
+    plan_module.design_multisine, bus_rate.CYCLES = remembered, _CHECKED_CYCLES
+    try:
+        yield
+    finally:
+        plan_module.design_multisine, bus_rate.CYCLES = kept
 
 
 @contextlib.contextmanager

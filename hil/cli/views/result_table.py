@@ -11,7 +11,7 @@ from hil.cli.printing import print_table, say
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
-from hil.estimator.models.terms import joint_of, term_of
+from hil.estimator.models.terms import TERMS, joint_of, kind_of, term_of
 from hil.results.parts import Quantity
 from hil.results.result import SettledResult, ShootingResult
 
@@ -83,6 +83,8 @@ def _parameters(result: SettledResult) -> Table:
 
 def _constant_std(result: SettledResult, name: str) -> float:
     """Relative standard error of the joint's torque constant, with which the parameter scales; 0 where it does not."""
+    if kind_of(name) not in TERMS:  # a base parameter of a spatial arm, to which several joints' torques contribute
+        return 0.0
     joint = joint_of(name) or 1
     if not term_of(name).of_torque or joint > len(result.arm.joints):
         return 0.0

@@ -159,7 +159,7 @@ def test_plots_are_figures_a_notebook_can_show(identified_once: Path) -> None:
     assert figure._repr_png_().startswith(b"\x89PNG")
     assert len(run.result.plot().axes) >= 4
     assert len(run.plot().axes) == 4
-    with pytest.raises(ValueError, match=r"no picture name starts with 'velocity'.*residual_1"):
+    with pytest.raises(ValueError, match=r"no figure name starts with 'velocity'.*residual_1"):
         run.result.plot("velocity")
     assert "matplotlib.pyplot" not in sys.modules
 
