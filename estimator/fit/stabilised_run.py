@@ -3,8 +3,11 @@
 A stabiliser with stiffness k applied the torque k (pose - measured). In closed loop, the simulated arm would receive k
 (pose - simulated) instead, which equals the commanded torque plus that of a spring, k (measured - simulated). So the
 simulation uses the commanded torque and this spring instead of the loop: an arm that is unstable on its own stays close
-to the real one, derivatives are those of every other run, and where model and arm agree the spring has no effect. The
-stabiliser's damper is left out: it only determines how fast deviations decay.
+to the real one, and where model and arm agree the spring has no effect. The stabiliser's damper is left out: it only
+determines how fast deviations decay.
+
+The springs pull the simulated joints to where the real ones were, so the encoders' errors, as far as the model has any,
+are taken out of the measured angles; with them a spring would exert a torque that the arm never felt.
 """
 
 from collections.abc import Iterator
@@ -15,9 +18,13 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.simulated_run import SimulatedRun
-from hil.estimator.models.parameters import Physics
+from hil.estimator.models.parameters import ENCODER, Physics
+from hil.estimator.models.terms import joint_of, kind_of
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.closed_loop import Stabilised
+from hil.estimator.simulation.encoder import without_errors
+
+SHIFT = 1e-3  # change of an encoder error for its derivative [rad]
 
 
 @dataclass(frozen=True)
@@ -65,4 +72,25 @@ class StabilisedRun:
         For each joint, the stiffer of the stabiliser's spring and `tracking_stiffness` is used.
         """
         stiffness = self.stiffness if tracking_stiffness is None else np.maximum(self.stiffness, tracking_stiffness)
-        return self.run.pieces(physics, start, names, stiffness, horizon)
+        errors = [(index, name) for index, name in enumerate(names) if kind_of(name) in ENCODER]
+        base = self._pulled_by(physics).pieces(physics, start, names, stiffness, horizon)
+        # An encoder error moves the springs' ends too, which no other derivative contains.
+        moved = [
+            self._pulled_by(_shifted(physics, name)).pieces(physics, start, (), stiffness, horizon)
+            for _, name in errors
+        ]
+        for (part, position, derivative), *others in zip(base, *moved, strict=True):
+            for (index, _), (_, other, _) in zip(errors, others, strict=True):
+                derivative[:, :, index] += (other - position) / SHIFT
+            yield part, position, derivative
+
+    def _pulled_by(self, physics: Physics) -> SimulatedRun:
+        """Return the run with springs to where the joints were if the encoders have the errors of `physics`."""
+        assert self.run.pulled_to is not None
+        return replace(self.run, pulled_to=without_errors(physics, self.run.pulled_to))
+
+
+def _shifted(physics: Physics, name: str) -> Physics:
+    encoder = physics.encoder.copy()
+    encoder[(joint_of(name) or 1) - 1, ENCODER.index(kind_of(name))] += SHIFT
+    return replace(physics, encoder=encoder)

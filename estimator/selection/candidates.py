@@ -306,6 +306,20 @@ def ripple_cycles(period: SettledPeriod, estimate: Estimate, cycles: Sequence[fl
     return {f"ripple_cycles_{joint}": best[joint][1] for joint in joints}
 
 
+def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
+    """Return derivatives of the positions of `period` by all causes (joints, samples, causes), over the residual's RMS.
+
+    The causes are the estimate's parameters, followed by the initial state, as in `Linearised`.
+    """
+    used = without_spikes(period)
+    rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
+    weight = np.where(np.isfinite(estimate.residual), 1.0 / np.maximum(rms, 1e-300), 0.0)
+    columns, _ = _columns(
+        simulated_run(used), Physics.of(estimate.parameters), estimate.start, tuple(estimate.names), weight
+    )
+    return columns.reshape(period.joints, -1, columns.shape[1])
+
+
 def _columns(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
     """Return weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
     pieces = list(run.pieces(physics, start, names))

@@ -14,7 +14,7 @@ from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
-from hil.estimator.selection.candidates import colour, simulated_run
+from hil.estimator.selection.candidates import by_parameters, colour, linearised, simulated_run
 
 ITERATIONS = 3
 LEAST = 0.005  # minimum relative change of friction that matters
@@ -47,6 +47,35 @@ class Drift:
                 if f"{name}_{joint + 1}" in estimate.names:
                     value[estimate.names.index(f"{name}_{joint + 1}")] *= factor[joint]
         return replace(estimate, value=value)
+
+
+def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
+    """Return the covariance (parameters, parameters) including that friction changed while `period` was recorded.
+
+    The fit assumes constant friction. Where friction changes at the rate of `drift`, other parameters follow the slow
+    change of torque, above all those that act slowly too, such as gravity of an arm that hardly feels it. The motion is
+    taken to follow the friction of the moment, as it does where the arm forgets its past within a small part of the
+    period.
+    """
+    about = linearised(period, estimate, (), {})
+    derivative = by_parameters(period, estimate)
+    seconds = np.arange(period.samples) / period.rate
+    since = (seconds - seconds.mean()) / drift.seconds
+    own = np.linalg.pinv(about.normal + about.expected * about.colour, rcond=1e-11, hermitian=True)
+    wider = estimate.covariance.copy()
+    seen = np.isfinite(np.diag(wider))
+    for joint in range(period.joints):
+        names = [f"{name}_{joint + 1}" for name in SCALED]
+        friction = sum(
+            derivative[:, :, estimate.names.index(name)] * estimate.parameters[name]
+            for name in names
+            if name in estimate.names
+        )
+        changed = friction * since * drift.change[joint]
+        shift = own @ np.einsum("jsc,js->c", derivative, changed)
+        moved = shift[: len(estimate.names)]
+        wider += np.where(np.outer(seen, seen), np.outer(moved, moved), 0.0)
+    return wider
 
 
 def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -> Drift:

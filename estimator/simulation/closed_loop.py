@@ -123,7 +123,7 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     lag = physics.lag + max(physics.delay, 0.0)
     moving = without_dry_friction(physics.vector)
     respond_compiled(
-        *(physics.vector, has_bristles(physics), moving, full, both, gains),
+        *(physics.vector, has_bristles(physics), moving, full, both, gains, physics.encoder),
         *(lag, step, steps, finer_pieces(physics, step), position, velocity, torque),
     )
     return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
@@ -137,6 +137,7 @@ def _loop(
     state: Any,
     command: Any,
     gains: Any,
+    e: Any,
     lag: float,
     step: float,
     steps: int,
@@ -158,7 +159,12 @@ def _loop(
         c2 = command[1, k] + gains[0, 1] * (gains[2, 1] - s2) - gains[1, 1] * w2
         c1 = min(max(c1, -gains[3, 0]), gains[3, 0])
         c2 = min(max(c2, -gains[3, 1]), gains[3, 1])
-        s1, s2, w1, w2 = q1, q2, v1, v2
+        # The loop is closed on what the encoders read.
+        s1 = q1 + e[0, 0] * math.sin(q1) + e[0, 1] * math.cos(q1)
+        s1 += e[0, 2] * math.sin(2.0 * q1) + e[0, 3] * math.cos(2.0 * q1)
+        s2 = q2 + e[1, 0] * math.sin(q2) + e[1, 1] * math.cos(q2)
+        s2 += e[1, 2] * math.sin(2.0 * q2) + e[1, 3] * math.cos(2.0 * q2)
+        w1, w2 = v1, v2
         position[0, k] = q1
         position[1, k] = q2
         velocity[0, k] = v1

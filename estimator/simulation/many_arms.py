@@ -213,6 +213,7 @@ def _peaks_loop(
     position, velocity, torque = np.empty_like(former), np.empty_like(former), np.empty_like(former)
     ramped = np.empty((2, ramp_in.shape[2]))
     ramped_velocity, ramped_torque = np.empty_like(ramped), np.empty_like(ramped)
+    perfect = np.zeros((2, 4))  # encoders without errors
     for arm in range(p.shape[0]):
         state, felt = _resting(pose[arm]), _felt(gains, scale[arm])
         for joint in range(2):
@@ -222,7 +223,7 @@ def _peaks_loop(
             command = _scaled(period[segment], scale[arm])
             faded = _scaled(ramp_in[segment], scale[arm])
             respond_compiled(
-                p[arm], bristly[arm], m[arm], state, faded, felt, lag[arm], step, steps, pieces[arm],
+                p[arm], bristly[arm], m[arm], state, faded, felt, perfect, lag[arm], step, steps, pieces[arm],
                 ramped, ramped_velocity, ramped_torque,
             )  # fmt: skip
             _raise(values[arm], ramped, ramped_velocity, ramped_torque, scale[arm])
@@ -230,7 +231,7 @@ def _peaks_loop(
             played = 0
             while left > 0:
                 respond_compiled(
-                    p[arm], bristly[arm], m[arm], state, command, felt, lag[arm], step, steps, pieces[arm],
+                    p[arm], bristly[arm], m[arm], state, command, felt, perfect, lag[arm], step, steps, pieces[arm],
                     position, velocity, torque,
                 )  # fmt: skip
                 _raise(values[arm], position, velocity, torque, scale[arm])
@@ -246,7 +247,7 @@ def _peaks_loop(
                 break
             faded = _scaled(ramp_out[segment], scale[arm])
             respond_compiled(
-                p[arm], bristly[arm], m[arm], state, faded, felt, lag[arm], step, steps, pieces[arm],
+                p[arm], bristly[arm], m[arm], state, faded, felt, perfect, lag[arm], step, steps, pieces[arm],
                 ramped, ramped_velocity, ramped_torque,
             )  # fmt: skip
             _raise(values[arm], ramped, ramped_velocity, ramped_torque, scale[arm])
@@ -272,7 +273,7 @@ def _positions_loop(
     for arm in range(p.shape[0]):
         respond_compiled(
             p[arm], bristly[arm], m[arm], _resting(pose[arm]), _scaled(command, scale[arm]), _felt(gains, scale[arm]),
-            lag[arm], step, steps, pieces[arm], position, velocity, torque,
+            np.zeros((2, 4)), lag[arm], step, steps, pieces[arm], position, velocity, torque,
         )  # fmt: skip
         for k in range(kept.shape[2]):
             kept[arm, 0, k] = position[0, k * every]

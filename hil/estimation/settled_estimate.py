@@ -21,7 +21,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
-from hil.estimator.selection.drift import Drift, friction_change
+from hil.estimator.selection.drift import Drift, drifting, friction_change
 from hil.estimator.selection.settled import Choice, choose, predict_period
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
@@ -55,6 +55,8 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=_with_neglected(considered(period, estimate), estimate))
     drift = None if other is None else _drift(facts, samples, other, estimate)
+    if drift is not None:
+        estimate = replace(estimate, covariance=drifting(period, estimate, drift))
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if other is not None:
         later = estimate if drift is None or not drift.is_seen else drift.at_the_later(estimate)
