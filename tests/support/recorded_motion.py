@@ -9,20 +9,10 @@ import numpy as np
 from hil.estimator.excitation.multisine import design_multisine, zippered_lines
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import make_plant
+from tests.support.recorded_arm import CURRENT_STEP, DRIVES, LINKS, SERVO, STEP
 
-STEP = 2.0 * math.pi / 4096
 RATE = 200.0
-CURRENT_STEP = 2.69e-3
 FRICTION = {"stribeck_rise": 0.4, "stribeck_velocity": 0.3, "load": 0.03}
-LINKS = (
-    {"length": 0.147, "mass": 0.180, "centre": 0.081, "inertia": 7.0e-4},
-    {"length": 0.180, "mass": 0.200, "centre": 0.112, "inertia": 2.9e-4},
-)
-DRIVES = (
-    {"viscous": 0.045, "coulomb": 0.055, "offset": 0.004},
-    {"viscous": 0.040, "coulomb": 0.050, "offset": -0.003},
-)
-SERVO = {"mass": 0.082, "rotor_inertia": 8.0e-8, "gear_ratio": 353.5, "torque_constant": 1.8}
 
 
 @dataclass(frozen=True)
