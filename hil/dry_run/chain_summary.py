@@ -12,6 +12,7 @@ from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction
 from hil.dry_run.chain_stop import ChainStops
 from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction, quantities_of
+from hil.dry_run.summary import joints_json
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,6 @@ def unsafe(config: Config, foreseen: ChainPrediction) -> str:
 def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
     """One object: verdict, clearance, stops, and per joint every predicted quantity."""
     config, peaks, fall, lowering = run.config, run.prediction, run.stops.fall, run.stops.lowering
-    median, quantile, chance = peaks.median, peaks.quantile, peaks.limit_chance
     return {
         "schema": 1,
         "config": str(config.path),
@@ -100,19 +100,7 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
             "speed_m_s": round(fall.speed, 2),
             "beyond_limits_rad": [round(float(value), 3) for value in fall.beyond],
         },
-        "joints": {
-            joint.name: {
-                name: {
-                    "unit": unit,
-                    "median": float(median[row, index]),
-                    "quantile_99": float(quantile[row, index]),
-                    "limit": float(peaks.limits[row, index]),
-                    "chance": float(chance[row, index]),
-                }
-                for row, (name, unit) in enumerate(quantities_of(config))
-            }
-            for index, joint in enumerate(config.joints)
-        },
+        "joints": joints_json(config, peaks),
         "servos": list(run.servos),
     }
 

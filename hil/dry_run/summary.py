@@ -79,9 +79,10 @@ def settling_text(config: Config, prediction: Prediction) -> str:
     return f"{100 * settled.mean():.0f} % of the simulated arms settle, 99 % of them within {seconds:g} s of the start."
 
 
-def _prediction_json(config: Config, prediction: Prediction) -> dict[str, Any]:
+def joints_json(config: Config, prediction: Prediction) -> dict[str, Any]:
+    """Return each joint's predicted peaks, their limits and the chance of passing them, by joint and quantity."""
     median, quantile, chance = prediction.median, prediction.quantile, prediction.limit_chance
-    joints = {
+    return {
         joint.name: {
             name: {
                 "unit": unit,
@@ -94,7 +95,10 @@ def _prediction_json(config: Config, prediction: Prediction) -> dict[str, Any]:
         }
         for index, joint in enumerate(config.joints)
     }
-    return {"guard_stop_chance": prediction.stop_chance, "joints": joints}
+
+
+def _prediction_json(config: Config, prediction: Prediction) -> dict[str, Any]:
+    return {"guard_stop_chance": prediction.stop_chance, "joints": joints_json(config, prediction)}
 
 
 def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
