@@ -74,7 +74,17 @@ def measure(rate: float, period: float) -> dict[str, Any]:
     samples = round(rate * period)
     when = np.arange(samples) / rate
     wave = np.stack([0.2 * np.sin(math.tau * when), 0.1 * np.sin(math.tau * 2 * when)], axis=1)
-    plan = Plan(rate, (Segment("identify", None, wave, round(rate)),), 200, rest_window(rate), 20, 5, 1, 0.01)  # type: ignore[arg-type]
+    plan = Plan(
+        rate=rate,
+        segments=(Segment("identify", None, wave, round(rate)),),  # type: ignore[arg-type]
+        rest_samples=200,
+        end_samples=rest_window(rate),
+        brake_samples=20,
+        max_settling_periods=5,
+        periods=1,
+        settle_within=0.01,
+        drift_within=0.2,
+    )
     clock = VirtualClock()
     bus = StandIn(config, clock, 0.05)
     with tempfile.TemporaryDirectory() as folder, Recorder(Path(folder) / "samples.npy", 2, plan.capacity) as recorder:
