@@ -101,7 +101,7 @@ class Space:
         return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
 
     def ends(self, position: Array) -> tuple[Array, Array]:
-        """Ends of all capsules in the base frame (capsules, 2, 3) [m] and their radii [m], at a pose (joints,) [rad]."""
+        """Ends of all capsules in the base frame (capsules, 2, 3) and their radii [m] at a pose (joints,) [rad]."""
         rotation, translation, axis = self._chain
         frames = [(np.eye(3), np.zeros(3))]
         for turn, shift, around, angle in zip(rotation, translation, axis, position, strict=True):

@@ -82,7 +82,7 @@ class Lowering:
             raise SafetyStop(f"{joint.title} is {np.nanmax(away):.2f} rad off its way down.", Cause.UNEXPECTED)
 
     def late(self, seconds: float) -> None:
-        """Report a missed deadline [s late]. Raises SafetyStop if it is too late."""
+        """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._guard.late(seconds)
 
 
