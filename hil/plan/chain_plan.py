@@ -140,7 +140,8 @@ def check_clearance(config: Config, plan: Plan) -> None:
                 raise ConfigError(
                     f"{config.path}: the path has too little clearance: {nearest}, at least "
                     f"{1e3 * nearest.needed:.0f} mm are required. Move joint_path.centre, "
-                    "lower joint_path.swing, or correct [clearance] and the URDF's collision geometry; `hil dry-run` shows where."
+                    "lower joint_path.swing, or correct [clearance] and the URDF's collision geometry; "
+                    "`hil dry-run` shows where."
                 )
 
 
