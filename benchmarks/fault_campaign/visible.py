@@ -4,8 +4,8 @@ The fault's effect is judged by the data that the program received: does the pos
 velocity, does the current agree with the goals, and could any arm consistent with the prior have moved like this? The
 last question is a sequential test: the arm's equations of motion, integrated over intervals of `STRETCH_S`, are linear
 in its parameters. These start from the prior of the program's configuration and are estimated from all intervals so
-far; each new interval is compared with its prediction. Unlike the program, the detector knows the noise in advance, from an
-undisturbed run of the same arm. A run may therefore continue if even this detector finds nothing.
+far; each new interval is compared with its prediction. Unlike the program, the detector knows the noise in advance,
+from an undisturbed run of the same arm. A run may therefore continue if even this detector finds nothing.
 """
 
 from collections.abc import Sequence

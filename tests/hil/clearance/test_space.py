@@ -1,4 +1,4 @@
-"""Clearance of an arm in space: capsules around its links, distances to itself, the floor and boxes."""
+"""Clearance of a spatial arm: capsules around its links, distances from itself, the floor and boxes."""
 
 import struct
 from pathlib import Path
