@@ -15,11 +15,11 @@ base_median_percent    median error of the base parameters that make up a tenth 
 residual_ticks         residual of stage 2, worst joint; rounding alone leaves 0.289
 held_out_percent       closed-loop prediction of the held-out motion: RMS error over motion RMS, worst joint
 coverage_95            share of base parameters within their 95 % intervals, over all seeds
-seconds                both stages, compiled, one core; processor_seconds the same where other work shares it
+seconds                both stages, compiled, one core; processor_seconds: the same in processor time
 iterations             simulations with all sensitivities
-share_of_classic       torque error over the classic's, same recording
-classic                the same of filtered inverse dynamics least squares: the best of three cut-offs, chosen with the
-                       truth known; it has no one-step-ahead residual
+share_of_classic       ratio of the torque error to that of the classic method, same recording
+classic                the same figures for filtered inverse-dynamics least squares: the best of three cut-offs, chosen
+                       with the truth known; it has no one-step-ahead residual
 
 `--json` prints {"arms": {"4": {...}, "6": {...}}} and nothing else.
 """
@@ -200,7 +200,7 @@ def errors(setup: Setup, value: np.ndarray, path: Motion) -> dict[str, float]:
 
 
 def classic(setup: Setup, period: SettledPeriod, held_out: SettledPeriod, path: Motion) -> dict[str, float | None]:
-    """Filtered least squares with the cut-off that gives the least torque error."""
+    """Filtered least squares with the cut-off that gives the smallest torque error."""
     model = ChainModel(setup.base, friction="coulomb")
     at = np.arange(period.samples) / period.rate
     recording = Recording(at, period.torque, period.position, period.position_step, between="held")
@@ -226,7 +226,7 @@ def classic(setup: Setup, period: SettledPeriod, held_out: SettledPeriod, path: 
 
 
 def foretold(model: ChainModel, parameters: dict[str, float], held_out: SettledPeriod) -> float | None:
-    """Error of the free prediction [%], worst joint; None where the arm of these parameters runs away."""
+    """Error of the free prediction [%], worst joint; None if the simulation with these parameters diverges."""
     try:
         return 100 * float(relative_error(held_out, predict(model, parameters, held_out)).max())
     except PeriodicityError:
@@ -259,7 +259,7 @@ _COMPILED: set[int] = set()
 
 
 def _compiled(joints: int, seed: int) -> dict[str, Any]:
-    """`measure`, which a worker does once before its first for everything to be compiled."""
+    """Call `measure`; a worker does so once before its first measurement, so that everything is compiled."""
     if joints not in _COMPILED:
         measure(joints, 1)
         _COMPILED.add(joints)
@@ -267,7 +267,7 @@ def _compiled(joints: int, seed: int) -> dict[str, Any]:
 
 
 def worst(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """The worst of the seeds, None where one has none; coverage over all of them."""
+    """Worst figure of all seeds, None if a seed has none; coverage over all seeds."""
     result: dict[str, Any] = {}
     for key, first in found[0].items():
         each = [one[key] for one in found]
@@ -289,7 +289,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=6)
-    parser.add_argument("--jobs", type=int, default=1, help="workers; more than one disturb each other's times")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="number of workers; with more than one, times are disturbed"
+    )
     parser.add_argument("--joints", type=int, nargs="+", default=[4, 6], choices=sorted(BENCHES))
     given = parser.parse_args()
     result: dict[str, Any] = {"arms": {}}

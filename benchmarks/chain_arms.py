@@ -1,10 +1,10 @@
-"""`hil identify` on the ready arms in space, from URDF, limits and rest pose alone, pilot included.
+"""`hil identify` on the bundled spatial arms, from URDF, limits and rest pose alone, including the pilot.
 
     python benchmarks/chain_arms.py [--arm koch] [--json]
 
 For each: trust, residual in encoder steps, held-out error, coverage of the 95 % intervals, arm time and
-processor time, least clearance and largest excess over a position limit in all that was recorded, and the worst
-relative standard error of the designed path over that of random ones.
+processor time, least clearance and largest overshoot of a position limit over all recordings, and the ratio of the
+worst relative standard error of the designed path to that of random paths.
 """
 
 import argparse
@@ -28,8 +28,8 @@ PLAIN = 5
 
 
 def measured(config: Config, run: Path) -> dict[str, float]:
-    """Of all recordings below a run folder: seconds, least distance to anything beyond the rest pose, and the largest
-    excess over a position limit [rad]."""
+    """Over all recordings in a run folder: duration [s], least clearance outside the rest pose [m], and largest
+    overshoot of a position limit [rad]."""
     space = Space.of(config)
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     seconds, nearest, excess = 0.0, np.inf, -np.inf
@@ -46,7 +46,7 @@ def measured(config: Config, run: Path) -> dict[str, float]:
 
 
 def over_plain(config: Config) -> float:
-    """Worst relative standard error of the designed path over the median of random ones, same limits and time."""
+    """Ratio of the designed path's worst relative standard error to the median of random ones, same limits and time."""
     config = chain_config(config)
     paths = Paths.of(config, ChainBelief.prior(config).torque)
     return float(
@@ -80,7 +80,7 @@ def identified(name: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--arm", choices=ARMS, action="append")
-    parser.add_argument("--json", action="store_true", help="one JSON object for all at the end, and nothing else")
+    parser.add_argument("--json", action="store_true", help="print only one JSON object for all arms, at the end")
     options = parser.parse_args()
     rows = {}
     for name in options.arm or ARMS:

@@ -1,10 +1,10 @@
-"""Random arms in space, three to six joints, identified on the fake bus from a description that is 30 % off.
+"""Random spatial arms with three to six joints, identified on the fake bus from a description that is 30 % off.
 
     python benchmarks/chain_population.py --arms 60 [--first 0] [--json]
 
 Axes, lengths, masses, servos, rest pose and limits are drawn; the real arm's masses differ from the URDF's by 30 %
-and its centres by 5 mm. Counted: runs that finish with a result, collisions of what was recorded with
-itself or the floor, and position limits passed. A run that a dry run refuses as unsafe has not finished.
+and its centres of mass by 5 mm. Counted: runs that finish with a result, collisions of the recorded motion with the arm
+itself or the floor, and exceeded position limits. A run that is refused by its dry run as unsafe has not finished.
 """
 
 import argparse
@@ -37,7 +37,7 @@ SERVOS = (("XM430-W350", 1.8, 1.4), ("XM540-W270", 2.41, 3.5))
 
 
 def urdf_of(random: np.random.Generator, joints: int) -> str:
-    """Links of 8 to 20 cm that turn about the vertical first, then mostly across themselves."""
+    """Draw links of 8 to 20 cm: the first axis is vertical, the others mostly perpendicular to their link."""
     parts = ['<robot name="random"><link name="base"><collision><origin xyz="0 0 0.02"/><geometry>']
     parts.append('<cylinder radius="0.04" length="0.04"/></geometry></collision></link>')
     reach = 0.07
@@ -60,7 +60,7 @@ def urdf_of(random: np.random.Generator, joints: int) -> str:
 
 
 def toml_of(random: np.random.Generator, joints: int, rest: Any, limits: Any, servos: Any, stops: Any) -> str:
-    """The arm's file; `stops` None leaves the fake without any."""
+    """Write the arm's file; without hard stops if `stops` is None."""
     text = ['[port]\nurl = "fake://"\nbaud = 3_000_000\n']
     for joint in range(joints):
         model, constant, current = servos[joint]
@@ -99,7 +99,7 @@ def toml_of(random: np.random.Generator, joints: int, rest: Any, limits: Any, se
 
 
 def draw(folder: Path, seed: int) -> Path:
-    """An arm with a rest pose in which it lies clear of everything; its file."""
+    """Draw an arm with a rest pose in which it is clear of everything; return its file."""
     random = np.random.default_rng((17, seed))
     joints = int(random.integers(3, 7))
     path = folder / "arm.toml"
@@ -140,7 +140,7 @@ def _weights(known: KnownChain, rest: Any, random: np.random.Generator) -> tuple
 
 
 def identified(seed: int) -> dict[str, Any]:
-    """One arm: what came of it."""
+    """Identify one arm; return the outcome."""
     with tempfile.TemporaryDirectory() as folder:
         path = draw(Path(folder), seed)
         config = load_config(path)
@@ -164,7 +164,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--arms", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="the summary alone, as JSON")
+    parser.add_argument("--json", action="store_true", help="print only the summary, as JSON")
     options = parser.parse_args()
     rows = []
     for seed in range(options.first, options.first + options.arms):

@@ -1,24 +1,23 @@
-"""Arms of a second distribution, farther out than that of population_arms.py: what other people might build.
+"""Arms from a second, wider distribution than that of population_arms.py: arms that other people might build.
 
-models          any pair of seven, each joint its own (three in ten pairs mixed), voltage-driven XL430 among them
+models          any of seven, including the voltage-driven XL430; three in ten pairs mix two models
 joints          one (30 %) or two
 orientation     hanging 40 %, tilted by 20 to 70 degrees 20 %, flat 20 %, upright 20 %
-links           the first 0.06 to 0.25 m of an XM430, the second 0.3 to 3 times it; each scaled as the stall torque to
-                0.4; 0.3 to 1.5 kg/m; half carry a payload of up to as much as the link at its end. Drawn again where
-                gravity at full stretch is above 20 % of stall, at any joint.
-friction        Coulomb 0.5 to 7 % of stall, evenly in its logarithm; Stribeck rise 0 to 0.5 at 0.03 to 0.4 rad/s;
+links           the first 0.06 to 0.25 m for an XM430, the second 0.3 to 3 times as long; both times (stall torque)^0.4;
+                0.3 to 1.5 kg/m; half carry a payload of up to the link's mass at their end. Redrawn if gravity at full
+                stretch exceeds 20 % of stall at any joint.
+friction        Coulomb 0.5 to 7 % of stall, log-uniform; Stribeck rise 0 to 0.5 at 0.03 to 0.4 rad/s;
                 viscous 0.1 to 4 % of stall per rad/s; offset up to 25 % of Coulomb; armature 0.8 to 6 g m^2 per N m
 richer friction a third each have load 0.02 to 0.1, ripple 0.5 to 2.5 % (3 to 16 cycles), presliding over 0.3 to
                 6 mrad with probability 0.15 each
-cable           one in six: up to 3 % of stall per radian, slack up to 0.5 rad away
-torque          one in six falls short by up to 4 % at the current limit
+cable           one in six: up to 3 % of stall per radian, rest angle up to 0.5 rad away
+torque          one in six saturates by up to 4 % at the current limit
 backlash        one in ten: 0.3 to 1 mrad
 warming         a quarter: 3 to 25 % within 20 to 200 s
-encoder         noise of up to 0.8 steps (a third), errors once and twice per turn of up to 3 and 1.5 steps (a quarter),
-                each joint its own
-rest            zeros off by up to 2.5 degrees; friction holds it up to 6 degrees away; servo counts start anywhere in
-                their turn
-experiment      rate 50 to 500 Hz, period 8 to 16 s, limits of 50 to 130 degrees, each side its own
+encoder         noise of up to 0.8 steps (a third), once- and twice-per-turn errors of up to 3 and 1.5 steps (a
+                quarter), independent for each joint
+rest            zeros off by up to 2.5 degrees; friction holds it up to 6 degrees away; servo zeros anywhere in a turn
+experiment      rate 50 to 500 Hz, period 8 to 16 s, limits of 50 to 130 degrees, independent on each side
 """
 
 import math
@@ -44,7 +43,7 @@ TURN = 4096
 
 
 def draw(seed: int) -> DrawnArm:
-    """The arm of this seed."""
+    """Draw the arm of this seed."""
     random = np.random.default_rng((29, seed))
     joints = 1 if random.random() < 0.3 else 2
     models = _models(random, joints)
@@ -188,7 +187,7 @@ def _held(
     joint: int,
     weight: float,
 ) -> float:
-    """Off the rest pose by what friction holds, at most 6 degrees."""
+    """Draw the initial pose [rad]: off the rest pose by as much as friction holds, at most 6 degrees."""
     held = 0.6 * drive["coulomb"] / max(_moment(links, models, joint) * weight, 1e-9)
     return float(random.uniform(-1, 1)) * min(6 * DEGREE, held)
 

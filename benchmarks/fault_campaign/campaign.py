@@ -41,7 +41,7 @@ AFTER_S = 1.5
 
 STATE = "XDG_STATE_HOME"
 FREE = frozenset({"Goal Position", "Registered Instruction"})
-"""Registers that a servo writes itself, whatever a program does."""
+"""Registers that a servo writes itself, independently of any program."""
 
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = 12

@@ -135,7 +135,7 @@ SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SPLIT, FaultKind.LATE_REPLY})
 """Faults after which the program may play its plan later than in an undisturbed run."""
 
 HARMLESS = frozenset({Kind.CLOCK_WRAP, Kind.RAISED_LIMIT})
-"""After these a run ends as if nothing had been done to it."""
+"""Faults after which a run ends as if undisturbed."""
 
 _OF_ONE_FIELD = frozenset({Kind.BIAS, Kind.CREEP, Kind.JITTER, Kind.STUCK_BIT, Kind.CONSTANT})
 
@@ -212,7 +212,7 @@ def _attack(kind: Kind, at: float, ids: Sequence[int], random: Random) -> Attack
 
 
 def _amount(kind: Kind, field: str, random: Random) -> float:
-    """How much of it; what that means depends on the kind."""
+    """Strength of the fault; its meaning depends on the kind."""
     sign = random.choice((-1.0, 1.0))
     ticks = {"position": 10 ** random.uniform(1.0, 3.6), "velocity": 10 ** random.uniform(0.3, 2.3)}.get(field, 100.0)
     return {

@@ -1,4 +1,4 @@
-"""Values forged inside whole answers and sealed again, so that nothing but their content tells."""
+"""Forges values in complete replies and recomputes their CRCs, so that only the content is wrong."""
 
 import math
 from collections import deque
@@ -9,7 +9,7 @@ from benchmarks.fault_campaign.attack import Attack, Kind, Request, blocks_in, f
 
 
 class Forger:
-    """Keeps what the servos said and changes it."""
+    """Stores the servos' reported values and modifies them."""
 
     def __init__(self) -> None:
         self._latest: dict[int, tuple[int, bytes]] = {}

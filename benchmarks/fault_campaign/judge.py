@@ -108,7 +108,7 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
 
 
 def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:
-    """For how long current flowed from a moment on; driven: the moments at which it did [s]."""
+    """Time for which current flowed after a moment [s]. driven: times at which it flowed [s]."""
     flowed = driven[driven >= since]
     return 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
 
@@ -129,7 +129,7 @@ def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
     """Whether the message names the cause among at most three causes, and whether it names only wrong ones."""
     offered = causes_in(text)
     if set(drawn.kinds) <= HARMLESS:
-        return False, True  # whatever it says: it should not have stopped
+        return False, True  # whatever the message says: the run should not have stopped
     right = frozenset().union(*(CAUSES[kind] for kind in drawn.kinds))
     if not right:
         return True, False  # none of the faults had to stop the run, so the message is not judged

@@ -75,7 +75,7 @@ class Middle(FakeSerial):
         self._sleeps = max((each.end for each in on_bytes), default=-math.inf)
 
     def let_be(self) -> None:
-        """The program is done: nothing is done to it any more, and the servos are as they were but for what it did."""
+        """End all attacks, because the program has ended, and undo their changes to the servos."""
         self.over = True
         while self._undo:
             self._undo.pop()()
@@ -201,7 +201,7 @@ class Middle(FakeSerial):
         return [each for each in self._lasting(now, FORGED) if self._strikes(each, now)]
 
     def _spoilt(self, attack: Attack, packet: bytes) -> bytes:
-        """Bytes that no checksum passes any more."""
+        """Corrupt bytes so that no checksum matches."""
         if attack.kind == Kind.CUT:
             at = self._random.randrange(len(packet))
             return packet[:at] + packet[at + self._random.randrange(1, 5) :]
@@ -216,7 +216,7 @@ class Middle(FakeSerial):
         return bytes(changed)
 
     def _collided(self, data: bytes) -> bytes:
-        """What is left where another servo answers at the same time: a line that either of them pulls down is down."""
+        """Combine with the bytes of another servo that answers at the same time: low if either pulls the line low."""
         other = encode_status(data[4], 0, self._random.randbytes(max(0, len(data) - 11))) if len(data) > 4 else b""
         return bytes(own & its for own, its in zip(data, other.ljust(len(data), b"\xff"), strict=False))
 

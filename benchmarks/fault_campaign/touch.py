@@ -1,4 +1,4 @@
-"""What is done to the servos, to their motors and to the program itself, past the bytes."""
+"""Attacks on the servos, their motors and the program itself rather than on bytes."""
 
 import contextlib
 import os
@@ -24,7 +24,7 @@ _SHORT_BOOT_S = 5e-3
 
 
 class Killed(BaseException):
-    """The program is gone: whatever it still tries on this port, nothing leaves it any more."""
+    """The program was killed: nothing that it still writes to this port is sent."""
 
 
 def prepare(attack: Attack, port: "Middle") -> None:
@@ -42,7 +42,7 @@ def prepare(attack: Attack, port: "Middle") -> None:
 
 
 def happen(attack: Attack, port: "Middle") -> list[Undo]:
-    """What happens at one moment; how to undo what the program is not to be blamed for."""
+    """Execute an attack that happens once; return functions that undo changes not caused by the program."""
     match attack.kind:
         case Kind.SIGINT | Kind.SIGTERM | Kind.SIGHUP:
             os.kill(os.getpid(), signal.Signals[attack.kind])
@@ -96,9 +96,9 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
 
 
 def _change(servo: EmulatedServo, register: str, value: int, before: int | None = None) -> Undo:
-    """Another program writes a register: the program under test is not to be blamed where that value stays.
+    """Write a register as another program would; the program under test is not blamed if this value remains.
 
-    before: what it then becomes again, by default what it was.
+    before: value that undoing restores; by default, the present one.
     """
     before = servo.value(register) if before is None else before
     servo.memory.set(register, value)
@@ -113,7 +113,7 @@ def _change(servo: EmulatedServo, register: str, value: int, before: int | None 
 
 
 def _fill_disk() -> Undo:
-    """No file grows any more: a write that needs room fails, in this process alone."""
+    """Limit the size of files, so that writes fail in this process only, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (_ROOM_BYTES, hard))
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

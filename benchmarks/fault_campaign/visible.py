@@ -1,12 +1,11 @@
-"""From when on a fault could be seen at all, by a detector that knows more than the program may.
+"""Determines when a fault became observable, using a detector with more information than the program.
 
-The fault's effect is judged on what the program was told, by three questions: does the position agree with the
-integral of the velocity, does the current agree with the goals, and could any arm that the program may be dealing with
-have moved like this? The last one is a sequential test: the arm's equations of motion, integrated over stretches of
-`STRETCH_S`, are linear in its parameters. These have the prior of the program's configuration, are estimated from all
-stretches so far, and each new stretch is compared with what they leave open. What the detector has and the program has
-not is the noise: it is taken from the same arm's undisturbed run, known in advance. So where even this detector sees
-nothing, a run may go on.
+The fault's effect is judged by the data that the program received: does the position agree with the integral of the
+velocity, does the current agree with the goals, and could any arm consistent with the prior have moved like this? The
+last question is a sequential test: the arm's equations of motion, integrated over intervals of `STRETCH_S`, are linear
+in its parameters. These start from the prior of the program's configuration and are estimated from all intervals so
+far; each new interval is compared with its prediction. Unlike the program, the detector knows the noise in advance,
+from an undisturbed run of the same arm. A run may therefore continue if even this detector finds nothing.
 """
 
 from collections.abc import Sequence
@@ -20,10 +19,10 @@ Array = NDArray[np.float64]
 
 STRETCH_S = 0.05
 SURE = 4.0
-"""Standard deviations beyond which a stretch is none of a healthy arm; times what its undisturbed run has at most."""
+"""Smallest threshold for the deviation of an interval [standard deviations]."""
 
 MARGIN = 1.2
-"""Times the most that the undisturbed run shows."""
+"""Factor on the largest deviation in the undisturbed run, which gives the threshold if that is larger."""
 
 _STILL_RAD_S = 0.06
 _STATIC = 1.5
@@ -32,9 +31,9 @@ _CURRENT_SHARE = 0.2
 
 
 class Heard:
-    """What the program was told at `time` (n,) [s]: angle, velocity, current (n, joints) [rad, rad/s, A].
+    """Data that the program received at `time` (n,) [s]: angle, velocity, current (n, joints) [rad, rad/s, A].
 
-    goal, torque: what it sent, a current or voltage, and the torque that this stands for (n, joints) [A or V, N m].
+    goal, torque: current or voltage that it commanded, and the corresponding torque (n, joints) [A or V, N m].
     """
 
     def __init__(
@@ -62,7 +61,7 @@ class Heard:
 
 
 def visible_from(config: Config, prior: tuple[Array, Array], told: Heard, undisturbed: Heard) -> float:
-    """The first moment at which the detector is sure [s]; infinite where it never is.
+    """First time at which the detector finds a fault [s]; infinite if it never does.
 
     prior: mean and covariance of the parameters, in the order of `_rows`.
     """
@@ -90,7 +89,7 @@ def _outside(config: Config, told: Heard) -> float:
 
 
 def _disagreement(told: Heard) -> tuple[Array, Array]:
-    """Time (n,), and how far position and integrated velocity part over a stretch, the worst joint (n, 1) [rad]."""
+    """Time (n,), and difference of position and integrated velocity over two intervals, worst joint (n, 1) [rad]."""
     step = np.diff(told.time, prepend=told.time[:1])[:, None]
     mean = 0.5 * (told.velocity + np.roll(told.velocity, 1, axis=0))
     apart = np.cumsum(np.diff(told.angle, axis=0, prepend=told.angle[:1]) - mean * step, axis=0)
@@ -99,7 +98,7 @@ def _disagreement(told: Heard) -> tuple[Array, Array]:
 
 
 def _not_carried(config: Config, told: Heard) -> tuple[Array, Array]:
-    """Time, and the mean distance of current and goal over a stretch, as a share of the largest goal; not under PWM."""
+    """Time, and mean difference of current and goal over an interval, relative to the largest goal; not under PWM."""
     senses = [not joint.joint.servo.senses_supply and joint.drive_mode.goal_unit == "A" for joint in config.joints]
     largest = np.maximum(np.abs(told.goal).max(axis=0), 1e-9)
     former = np.roll(told.goal, 1, axis=0)
@@ -111,7 +110,7 @@ def _not_carried(config: Config, told: Heard) -> tuple[Array, Array]:
 
 
 def _rows(told: Heard) -> tuple[Array, Array]:
-    """Momentum and what remains of the equations of motion, per unit of each parameter (n, joints, parameters).
+    """Momentum and remaining terms of the equations of motion, per unit of each parameter (n, joints, parameters).
 
     In the order inertia_1, coupling, inertia_2, armature_2, gravity_1, gravity_2, viscous_1, viscous_2, coulomb_1,
     coulomb_2, offset_1, offset_2, tilt_1, tilt_2 (docs/model.md).
@@ -135,13 +134,13 @@ def _rows(told: Heard) -> tuple[Array, Array]:
 
 
 def _stretches(told: Heard) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Of successive stretches: their ends (m,), rows (m, joints, 14), torques (m, joints), who stood in them."""
+    """Successive intervals: ends (m,), rows (m, joints, 14), torques (m, joints), joints at standstill (m, joints)."""
     momentum, rest = _rows(told)
     starts, ends = [], []
     at = 0
     for index in range(told.time.size):
         if told.time[index] - told.time[index - 1] > 2 * STRETCH_S + 1e-3:
-            at = index  # replies are missing: nothing can be said of what happened meanwhile
+            at = index  # replies are missing, so the motion in between is unknown
         elif told.time[index] - told.time[at] >= STRETCH_S - 1e-6:
             starts.append(at)
             ends.append(index)
@@ -165,7 +164,7 @@ def _stretches(told: Heard) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
 
 
 def _noise(prior: tuple[Array, Array], undisturbed: Heard) -> Array:
-    """Standard deviation of each joint's torque about the best arm of the prior, over an undisturbed run [N m]."""
+    """Standard deviation of each joint's torque residual after a fit with the prior, over an undisturbed run [N m]."""
     _, rows, torque, stood = _stretches(undisturbed)
     mean, covariance = prior
     noise = np.full(torque.shape[1], 0.02 * np.abs(torque).max())
@@ -183,7 +182,7 @@ def _noise(prior: tuple[Array, Array], undisturbed: Heard) -> Array:
 
 
 def _surprise(prior: tuple[Array, Array], told: Heard, noise: Array) -> tuple[Array, Array]:
-    """Ends of stretches, and by how many standard deviations each is none of the arm so far, the worst joint (m, 1)."""
+    """Ends of intervals, and deviation from the prediction of the worst joint (m, 1) [standard deviations]."""
     ends, rows, torque, stood = _stretches(told)
     mean, covariance = prior[0].copy(), prior[1].copy()
     surprise = np.zeros((ends.size, 1))

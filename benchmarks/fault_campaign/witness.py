@@ -13,7 +13,7 @@ from hil.fakes.servo.servo import EmulatedServo
 STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
 PUSH_RISES_S = 0.03
-"""In which somebody's push comes to its strength: no hand is faster."""
+"""Rise time of a push [s]: no hand is faster."""
 
 RECORD = np.dtype(
     [
@@ -29,7 +29,7 @@ RECORD = np.dtype(
 
 
 class Witness:
-    """Stands where the plant stands and sees every step of it. It changes nothing but what `disturb` asks for."""
+    """Wraps the plant and records every step. It changes only the disturbances requested by `disturb`."""
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant
@@ -52,17 +52,17 @@ class Witness:
 
     @property
     def current(self) -> Sequence[float]:
-        """As the servos' sensors have it: a weak motor carries its current, a push is none."""
+        """Motor currents as sensed by the servos: a weak motor still carries its current, and a push carries none."""
         if not self._disturbed:
             return self._plant.current
         return tuple(current + missing for current, missing in zip(self._plant.current, self._missing, strict=True))
 
     def disturb(self, joint: int, attack: Attack) -> None:
-        """Let this befall the joint's motor from its start to its end."""
+        """Apply an attack to the joint's motor from its start to its end."""
         self._disturbed.append((joint, attack))
 
     def _driven_by(self, current: Sequence[float], now: float) -> Sequence[float]:
-        """The currents that have the effect of these on the disturbed arm."""
+        """The currents whose effect on the plant equals that of `current` on the disturbed arm."""
         felt = list(current)
         self._missing = [0.0] * self.joints
         for joint, each in self._disturbed:

@@ -124,7 +124,7 @@ def dry_run(
     if checked.is_chain:
         if former is not None:
             raise ConfigError(
-                f"{shown}: --result: a dry run of an arm in space draws from its description only so far."
+                f"{shown}: --result: dry runs of spatial arms support only the description as prior so far."
             )
 
         def tell(done: int, of: int) -> None:

@@ -1,7 +1,7 @@
-"""How near a spatial arm comes to itself, the floor and boxes, from the collision geometry of its URDF.
+"""Clearance of a spatial arm from itself, the floor and boxes, from the collision geometry of its URDF.
 
-mesh     corner points of a mesh file
+mesh     vertices of a mesh file
 shapes   capsules that enclose each link
-kernel   compiled distances along a motion
-space    the arm among what it must not touch
+kernel   compiled distance computations along a motion
+space    the arm and its obstacles
 """

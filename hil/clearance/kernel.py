@@ -1,7 +1,7 @@
-"""Compiled: where capsules are along a motion, and the least distance of the pairs that must not touch.
+"""Compiled functions: capsule positions along a motion, and the smallest distance among pairs that must not touch.
 
-Segments by Ericson, Real-Time Collision Detection (2005), 5.1.9. The distance to a box, which is convex, is searched
-along the segment.
+Distances between segments follow Ericson, Real-Time Collision Detection (2005), 5.1.9. The distance from a segment to a
+box is convex along the segment, so a golden-section search finds its minimum.
 """
 
 import math
@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 FLOOR, BOXES = -1, -2
-"""Second partner of a pair: another capsule, the floor, or box number `BOXES - partner`."""
+"""Second member of a pair: the index of another capsule, FLOOR, or `BOXES - index` for a box."""
 
 _SEARCHES = 40
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -20,7 +20,7 @@ _SHORT = 1e-18
 
 
 def _segments(a: Any, b: Any) -> float:
-    """Distance of two segments (2, 3)."""
+    """Distance between two segments, each (2, 3)."""
     d0, d1, d2 = a[1, 0] - a[0, 0], a[1, 1] - a[0, 1], a[1, 2] - a[0, 2]
     e0, e1, e2 = b[1, 0] - b[0, 0], b[1, 1] - b[0, 1], b[1, 2] - b[0, 2]
     r0, r1, r2 = a[0, 0] - b[0, 0], a[0, 1] - b[0, 1], a[0, 2] - b[0, 2]
@@ -47,7 +47,10 @@ def _segments(a: Any, b: Any) -> float:
 
 
 def _to_box(a: Any, s: float, box: Any) -> float:
-    """Distance of a segment's point from a box (5, 3): rotation by rows, centre, half its size; negative inside."""
+    """Signed distance from the point at fraction `s` of a segment to a box; negative inside.
+
+    box (5, 3): rotation matrix, centre, half-size.
+    """
     out, most = 0.0, -1e300
     for axis in range(3):
         along = 0.0
@@ -77,7 +80,7 @@ def _box(a: Any, box: Any) -> float:
 
 
 def _place(rotation: Any, translation: Any, axis: Any, q: Any, frame: Any) -> None:
-    """Frames of base and links (joints + 1, 12): rotation by rows, origin."""
+    """Fill `frame` (joints + 1, 12) for base and links: rotation matrix row by row, then origin."""
     for r in range(12):
         frame[0, r] = 1.0 if r in (0, 4, 8) else 0.0
     for i in range(q.size):
@@ -98,7 +101,7 @@ def _place(rotation: Any, translation: Any, axis: Any, q: Any, frame: Any) -> No
 
 
 def _at(frame: Any, link: Any, ends: Any, out: Any) -> None:
-    """Ends of all capsules (capsules, 2, 3) in the base's frame."""
+    """Fill `out` (capsules, 2, 3) with the ends of all capsules in the base frame."""
     for k in range(link.size):
         f = frame[link[k]]
         for end in range(2):
@@ -108,7 +111,7 @@ def _at(frame: Any, link: Any, ends: Any, out: Any) -> None:
 
 
 def _distance(first: int, second: int, at: Any, radius: Any, floor: Any, boxes: Any) -> float:
-    """Of one pair [m]; negative where they overlap."""
+    """Distance between the members of a pair [m]; negative if they overlap."""
     a = at[first]
     if second >= 0:
         return float(_segments(a, at[second]) - radius[first] - radius[second])
@@ -122,7 +125,7 @@ def _distance(first: int, second: int, at: Any, radius: Any, floor: Any, boxes: 
 
 
 def _all_loop(chain: Any, shapes: Any, pairs: Any, q: Any, out: Any) -> None:
-    """Distances of all pairs (samples, pairs) at poses q (samples, joints)."""
+    """Fill `out` (samples, pairs) with the distances of all pairs at poses q (samples, joints)."""
     rotation, translation, axis = chain
     link, ends, radius, floor, boxes = shapes
     frame, at = np.empty((q.shape[1] + 1, 12)), np.empty(ends.shape)
@@ -134,7 +137,10 @@ def _all_loop(chain: Any, shapes: Any, pairs: Any, q: Any, out: Any) -> None:
 
 
 def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: Any, worst: Any) -> None:
-    """Of each pose the least of distance less what is needed of that pair (samples,), and the pair it is of."""
+    """For each pose, find the smallest difference between a pair's distance and its required distance.
+
+    Fills `room` (samples,) with that difference [m] and `worst` (samples,) with the index of the pair.
+    """
     rotation, translation, axis = chain
     link, ends, radius, floor, boxes = shapes
     frame, at = np.empty((q.shape[1] + 1, 12)), np.empty(ends.shape)
@@ -154,7 +160,7 @@ def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: 
         for p in range(pairs.shape[0]):
             a, b = pairs[p, 0], pairs[p, 1]
             if b >= 0:
-                # Spheres around both are a lower bound that mostly suffices.
+                # The distance between bounding spheres is a lower bound, which usually suffices to discard the pair.
                 apart = (
                     (middle[a, 0] - middle[b, 0]) ** 2
                     + (middle[a, 1] - middle[b, 1]) ** 2

@@ -1,4 +1,4 @@
-"""The corners of a mesh: STL (binary or text) and OBJ, as far as a bounding box needs them."""
+"""Vertices of a mesh file, for its bounding box: STL (binary or text) and OBJ."""
 
 from pathlib import Path
 
@@ -12,7 +12,10 @@ _HEADER, _TRIANGLE = 84, 50
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
-    """The file that a URDF calls so: beside it, or for package://NAME/PATH in a folder above it; None if not there."""
+    """Find the file to which a mesh name in a URDF refers; None if it does not exist.
+
+    Names are resolved relative to the URDF's folder and every folder above it, with or without the package name.
+    """
     for scheme in ("package://", "file://"):
         if name.startswith(scheme):
             name = name[len(scheme) :]
@@ -26,7 +29,7 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
 
 
 def mesh_corners(path: Path) -> Array | None:
-    """Corner points (points, 3) in the file's units; None where the file cannot be read as a mesh."""
+    """Vertices (points, 3) in the file's units; None if the file cannot be read as a mesh."""
     try:
         if path.stat().st_size > MOST_BYTES:
             return None

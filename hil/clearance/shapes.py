@@ -1,8 +1,8 @@
-"""Capsules that enclose each link: from the collision geometry of its URDF, else from the distances between joints.
+"""Capsules that enclose each link: from the collision geometry of its URDF, otherwise from the joint positions.
 
-A capsule is all that is nearer than its radius to a line segment. Spheres are exact; a cylinder is enclosed by one
-capsule, a box by one or a row of them, a mesh by those of its bounding box. A link of which nothing can be read gets a
-capsule from joint to joint, with a guessed radius, and is named.
+A capsule is the set of points within its radius of a line segment. Spheres are represented exactly. A cylinder is
+enclosed by one capsule, a box by one or a row of them, and a mesh by those of its bounding box. A link whose geometry
+cannot be read gets a capsule from joint to joint with a guessed radius, and is listed in `Shapes.guessed`.
 """
 
 import xml.etree.ElementTree as ET
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Placed = tuple[int, Array, Array, ET.Element | None]
 
 GUESSED_SHARE, GUESSED_LEAST, GUESSED_MOST = 0.2, 0.015, 0.05
-"""Radius of a link without geometry: this share of its length, within these bounds [m]."""
+"""Radius of a link without geometry: this fraction of its length, clipped to these bounds [m]."""
 
 MOST_STRIPS = 4
 LONGEST_PIECE = 0.08  # m
@@ -30,7 +30,10 @@ _NOTHING = 1e-6
 
 @dataclass(frozen=True)
 class Capsule:
-    """link: 0 for what stands still, then 1 to the number of joints; ends (2, 3) [m] in that link's frame."""
+    """A capsule fixed to a link.
+
+    link: 0 for the fixed base, then 1 to the number of joints. ends: (2, 3) [m] in that link's frame. radius: [m].
+    """
 
     link: int
     ends: Array
@@ -39,7 +42,10 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Shapes:
-    """names: of the links, the base's first. guessed: links whose shape comes from the distances between joints."""
+    """The capsules of an arm.
+
+    names: names of the links, the base's first. guessed: links whose shape was guessed from the joint positions.
+    """
 
     names: tuple[str, ...]
     capsules: tuple[Capsule, ...]
@@ -47,7 +53,7 @@ class Shapes:
 
 
 def shapes_of(arm: ArmDescription) -> Shapes:
-    """The capsules of an arm."""
+    """Enclose the links of an arm in capsules. Raises ArmFileError."""
     names = (arm.base, *(joint.link for joint in arm.joints))
     placed = _placed(arm)
     capsules: list[Capsule] = []
@@ -62,23 +68,23 @@ def shapes_of(arm: ArmDescription) -> Shapes:
     for each in capsules:
         if not (np.isfinite(each.ends).all() and 0.0 <= each.radius < np.inf):
             raise ArmFileError(
-                f'{arm.path}: link "{names[each.link]}": its collision geometry has a size or origin that is no number'
+                f'{arm.path}: link "{names[each.link]}": a size or origin in its collision geometry is not a number'
             )
     return Shapes(names, tuple(capsules), tuple(guessed))
 
 
 def _pieces(capsule: Capsule) -> list[Capsule]:
-    """Shorter capsules that together are the same: the part next to a joint may touch what the rest must not."""
+    """Split a capsule, because the piece next to a joint may touch a link that the other pieces must not touch."""
     length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))
     if not length < np.inf:
-        return [capsule]  # named later
+        return [capsule]  # rejected by `shapes_of`
     at = np.linspace(0.0, 1.0, max(2, int(np.ceil(length / LONGEST_PIECE)) + 1))
     points = capsule.ends[0] + at[:, None] * (capsule.ends[1] - capsule.ends[0])
     return [Capsule(capsule.link, np.stack(ends), capsule.radius) for ends in pairwise(points)]
 
 
 def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], bool]:
-    """Capsules around all that one moving link carries, and whether all its geometry could be read."""
+    """Capsules around everything fixed to one moving link, and whether all its geometry could be read."""
     found, is_whole = [], True
     for _, rotation, translation, element in here:
         if element is None:
@@ -92,7 +98,7 @@ def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Ca
 
 
 def _placed(arm: ArmDescription) -> list[Placed]:
-    """Every link of the file: which moving link carries it, its frame there, its element. Empty for other formats."""
+    """For each link of a URDF: the moving link it is fixed to, its frame and its element. Empty for other formats."""
     if b"<robot" not in arm.path.read_bytes():
         return []
     root = parse_urdf(arm.path)
@@ -117,7 +123,7 @@ def _placed(arm: ArmDescription) -> list[Placed]:
 
 
 def _geometry(link: ET.Element) -> Iterator[tuple[ET.Element, Array, Array]]:
-    """Shapes of a link's collision geometry, and their frames in its own; where it has none, of what is shown."""
+    """Shapes of a link's collision geometry (visual geometry if it has none) and their frames in the link's frame."""
     for element in link.findall("collision") or link.findall("visual"):
         for shape in element.find("geometry") or ():
             if isinstance(shape.tag, str):
@@ -125,7 +131,7 @@ def _geometry(link: ET.Element) -> Iterator[tuple[ET.Element, Array, Array]]:
 
 
 def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float]] | None:
-    """Ends (2, 3) and radius of capsules around a shape; None where it cannot be read."""
+    """Ends (2, 3) and radii of capsules that enclose a shape; None if the shape cannot be read."""
     if shape.tag == "sphere":
         return [(np.zeros((2, 3)), float(shape.get("radius", "nan")))]
     if shape.tag == "cylinder":
@@ -146,7 +152,7 @@ def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float
 
 
 def _of_cylinder(radius: float, length: float) -> tuple[Array, float]:
-    """A flat one is enclosed by a sphere, others by a capsule of the same axis."""
+    """A flat cylinder is enclosed by a sphere, any other by a capsule with the same axis."""
     half = 0.5 * length
     if half < 0.5 * radius:
         return np.zeros((2, 3)), float(np.hypot(radius, half))
@@ -154,7 +160,7 @@ def _of_cylinder(radius: float, length: float) -> tuple[Array, float]:
 
 
 def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
-    """A row of capsules along the longest edge, beside each other across the second."""
+    """Capsules parallel to the longest edge, side by side along the second-longest."""
     third, second, longest = np.argsort(size)
     strips = int(np.clip(np.round(size[second] / max(size[third], _NOTHING)), 1, MOST_STRIPS))
     width = size[second] / strips
@@ -170,7 +176,10 @@ def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
 
 
 def _from_joints(arm: ArmDescription, link: int, fixed: list[Array]) -> list[Capsule]:
-    """From the link's joint to the next one; of the last link to what is fixed to it, or twice as far as its centre."""
+    """A capsule from the link's joint to the next one.
+
+    The last link's ends at the farthest of the frames fixed to it and twice the distance of its centre of mass.
+    """
     if link < len(arm.joints):
         end = arm.joints[link].translation
     else:
@@ -193,6 +202,6 @@ def _origin(element: ET.Element) -> tuple[Array, Array]:
 
 
 def _numbers(text: str | None, count: int, default: float = float("nan")) -> list[float]:
-    """`count` numbers; the default where there is no text."""
+    """Parse `count` numbers: all defaults if there is no text, all NaN if their count differs."""
     found = [default] * count if text is None else [float(word) for word in text.split()]
     return found if len(found) == count else [float("nan")] * count

@@ -1,4 +1,4 @@
-"""An arm in space among what it must not touch: itself, the floor and the boxes of `[clearance]`."""
+"""A spatial arm and what it must not touch: itself, the floor and the boxes of `[clearance]`."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,22 +18,27 @@ from hil.errors import ConfigError
 Array = NDArray[np.float64]
 
 ALWAYS_SHARE = 0.75
-"""Of all poses: capsules with one link between them that are nearer than BUILT_NEAR in as many meet at its joints."""
+"""Two capsules with one link in between that are closer than BUILT_NEAR in at least this fraction of poses are taken to
+meet by construction."""
 
 ALWAYS_SHARE_OF_OTHERS = 0.98
 BUILT_NEAR = 0.02  # m beyond the margin
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
-"""m by which an arm on its way may come nearer than it lies at rest, where it lies hardly farther than the margin."""
+"""Distance [m] by which pairs may be closer on the way to or from the rest pose than they are in it, if that is less
+than the margin."""
 
 LYING_RAD = 0.12
-"""An arm that is so near its rest pose in every joint lies, which its owner says is safe."""
+"""An arm within this angle of its rest pose in every joint counts as at rest, which its owner declares safe."""
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """The tightest moment of a motion. distance [m] of what `pair` names; needed [m] there; sample: its index."""
+    """The sample of a motion with the least clearance.
+
+    distance: between the members of `pair` [m]. needed: required distance [m]. sample: its index.
+    """
 
     distance: float
     needed: float
@@ -42,7 +47,7 @@ class Nearest:
 
     @property
     def room(self) -> float:
-        """Distance beyond what is needed [m]; negative where it is too near."""
+        """Distance in excess of what is required [m]; negative if too close."""
         return self.distance - self.needed
 
     def __str__(self) -> str:
@@ -53,7 +58,7 @@ class Nearest:
 class Space:
     """Pairs of capsules that must keep apart, and by how much.
 
-    as_built: pairs of links of which some capsules are left out, since they touch in nearly every pose.
+    as_built: pairs of links with capsules that are not checked, because they touch in nearly every pose.
     """
 
     shapes: Shapes
@@ -63,31 +68,31 @@ class Space:
     rest: Array
     """The rest pose (joints,) [rad]."""
     at_rest: Array
-    """Distance of each pair in it (pairs,) [m]."""
+    """Distance of each pair in the rest pose (pairs,) [m]."""
     _pairs: NDArray[np.int64]
     _chain: tuple[Array, Array, Array]
     _arrays: tuple[NDArray[np.int64], Array, Array, Array, Array]
 
     @classmethod
     def of(cls, config: Config) -> "Space":
-        """Raises ConfigError, ArmFileError."""
+        """Build the space of a configured arm. Raises ConfigError, ArmFileError."""
         arm = described_arm(config)
         return _space(_Key(config, arm))
 
     def room(self, position: Array, on_the_way: bool = False) -> Array:
-        """Least distance beyond what is needed at each pose (samples,) [m] of a motion (joints, samples) [rad].
+        """Smallest excess over the required distance (samples,) [m] along a motion (joints, samples) [rad].
 
-        on_the_way: whether the motion leads from or to the rest pose, where the arm may lie nearer than the margin.
+        on_the_way: whether the motion leads from or to the rest pose, in which distances may be less than the margin.
         """
         return self._least(position, on_the_way)[0]
 
     def lies(self, position: Array) -> NDArray[np.bool_]:
-        """At which poses of a motion (joints, samples) [rad] the arm lies in its rest pose (samples,)."""
+        """Whether the arm is at rest in each pose (samples,) of a motion (joints, samples) [rad]."""
         near: NDArray[np.bool_] = np.abs(position.T - self.rest).max(axis=1) < LYING_RAD
         return near
 
     def nearest(self, position: Array, on_the_way: bool = False) -> Nearest:
-        """The tightest moment of a motion (joints, samples) [rad]."""
+        """Find the sample of a motion (joints, samples) [rad] with the least clearance."""
         room, worst = self._least(position, on_the_way)
         sample = int(np.argmin(room))
         if worst[sample] < 0:
@@ -96,7 +101,7 @@ class Space:
         return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
 
     def ends(self, position: Array) -> tuple[Array, Array]:
-        """Ends of all capsules in the base's frame (capsules, 2, 3) [m] in one pose (joints,), and their radii."""
+        """Ends of all capsules in the base frame (capsules, 2, 3) and their radii [m] at a pose (joints,) [rad]."""
         rotation, translation, axis = self._chain
         frames = [(np.eye(3), np.zeros(3))]
         for turn, shift, around, angle in zip(rotation, translation, axis, position, strict=True):
@@ -108,16 +113,16 @@ class Space:
 
     @property
     def floor(self) -> tuple[Array, float]:
-        """The floor's normal in the base's frame (3,) and its height [m]; -inf where there is none."""
+        """The floor's normal in the base frame (3,) and its height [m], -inf if there is no floor."""
         return self._arrays[3][:3], float(self._arrays[3][3])
 
     @property
     def links(self) -> NDArray[np.int64]:
-        """Which link each capsule belongs to, 0 the base's (capsules,)."""
+        """Index of the link each capsule belongs to (capsules,); 0 is the base."""
         return self._arrays[0]
 
     def names_of(self, pair: int) -> tuple[str, str]:
-        """What a pair is made of, in words."""
+        """Names of the two members of a pair."""
         link = self._arrays[0]
         first, second = self._pairs[pair]
         return self.shapes.names[link[first]], self._partner(int(second))
@@ -142,7 +147,7 @@ class Space:
 
 
 class _Key:
-    """A configuration and its description, the same as another with the same geometry and limits."""
+    """Cache key: equal for configurations with the same description, clearance, base, rest pose and limits."""
 
     def __init__(self, config: Config, arm: ArmDescription) -> None:
         self.config, self.arm = config, arm
@@ -190,7 +195,10 @@ def _space(key: _Key) -> Space:
 
 
 def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:
-    """Capsules of links that are no neighbours; with the floor those beyond the first link, which is on the base."""
+    """Pairs to check: capsules of non-adjacent links, capsules and boxes, and capsules and the floor.
+
+    The base and the first link, which is mounted on it, are not checked against the floor.
+    """
     count = len(shapes.capsules)
     found = [(a, b) for a in range(count) for b in range(a + 1, count) if abs(link[a] - link[b]) > 1]
     found += [(a, FLOOR) for a in range(count) if link[a] > 1 and has_floor]
@@ -200,7 +208,7 @@ def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool)
 def _touch_as_built(
     config: Config, chain: object, arrays: tuple[Any, ...], pairs: NDArray[np.int64], margin: float
 ) -> NDArray[np.bool_]:
-    """Of which pairs the capsules are near in nearly every pose within the limits (pairs,)."""
+    """Whether the capsules of each pair (pairs,) are close to each other in nearly every pose within the limits."""
     link = arrays[0]
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     poses = np.random.default_rng(1).uniform(low, high, (RANDOM_POSES, len(low)))
@@ -219,7 +227,7 @@ def _ignored(config: Config, names: tuple[str, ...]) -> set[frozenset[str]]:
         for name in pair:
             if name not in names:
                 raise ConfigError(
-                    f"{config.path}: clearance.ignore: there is no {name!r}; there are {', '.join(names)}."
+                    f"{config.path}: clearance.ignore: unknown name {name!r}; known names are {', '.join(names)}."
                 )
     return {frozenset(pair) for pair in config.clearance.ignore}
 

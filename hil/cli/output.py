@@ -28,5 +28,5 @@ def readable_output() -> Iterator[None]:
 
 
 def _drop_output() -> None:
-    """What is still buffered goes nowhere, or Python would try again while it ends and complain."""
+    """Discard buffered output; otherwise Python would try to write it again at exit and report an error."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

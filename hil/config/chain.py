@@ -29,14 +29,14 @@ def described_arm(config: "Config") -> ArmDescription:
 
 
 def base_gravity(config: "Config") -> NDArray[np.float64]:
-    """In the base's frame (3,) [m/s^2]."""
+    """Gravity in the base frame (3,) [m/s^2]."""
     down = np.array([0.0, 0.0, -config.arm.gravity])
     turned: NDArray[np.float64] = rotation_of(*config.arm.base).T @ down
     return turned
 
 
 def describes_planar(config: "Config") -> bool:
-    """Whether the arm of `[arm] urdf` is a planar one; False where the file cannot be read."""
+    """Whether the arm of `[arm] urdf` is a planar one; False if the file cannot be read."""
     try:
         return is_planar(described_arm(config), base_gravity(config))
     except ArmFileError:

@@ -1,4 +1,4 @@
-"""`[clearance]`: what an arm in space must not touch, and how near it may come."""
+"""`[clearance]`: what a spatial arm must not touch, and the required distance."""
 
 from typing import Annotated, Literal
 

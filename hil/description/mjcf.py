@@ -69,12 +69,12 @@ class _Tree:
     path: Path
 
     def name(self, body: int) -> str:
-        """Of a body; its number where it has none."""
+        """Name of a body, or its number if it has none."""
         return str(self.model.body(body).name) or f"body {body}"
 
     @property
     def hinges(self) -> list[str]:
-        """All of them, in MuJoCo's order, which is from the base outwards."""
+        """Names of all hinge joints in MuJoCo's order, i.e. from the base outwards."""
         return [str(self.model.joint(j).name) for j in range(self.model.njnt) if self.model.jnt_type[j] == HINGE]
 
     def branch(self, names: list[str]) -> list[int]:

@@ -1,6 +1,6 @@
-"""The experiment of an arm in space simulated on arms that could be it: peaks against limits, and clearance.
+"""Simulation of a spatial arm's experiment on an ensemble of possible arms: peaks versus limits, and clearance.
 
-Each arm plays the whole of every path: from the rest pose, in which it lies, there, two periods, back.
+Each arm plays every path in full: the transition from the rest pose, two periods, and the transition back.
 """
 
 from collections.abc import Callable
@@ -26,15 +26,16 @@ LOOKED_AT_HZ = 100.0
 """Rate at which the clearance of a motion is computed [Hz]."""
 
 RAN_AWAY = 1e3
-"""Times its limit, which stands for the peaks of an arm that runs away."""
+"""Peak of an arm whose simulation diverges, as a multiple of the limit."""
 
 
 @dataclass(frozen=True)
 class ChainPrediction:
-    """peaks: as of a planar arm. nearest: the tightest moment of all arms, at `moment` [s] of the segment of `role`.
+    """Prediction of a spatial arm's experiment.
 
-    distances: of each arm the least room beyond the margin (arms,) [m]. tracking: how far typical arms are from the
-    wanted path (joints,) [rad].
+    peaks: as for a planar arm. nearest: least clearance of all arms, at `moment` [s] of the segment `role`. rooms: each
+    arm's least clearance minus the required one (arms,) [m]. tracking: median of the arms' largest tracking errors
+    (joints,) [rad].
     """
 
     peaks: Prediction
@@ -46,7 +47,7 @@ class ChainPrediction:
 
     @property
     def is_clear(self) -> bool:
-        """Whether every arm keeps clear."""
+        """Whether every arm keeps the required clearance."""
         return bool((self.rooms >= 0.0).all())
 
     def __str__(self) -> str:
@@ -57,8 +58,10 @@ class ChainPrediction:
 def predict_chain(
     config: Config, plan: Plan, arms: ChainArms, tell: Tell | None = None, shown: int = 0
 ) -> ChainPrediction:
-    """Play `plan` on every arm. tell: called with the number of arms simulated and that of all. Raises ArmFileError,
-    ConfigError."""
+    """Simulate `plan` on every arm. Raises ArmFileError, ConfigError.
+
+    tell: called with the number of simulations done and their total. shown: number of motions to store.
+    """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
     values = np.zeros((arms.size, *limits.shape))
@@ -104,7 +107,7 @@ def predict_chain(
 
 
 def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:
-    """What the software does while a segment is played."""
+    """Commands and feedback of the control loop while a segment is played."""
     assert config.stabiliser is not None  # checked with the configuration
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     goals = np.concatenate((segment.ramp_in, *[segment.period_current] * PERIODS, segment.ramp_out))
@@ -142,9 +145,11 @@ def _centre(plan: Plan) -> Array:
 
 
 def _shares(values: Array, limits: Array, rest: Array, centre: Array) -> Array:
-    """Peaks as fractions of the distance to their limits, from rest or the path's centre, whichever is nearer them.
+    """Peaks as fractions of the distance to their limits.
 
-    An arm may well rest close to a limit, where a fraction of what is left would say little."""
+    Distances to position limits start at the rest pose or the path's centre, whichever is farther from the limit: an
+    arm may rest close to a limit, which would make the fraction meaningless.
+    """
     shares = np.abs(values / limits)
     low, high = np.minimum(rest, centre), np.maximum(rest, centre)
     shares[:, 0] = (high - values[:, 0]) / (high - limits[0])
@@ -153,7 +158,7 @@ def _shares(values: Array, limits: Array, rest: Array, centre: Array) -> Array:
 
 
 def _nearest(space: Space, position: Array, ways: int, rate: float) -> tuple[Nearest, float]:
-    """The tightest moment of a motion with ways of so many samples, and when it is [s]."""
+    """Least clearance of a motion, and its time [s]. ways: samples of the transition at either end."""
     every = max(1, round(rate / LOOKED_AT_HZ))
     count = position.shape[1]
     parts = (slice(0, ways, every), slice(ways, count - ways, every), slice(count - ways, count, every))

@@ -1,7 +1,7 @@
-"""Arms in space that could be the one on the bench, before anything was identified.
+"""Prior ensemble of spatial arms, before anything was identified.
 
-Each link's mass, centre and inertia are drawn about what its description says, friction and rotors about what its
-servos usually have. `[arm.prior] spread` says how far a description's masses may be off.
+Each link's mass, centre of mass and inertia are drawn around its description, friction and rotor inertia around typical
+values of its servos. `[arm.prior] spread` is the relative standard deviation of the described masses.
 """
 
 import numpy as np
@@ -21,11 +21,11 @@ INERTIA_SPREAD = 0.3
 OFFSET_PER_COULOMB = 0.1
 GEAR_EFFICIENCY, GENERATED_SPREAD = 0.6, 0.25
 COULOMB_WIDTH = 0.05  # rad/s
-LEAST_INERTIA = 0.2  # of a link's inertia about its centre: no draw makes it a point
+LEAST_INERTIA = 0.2  # smallest factor on a link's central inertia, so that no draw makes it a point mass
 
 
 def prior_arms(config: Config, known: KnownChain, count: int, seed: int = 0) -> ChainArms:
-    """`count` arms; the first is the described one."""
+    """Draw `count` arms; the first is the described one."""
     random = np.random.default_rng((seed, 16))
     given = config.arm.prior or PriorConfig()
     n = len(config.joints)
@@ -46,7 +46,7 @@ def prior_arms(config: Config, known: KnownChain, count: int, seed: int = 0) -> 
 
 
 def _links(random: np.random.Generator, described: Array, count: int, spread: float) -> Array:
-    """Inertial parameters (count, joints, 10) of links that have some distribution of mass."""
+    """Draw physically consistent inertial parameters of the links (count, joints, 10)."""
     n = len(described)
     drawn = np.empty((count, n, TERMS - 1))
     for joint, row in enumerate(described):
@@ -66,7 +66,10 @@ def _links(random: np.random.Generator, described: Array, count: int, spread: fl
 
 
 def _drives(config: Config, given: PriorConfig) -> dict[str, tuple[Array, Array]]:
-    """Medians and relative spreads of friction, lag and rotors; two servos on one joint have twice of it."""
+    """Medians and relative spreads of friction, lag and armature.
+
+    Friction and armature are multiplied by the number of servos on the joint.
+    """
     priors = [servo_prior(joint.joint.servo) for joint in config.joints]
     servos = np.array([len(joint.ids) for joint in config.joints], dtype=np.float64)
     emf = np.array([joint.joint.servo.torque_per_ampere.value / GEAR_EFFICIENCY for joint in config.joints])
@@ -87,7 +90,7 @@ def _drives(config: Config, given: PriorConfig) -> dict[str, tuple[Array, Array]
 
 
 def _log_normal(random: np.random.Generator, median: Array, spread: Array, count: int) -> Array:
-    """Draws (count, ...), the first of them the median."""
+    """Log-normal draws (count, ...); the first is the median."""
     normal = random.standard_normal((count, median.size))
     normal[0] = 0.0
     drawn: Array = median * np.exp(np.sqrt(np.log1p(spread**2)) * normal)

@@ -1,7 +1,7 @@
-"""What a stop does to an arm in space: lowered where its servos still take commands, fallen where they do not.
+"""Simulated stops of a spatial arm: lowered if its servos still accept commands, falling if they do not.
 
-From moments all along the planned motion, on arms of the ensemble: the way home as the stream would command it, and the
-fall without torque, up to the first thing that is hit.
+Stops are simulated from times spread over the planned path, on arms of the ensemble: the way home as the stream would
+command it, and the fall without torque until the first collision.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,16 @@ Array = NDArray[np.float64]
 
 MOMENTS, ARMS = 16, 6
 FALL_S = 1.5
-HARDLY = 0.05  # rad: an arm that ends so near its rest pose lies
+HARDLY = 0.05  # rad: an arm that ends within this angle of its rest pose has reached it
 
 
 @dataclass(frozen=True)
 class Fall:
-    """The hardest fall: from which moment [s] of the path, what meets what (None: nothing within FALL_S), after how
-    long [s], how far down [m] and how fast [m/s]; beyond: how far joints get past their limits in any fall (joints,)
-    [rad].
+    """The hardest fall.
+
+    moment: start, as a time in the path [s]. hits: names of what collides; None if nothing does within FALL_S. seconds:
+    duration [s]. height: largest descent [m]. speed: largest speed at its end [m/s]. beyond: largest overshoot of each
+    joint beyond its limits in any fall (joints,) [rad].
     """
 
     moment: float
@@ -41,7 +43,10 @@ class Fall:
 
 @dataclass(frozen=True)
 class LoweringForeseen:
-    """seconds: the longest; nearest: the tightest moment; lies: share that ends in the rest pose."""
+    """Predicted lowering.
+
+    seconds: longest duration [s]. nearest: least clearance. lies: fraction of simulations that end in the rest pose.
+    """
 
     seconds: float
     nearest: Nearest
@@ -50,14 +55,14 @@ class LoweringForeseen:
 
 @dataclass(frozen=True)
 class ChainStops:
-    """Both, from the moments of a plan."""
+    """The hardest fall and the lowering, over all simulated stops of a plan."""
 
     fall: Fall
     lowering: LoweringForeseen
 
 
 def foreseen_stops(config: Config, plan: Plan, arms: ChainArms) -> ChainStops:
-    """Simulate stops from all along the first path. Raises ConfigError, ArmFileError."""
+    """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError."""
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)
     few = arms.first(ARMS)
@@ -95,7 +100,7 @@ def _hardest(config: Config, rate: float, arms: ChainArms, starts: list[tuple[fl
 
 
 def _dropped(space: Space, first: Array, before: Array, last: Array, rate: float) -> tuple[float, float]:
-    """How far down the arm's lowest falling point came [m], and how fast its fastest point is [m/s]."""
+    """Largest descent of any point of the arm [m], and the speed of its fastest point [m/s]."""
     up, _ = space.floor
     top, former, bottom = (space.ends(pose)[0] for pose in (first, before, last))
     if not top.size:

@@ -1,4 +1,4 @@
-"""A dry run of an arm in space in words and numbers."""
+"""Result of a spatial arm's dry run as table, text and JSON."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,10 +17,11 @@ from hil.dry_run.summary import joints_json
 
 @dataclass(frozen=True)
 class ChainDryRun:
-    """share: of the designed path, 1 where [joint_path] gives it. config: with path and stabiliser as they would be
-    played.
+    """A dry run of a spatial arm.
 
-    shapes_guessed: links without readable geometry; as_built: pairs of which parts are taken to touch as built.
+    config: with path and stabiliser as they would be played. share: fraction of the designed path's amplitude; 1 if
+    [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
+    that touch by construction and are not checked.
     """
 
     config: Config
@@ -35,37 +36,37 @@ class ChainDryRun:
 
     @property
     def prediction(self) -> Prediction:
-        """The peaks."""
+        """Predicted peaks."""
         return self.foreseen.peaks
 
     @property
     def peak_torque(self) -> tuple[float, ...]:
-        """Largest torque of each joint in the middle arm [N m]."""
+        """Median over the arms of each joint's largest torque [N m]."""
         return tuple(float(value) for value in self.prediction.median[QUANTITIES.index("torque")])
 
     def is_safe(self, config: Config) -> bool:
-        """Whether no arm comes too near anything and the guard would hardly ever stop it."""
+        """Whether every arm keeps its clearance and the guard is unlikely to stop it."""
         return not unsafe(config, self.foreseen)
 
 
 def unsafe(config: Config, foreseen: ChainPrediction) -> str:
-    """Why a motion is not safe; nothing where it is."""
+    """Explain why a motion is not safe; empty if it is."""
     peaks = foreseen.peaks
     if not foreseen.is_clear:
-        return f"too near, {foreseen}"
+        return f"too little clearance, {foreseen}"
     touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
     chance = peaks.limit_chance[:GUARDED]
     if touched.any() or peaks.stop_chance > config.safety.limit_chance:
         row, joint = np.unravel_index(int(np.argmax(touched + chance)), chance.shape)
         return (
             f"joint {config.joints[int(joint)].name!r} reaches {QUANTITIES[int(row)]} "
-            f"{peaks.quantile[row, joint]:.3g} of {peaks.limits[row, joint]:.3g} in 1 of 100 arms"
+            f"{peaks.quantile[row, joint]:.3g} (limit {peaks.limits[row, joint]:.3g}) in 1 of 100 arms"
         )
     return ""
 
 
 def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
-    """One object: verdict, clearance, stops, and per joint every predicted quantity."""
+    """Form the JSON object: verdict, clearance, stops, and every predicted quantity per joint."""
     config, peaks, fall, lowering = run.config, run.prediction, run.stops.fall, run.stops.lowering
     return {
         "schema": 1,
@@ -106,7 +107,7 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
 
 
 def print_chain_dry_run(run: ChainDryRun, console: Console) -> None:
-    """Table and verdict for a person."""
+    """Print the table and the verdict."""
     console.print(_table(run))
     for line in (*run.servos, *_lines(run)):
         console.print(line, soft_wrap=True, markup=False)
@@ -133,23 +134,24 @@ def _table(run: ChainDryRun) -> Table:
 
 def _lines(run: ChainDryRun) -> list[str]:
     fall, lowering, why = run.stops.fall, run.stops.lowering, unsafe(run.config, run.foreseen)
-    hit = "nothing within 1.5 s" if fall.hits is None else f"{fall.hits[0]} meets {fall.hits[1]}"
+    hit = "nothing within 1.5 s" if fall.hits is None else f"{fall.hits[0]} hits {fall.hits[1]}"
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
         f"Least clearance: {run.foreseen}.",
         f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated arms "
-        f"then lie in the rest pose; least clearance on the way: {lowering.nearest}.",
-        f"Without commands (cable out, program killed, a servo lost) it falls; hardest from {fall.moment:.1f} "
-        f"s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, at {fall.speed:.1f} m/s.",
+        f"reach the rest pose; least clearance on the way: {lowering.nearest}.",
+        f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, from "
+        f"{fall.moment:.1f} s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
+        f"at {fall.speed:.1f} m/s.",
     ]
     if run.shapes_guessed:
         lines.append(
-            f"No collision geometry could be read of {', '.join(run.shapes_guessed)}: capsules from joint to joint "
-            "stand for it (for a base, nothing)."
+            f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: replaced by capsules from joint "
+            "to joint (a base: by nothing)."
         )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
-        lines.append(f"Parts that meet at joints in nearly every pose are taken to be built so: {pairs}.")
+        lines.append(f"Not checked, because parts of these links touch in nearly every pose, by construction: {pairs}.")
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which this shows.")
     return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

@@ -166,7 +166,7 @@ def predict(
 def _peaks(
     arms: ManyArms, commands: Sequence[Commands], rate: float, settling: SettlingRule, executor: Executor | None
 ) -> tuple[Array, NDArray[np.int64]]:
-    """`ManyArms.peaks`, by the executor where there is one: each arm is simulated for itself."""
+    """`ManyArms.peaks`, distributed over the executor if there is one; arms are simulated independently."""
     if executor is None:
         return arms.peaks(commands, rate, settling)
     parts = [arms.part(first, first + _ARMS_A_TASK) for first in range(0, len(arms.physics), _ARMS_A_TASK)]

@@ -123,7 +123,7 @@ def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quan
 
 
 def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
-    """Names of the joints whose motion (joints, samples) [rad] says nothing of them."""
+    """Names of the joints that move too little to be identified. position: (joints, samples) [rad]."""
     reach = np.ptp(np.where(np.isnan(position), np.nanmean(position, axis=1, keepdims=True), position), axis=1)
     return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
 

@@ -9,19 +9,19 @@ from collections.abc import Sequence
 from math import isnan
 
 ALLOWED_RAD = 0.1
-"""For play in two gear trains, encoders that are not linear, and a joint that is twisted between its servos."""
+"""Tolerance for backlash of two gear trains, encoder nonlinearity, and twist of the joint between its servos."""
 
 
 class Apart:
-    """Compares the further servos of each joint with its first one."""
+    """Compares the other servos of each joint with its first one."""
 
     def __init__(self) -> None:
         self._first: dict[tuple[int, int], float] = {}
 
     def look(self, apart: Sequence[Sequence[float]]) -> tuple[int, int, float] | None:
-        """Process a sample; return joint and further servo (both from 0) and change [rad] if they no longer agree.
+        """Process a sample; return joint, additional servo (both from 0) and change [rad] if they no longer agree.
 
-        apart: angles of each joint's further servos minus the first's [rad], NaN if one did not reply.
+        apart: angles of each joint's other servos minus the first's [rad], NaN if one did not reply.
         """
         for joint, differences in enumerate(apart):
             for servo, difference in enumerate(differences):

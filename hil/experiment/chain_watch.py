@@ -1,7 +1,7 @@
-"""The dry run's model beside the experiment of an arm in space: could any arm of the ensemble have moved like this?
+"""Check during the experiment that a spatial arm's motion is consistent with some arm of the dry run's ensemble.
 
-Prior knowledge is the ensemble's mean and widened covariance: drawn about the description, or what the steps of a pilot
-left of it. While the arm lies in its rest pose, something else may carry it, and nothing is judged.
+Prior knowledge is the ensemble's mean and widened covariance. The ensemble is drawn around the description, and updated
+after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
 """
 
 from collections.abc import Sequence
@@ -21,25 +21,29 @@ Array = NDArray[np.float64]
 
 ARMS = 96
 WIDENED = 1.5
-"""Times the ensemble's standard deviations: what its arms lack is none of their parameters."""
+"""Factor on the ensemble's standard deviations, for effects that its model does not include."""
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
-"""Times the mean dry friction: a planned torque below is taken for as much, so that no less than twice the friction is
-an alarm."""
+"""Smallest torque scale, in multiples of the mean dry friction, so that less than twice the friction causes no alarm.
+"""
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 
 
 class ChainWatch:
-    """Looks at every sample; raises SafetyStop. planned: largest goal of each joint [A, or V under PWM]."""
+    """Checks every sample against the model.
+
+    planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
+    configuration.
+    """
 
     def __init__(self, config: Config, planned: Sequence[float], arms: ChainArms | None = None) -> None:
         arms = prior_arms(config, known_chain(config), ARMS) if arms is None else arms
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         mean, covariance = observed_parameters(arms)
         n = len(self._constants)
-        # A light joint's torque is hardly more than dry friction, whose behaviour near standstill is not in the model.
+        # A light joint's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         largest = np.maximum(self._constants * np.array(planned), _FRICTIONS * mean[len(mean) - 2 * n : len(mean) - n])
         self._observer = ChainObserver(arms.base, mean, covariance, largest, 1.0 / config.experiment.rate)
         self._names = [joint.joint.title for joint in config.joints]
@@ -48,7 +52,7 @@ class ChainWatch:
         self._seen_at = 0.0
 
     def look(self, state: State) -> None:
-        """Process the latest sample; raises SafetyStop if no arm in the ensemble could have moved like this."""
+        """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
         if any(state.missing):
             return
         goal, self._goal = self._goal, state.goal_current
@@ -67,21 +71,20 @@ class ChainWatch:
         name = self._names[joint]
         if abs(state.velocity[joint]) < _STILL_RAD_S:
             said = (
-                f"{name} stands still although {abs(lacking):.3f} N m drive it, which would move any arm consistent "
-                "with the prior and the data so far. Something holds it, it is stuck, or its encoder is frozen."
+                f"{name} stands still although a torque of {abs(lacking):.3f} N m drives it, which would move any arm "
+                "consistent with the prior and the data so far. Something blocks it, or its encoder is frozen."
             )
         else:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
-                f"{lacking:+.3f} N m of the commanded torque do not show in its motion. Its motor or its "
+                f"{lacking:+.3f} N m of the commanded torque are not reflected in its motion. Its motor or its "
                 "encoder has failed, something pushes or holds it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
 
 
 def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
-    """Mean and covariance of an ensemble's base parameters, viscous and dry friction and offsets, in units of the
-    commanded torque, widened."""
+    """Mean and widened covariance of an ensemble's `linear_parameters`, in units of the commanded torque."""
     drawn = linear_parameters(arms)
     mean = drawn.mean(axis=0)
     covariance = WIDENED**2 * np.cov(drawn.T) + np.diag((_RELATIVE_STD * mean) ** 2 + 1e-12)
@@ -93,10 +96,10 @@ def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
 
 
 def linear_parameters(arms: ChainArms) -> Array:
-    """Of each arm the base parameters, viscous and dry friction, offsets (arms, base + 3 joints) per commanded torque.
+    """Base parameters, viscous and dry friction, and offsets of each arm (arms, base + 3 * joints).
 
-    Torque constants that are all off alike scale everything. Where joints differ, a base parameter, which several
-    joints feel, is taken by the first of them.
+    They are divided by the torque scale, i.e. in units of the commanded torque. If the scales of the joints differ, a
+    base parameter that affects several joints is divided by that of the first one.
     """
     scale = arms.drive[:, 4]
     owner = np.array([int(name.rpartition("_")[2]) - 1 for name in arms.base.names])

@@ -8,7 +8,7 @@ velocity must equal the change in position. The difference,
 is tracked with an exponential memory of `MEMORY_S`. Rounding and encoder noise do not accumulate in it, and a velocity
 that lags by tau, because the servo filters it, contributes at most tau times the change of velocity. The tolerance
 allows for a lag of `LAG_S`, a scale error of `SCALE` and the interval between samples. Once the joint has moved fast
-for `LEARNT_S`, it allows for twice the lag seen so far and `MORE_LAG_S`, if that is less: a lag does not grow.
+for `LEARNT_S`, it allows for only twice the largest lag observed so far plus `MORE_LAG_S`: a lag does not grow.
 """
 
 MEMORY_S = 0.3
@@ -16,7 +16,7 @@ LAG_S = 0.03
 LEARNT_S = 1.5
 MORE_LAG_S = 0.008
 _FAST_RAD_S = 2.0
-"""Range of velocities within the memory from which on it shows how large the lag is."""
+"""Smallest range of velocities within the memory from which the lag can be estimated [rad/s]."""
 
 SCALE = 0.06
 UNSURE_RAD = 0.02

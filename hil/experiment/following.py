@@ -8,7 +8,7 @@ Two hypotheses are compared on every sample, sequentially (E. S. Page, "Continuo
 (1954) 100): the current is the one commanded, or it is zero. Their log likelihood ratio, for errors of standard
 deviation sigma, grows by
 
-    (distance from the commanded current)^2 - (distance from zero)^2, over 2 sigma^2
+    [(distance from the commanded current)^2 - (distance from zero)^2] / (2 sigma^2)
 
 per sample. The step is bounded so that no single reply decides, and the sum is kept at or above zero. Each sample is
 weighted by the time that it represents. The commanded current is any value between the last two goals,
@@ -23,7 +23,7 @@ SIGMA_SHARE = 0.1
 """Standard deviation of ordinary sensor and current-loop errors, relative to the planned peak."""
 
 SIGMA_TICKS = 4.0
-"""The same in register ticks; applies if the planned peak is small."""
+"""The same in register ticks; used if it is larger than that of SIGMA_SHARE."""
 
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it is taken for zero [s]."""

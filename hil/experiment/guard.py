@@ -32,10 +32,10 @@ EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while resting before the start [rad]."""
 
 FARTHER_OUT_RAD = 0.01
-"""How much farther out a joint may move that a run before this one left beyond its limit."""
+"""How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
 
 MOST_OUTSIDE_RAD = 0.15
-"""How far beyond its limit a joint may be found that a run before this one left there [rad]."""
+"""How far beyond its limit a joint may start if an earlier run left it there [rad]."""
 
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""

@@ -1,8 +1,8 @@
-"""A stop of an arm that cannot hang: brake, then lower it to its rest pose, while its servos still take commands.
+"""Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
-Feed-forward of what is thought of the arm, with the stabiliser's spring and damper around the way home. It is watched
-like the experiment: a reply missing, an alert, a current that does not follow or a joint that leaves the way end it,
-and torque is cut.
+The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the way
+home. Lowering is monitored like the experiment: a missing reply, an alert, a current that does not follow its goal or a
+joint that leaves the way ends it, and torque is cut.
 """
 
 import numpy as np
@@ -17,12 +17,12 @@ from hil.plan.plan import Plan
 from hil.plan.way_home import WayHome
 
 LEAVES_RAD = 0.35
-"""Off its way: a joint that is farther away does not follow it."""
+"""Largest accepted tracking error: a joint with a larger one does not follow its way home."""
 
 LYING_RAD = 0.06
-"""From the rest pose: an arm that is nearer lies already."""
+"""An arm within this angle of its rest pose in every joint is already at rest."""
 
-_ROOM_RAD = 0.2  # beyond position limits and the pose in which it was stopped
+_ROOM_RAD = 0.2  # beyond the position limits and the way home
 _FASTER = 1.3
 
 
@@ -34,7 +34,7 @@ def may_lower(config: Config, error: BaseException) -> bool:
 
 
 class Lowering:
-    """Goals on the way home. Made before torque is on; `begin` when a stop comes."""
+    """Computes the goals on the way home. Created before torque is switched on; call `begin` when a stop occurs."""
 
     def __init__(self, config: Config, plan: Plan) -> None:
         segment = plan.segments[0]
@@ -47,15 +47,15 @@ class Lowering:
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         self._fade = max(1, round(SETTLE_IN * plan.rate))
         self._rest = np.array(config.arm.rest_pose)
-        self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compiled
+        self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compile in advance
 
     def lies(self, state: State) -> bool:
-        """Whether the arm already lies in its rest pose."""
+        """Whether the arm is already at rest in its rest pose."""
         away = np.abs(np.array(state.position) - self._rest)
         return bool(away.max() < LYING_RAD)
 
     def begin(self, state: State, goal: list[float]) -> int:
-        """From this sample, the last goals being `goal` [A or V]. Returns how many samples it takes."""
+        """Start lowering from this sample; return the number of samples it takes. goal: latest goals [A or V]."""
         position, velocity = np.array(state.position), np.array(state.velocity)
         self._path = self._way.path(position, velocity)
         torque = self._thought.of(self._path)
@@ -68,13 +68,13 @@ class Lowering:
         return int(count)
 
     def goals(self, index: int, state: State) -> list[float]:
-        """Goals [A or V] of one sample, from the state before; raises SafetyStop."""
+        """Goals [A or V] of one sample, from the previous sample's state. Raises SafetyStop."""
         ahead = self._position[index] - np.array(state.position), self._velocity[index] - np.array(state.velocity)
         held = np.where(np.array(state.missing), 0.0, self._stiffness * ahead[0] + self._damping * ahead[1])
         return self._guard.clamp(((self._feed[index] + held) / self._constants).tolist())
 
     def look(self, index: int, state: State, gap: float) -> None:
-        """Raise SafetyStop where the arm does not follow its way, or anything is wrong with a servo."""
+        """Process a sample. Raises SafetyStop if the arm leaves its way home or a servo is faulty."""
         self._guard.look(state, gap)
         away = np.abs(self._position[index] - np.array(state.position))
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:
@@ -82,12 +82,12 @@ class Lowering:
             raise SafetyStop(f"{joint.title} is {np.nanmax(away):.2f} rad off its way down.", Cause.UNEXPECTED)
 
     def late(self, seconds: float) -> None:
-        """A deadline passed; raises SafetyStop after too long a time."""
+        """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._guard.late(seconds)
 
 
 def _guard_of(config: Config, position: np.ndarray, velocity: np.ndarray) -> Guard:
-    """A guard that allows for where and how fast the arm was when it was stopped, and for no more than that."""
+    """A guard whose limits are widened just enough for the arm's position and velocity when it was stopped."""
     fastest = max(_FASTER * float(np.abs(velocity).max()), 2.0 * config.safety.lower_speed) + 0.5
     joints = [
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))

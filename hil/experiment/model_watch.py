@@ -63,7 +63,7 @@ class ModelWatch:
             return
         goal, self._goal = self._goal, state.goal_current
         seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
-        # When in a long exchange the servos measured is not known: the motion up to there tells nothing.
+        # During a long exchange the time of the measurement is unknown, so the motion up to it is not judged.
         took = state.time_after_read - state.time_before_write
         self._shortest = min(self._shortest, took)
         if goal is None or took - self._shortest > self._long:

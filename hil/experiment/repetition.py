@@ -1,11 +1,11 @@
-"""Comparison of successive periods while they are played, which avoids a burst of work at the end of a period.
+"""Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
-The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated sample by sample: at the end
-of a period only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
+The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated while the period is played:
+at its end only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
 
-The same torque must give the same motion. From the third period on each sample is also compared with the same sample of
-the period before: a joint that is farther from it than `TIMES` the RMS difference of the two periods before, for
-`LASTING_S`, does not repeat its motion (`unlike`).
+The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
+sample of the previous period. If they differ by more than `TIMES` the RMS difference between the two previous periods,
+plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`).
 """
 
 from array import array
@@ -16,10 +16,10 @@ _EMPTY = float("nan")
 
 TIMES = 10.0
 FLOOR_RAD = 0.05
-"""Deviation from the previous period that is always accepted: stiction may end a little earlier or later."""
+"""Deviation from the previous period that is always accepted, because stiction may end slightly earlier or later."""
 
 LASTING_S = 0.03
-_FEWEST = 2  # samples, however slow the rate
+_FEWEST = 2  # samples, however low the rate
 
 
 class Repetition:
@@ -36,7 +36,7 @@ class Repetition:
         self.begin(samples, anew=True)
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
-        """Start a new period of `samples` samples. anew: its torque is not that of the period before.
+        """Start a new period of `samples` samples. anew: whether its torque differs from the previous period's.
 
         The buffer is not cleared, which would take too long between two samples.
         """

@@ -76,7 +76,7 @@ def run_experiment(
             log.note(clock.now(), what)
 
         if config.is_chain and not config.is_fake:
-            note("experiments on real arms in space are not tested on hardware yet: keep a hand on the supply's switch")
+            note("spatial arms have not been tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
         if has_moved():

@@ -106,8 +106,7 @@ class StatusCheck:
                 return None
             return Cause.STALE, (
                 f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
-                "are delayed in transit, or it was rebooted. Check the adapter, its latency and its "
-                "cable."
+                "are delayed in transit, or it was rebooted. Check the adapter, its latency and its cable."
             )
         least = offset if ahead < drifted else behind + drifted
         self._clock[joint] = least, now, readings + 1, 0

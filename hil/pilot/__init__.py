@@ -6,7 +6,7 @@ steps    one run: predicted and measured peaks
 search   from the first careful run to a run at the limits
 full     the run at the limits and its estimate
 
-Of an arm in space: chain_belief, chain_paths and chain_search.
+For spatial arms: chain_belief, chain_paths and chain_search.
 """
 
 from hil.pilot.full import identify_in_steps

@@ -1,8 +1,8 @@
-"""Arms in space that could be the real one, and what a run teaches of them.
+"""Ensemble of spatial arms that may equal the real one, and its update with the recording of a run.
 
-Torque is linear in base parameters and friction, so each arm is moved by a randomised maximum a posteriori step (Y.
-Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1): as if it were the prior's mean and the recording had other
-noise. What a motion says nothing of keeps its spread.
+Torque is linear in base parameters and friction, so each arm is updated by one randomised maximum a posteriori step (Y.
+Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1), with itself as the prior mean and independent noise added to
+the recording. Parameters that a motion does not excite keep their spread.
 """
 
 from dataclasses import dataclass
@@ -21,19 +21,19 @@ from hil.runs.recording import Phase
 Array = NDArray[np.float64]
 
 DRAWN = 400
-TAUGHT_HZ = 25.0  # rows a second that a recording is worth
+TAUGHT_HZ = 25.0  # rows of the regression per second of recording
 FREQUENCY, DAMPING_RATIO = 3.0, 0.7
-"""Of each joint on the stabiliser's spring [Hz]."""
+"""Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring."""
 
 MOST_DAMPING = 0.2
-"""Of a joint's velocity, with the others free: the most that the damper takes away in a sample."""
+"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free."""
 
 _CUT_OFF_TIMES = 6.0  # times the path's highest frequency
 _WIDTH = 0.05  # rad/s
 _LYING_RAD = 0.08
 _NOISE_TIMES = 2.0  # residuals are not white
-_LEAST_NOISE_SHARE = 0.005  # of a joint's largest torque
-_MODEL_SPREAD = 0.01  # of every parameter: what the model lacks
+_LEAST_NOISE_SHARE = 0.005  # smallest noise, relative to a joint's largest torque
+_MODEL_SPREAD = 0.01  # of each parameter, for effects that the model does not include
 _RIDGE = 1e-4
 _FEWEST_ROWS = 50
 _LEAST_FRICTION_SHARE = 1e-4
@@ -44,31 +44,31 @@ _HALVINGS = 6
 
 @dataclass(frozen=True)
 class ChainBelief:
-    """arms: as many as were drawn; to be simulated is a part of them."""
+    """An ensemble of arms, of which only the first ones are simulated."""
 
     config: Config
     arms: ChainArms
 
     @classmethod
     def prior(cls, config: Config) -> "ChainBelief":
-        """Before anything was played. Raises ArmFileError."""
+        """Draw the ensemble before the first run. Raises ArmFileError."""
         return cls(config, prior_arms(config, known_chain(config), DRAWN))
 
     @property
     def torque(self) -> ChainTorque:
-        """What the arm in the middle takes for a motion, per commanded torque."""
+        """Inverse dynamics with the ensemble's mean parameters, in units of the commanded torque."""
         mean = linear_parameters(self.arms).mean(axis=0)
         count, n = self.arms.base.count, self.arms.drive.shape[2]
         return ChainTorque(self.arms.base, mean[:count], *mean[count:].reshape(3, n))
 
     def with_stabiliser(self, given: Config) -> Config:
-        """The configuration, with gains for the arms as they are thought to be unless it names its own."""
+        """Add stabiliser gains suited to the ensemble, unless the configuration has its own."""
         if given.stabiliser is not None:
             return given
         low, high = np.array([joint.position_limit for joint in given.joints]).T
         poses = np.random.default_rng(2).uniform(low, high, (_POSES, len(low)))
         held, free = inertias(self.arms.first(_ARMS), poses)
-        # A damper acts on what it feels a sample later: more than this and a light joint would shake.
+        # A damper acts one sample late: a larger gain would make a light joint oscillate.
         turn = 2.0 * np.pi * FREQUENCY
         damping = 2.0 * DAMPING_RATIO * turn * np.median(held, axis=0)
         most = MOST_DAMPING * given.experiment.rate * np.maximum(free.min(axis=0), 0.0)
@@ -79,7 +79,7 @@ class ChainBelief:
         return given.model_copy(update={"stabiliser": gains})
 
     def learn(self, config: Config, samples: NDArray[np.void]) -> "ChainBelief":
-        """What is thought after this recording; the same where it says next to nothing."""
+        """Update the ensemble with a recording; return it unchanged if the recording is too short."""
         rows = _rows(self.arms, config, samples)
         if rows is None:
             return self
@@ -90,7 +90,7 @@ class ChainBelief:
         known = np.linalg.inv(covariance)
         mean = drawn.mean(axis=0)
         noise = _LEAST_NOISE_SHARE * torque_limits(config)
-        for _ in range(3):  # the noise is that of what the fit leaves
+        for _ in range(3):  # estimate the noise from the residuals
             weight = (1.0 / noise**2)[:, None, None]
             spread = np.linalg.inv(known + np.einsum("jki,jkl->il", Y * weight, Y))
             fitted = mean + spread @ np.einsum("jki,jk->i", Y * weight, torque - Y @ mean)
@@ -106,7 +106,10 @@ class ChainBelief:
         return ChainBelief(self.config, self._arms(moved))
 
     def _arms(self, linear: Array) -> ChainArms:
-        """Arms of these parameters, per commanded torque; what could not move is drawn towards the mean."""
+        """Arms with these parameters, in units of the commanded torque.
+
+        Arms whose mass matrix is not physical are moved towards the mean, and discarded if that does not help.
+        """
         base, drive = self.arms.base, self.arms.drive.copy()
         n = drive.shape[2]
         least = _LEAST_FRICTION_SHARE * torque_limits(self.config)
@@ -129,7 +132,10 @@ class ChainBelief:
 
 
 def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[Array, Array] | None:
-    """Regressor (joints, rows, parameters) and commanded torque (joints, rows) [N m] of the moving part."""
+    """Regressor (joints, rows, parameters) and commanded torque (joints, rows) [N m] while the arm moves.
+
+    None if the recording is too short.
+    """
     rate, n = config.experiment.rate, len(config.joints)
     phases = (Phase.RAMP_IN, Phase.PERIODIC, Phase.RAMP_OUT)
     rows = np.nonzero(np.isin(samples["phase"], phases) & (samples["segment"] == 0))[0]
@@ -162,7 +168,7 @@ def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[A
 
 
 def _filled(position: Array) -> Array:
-    """Missing samples by interpolation."""
+    """Fill missing samples by linear interpolation."""
     filled = np.array(position, dtype=np.float64)
     at = np.arange(len(filled))
     for column in filled.T:

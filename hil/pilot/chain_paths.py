@@ -1,4 +1,4 @@
-"""The paths of a pilot of an arm in space: designed once for all steps, played smaller in the first ones."""
+"""Paths of a pilot of a spatial arm: designed once for all steps and scaled down in the first ones."""
 
 from dataclasses import dataclass
 
@@ -18,13 +18,14 @@ from hil.plan.plan import HELD_OUT, Plan
 Array = NDArray[np.float64]
 
 BAND = (0.1, 1.5)
-"""Hz, where the configuration names none."""
+"""Default band [Hz], if the configuration has none."""
 
-POSITION_ROOM = 0.08  # of a joint's range, left to errors of what is known
+POSITION_ROOM = 0.08  # of a joint's range: reserve for errors of the assumed model
 SPEED_SHARE = 0.6  # of velocity_limit
 TORQUE_SHARE = 0.65
-EXTRA_ROOM = 0.01  # m beyond the margin, left to the distance from the path
-RAMP_SPEED = 1.2  # rad/s, or this share of velocity_limit, on the way
+EXTRA_ROOM = 0.01  # m in addition to the margin: reserve for tracking errors
+# Highest speed between rest pose and path: the smaller of this [rad/s] and this fraction of velocity_limit.
+RAMP_SPEED = 1.2
 RAMP_SPEED_SHARE = 0.35
 _PEAK = 1.875
 _WAY_POSES = 40
@@ -34,8 +35,7 @@ _WAY_POSES = 40
 class Paths:
     """The designed paths.
 
-    identify: optimised; held_out: around the same centre, with random phases; plain: worst relative standard errors of
-    random paths within the same limits.
+    identify: optimised path. held_out: path around the same centre, with random phases.
     """
 
     config: Config
@@ -78,7 +78,7 @@ class Paths:
         return cls(config, designer, best, other)
 
     def plan(self, config: Config, thought: ChainTorque, share: float) -> Plan:
-        """What is played at this share of the amplitude."""
+        """Plan both paths at this fraction of their amplitude."""
 
         def path(_: Config, role: str, __: int) -> Path:
             return self.designer.scaled(self.held_out if role == HELD_OUT else self.identify, share)
@@ -87,7 +87,7 @@ class Paths:
 
 
 def chain_config(config: Config) -> Config:
-    """The configuration with a band, and a ramp that reaches every pose within the limits at a calm speed."""
+    """The configuration with a band, and a ramp that is long enough to reach every pose within the limits slowly."""
     experiment = config.experiment
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     rest = np.array(config.arm.rest_pose)
@@ -100,7 +100,7 @@ def chain_config(config: Config) -> Config:
 
 
 def _ways(path: Path, rest: Array, share: float) -> Array:
-    """Poses on the ways between the rest pose and a path (joints, poses), as `hil.plan.chain_plan` blends them."""
+    """Poses on the transitions between rest pose and path (joints, poses), as blended by `hil.plan.chain_plan`."""
     samples = path.position.shape[1]
     s = np.linspace(0.0, 1.0, _WAY_POSES)
     blend = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)

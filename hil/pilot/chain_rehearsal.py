@@ -1,4 +1,4 @@
-"""What `hil dry-run` does for an arm in space: the path that would be played, on arms that could be this one."""
+"""`hil dry-run` for a spatial arm: simulate the path that would be played on an ensemble of possible arms."""
 
 from hil.clearance.space import Space
 from hil.config.schema import Config

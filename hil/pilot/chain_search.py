@@ -1,8 +1,8 @@
-"""From URDF, limits and rest pose to an identified arm in space: pilot, then up, then the full run.
+"""From URDF, limits and rest pose to an identified spatial arm: pilot, steps of increasing amplitude, full run.
 
-pilot     a small share of the designed path, safe for every arm that could be this one
-raise     the largest share that is safe for the arms that are left
-full      the designed path at that share, and one to be predicted
+pilot     a small fraction of the designed path, safe for every arm of the prior ensemble
+steps     larger fractions, safe for the ensemble as updated after each run
+full      the designed path at the largest safe fraction, and a held-out path
 """
 
 from dataclasses import dataclass, field, replace
@@ -33,14 +33,14 @@ from hil.setup.servo_session import servo_session
 Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
-"""Arms simulated while a share is looked for, and of the share that was found."""
+"""Number of arms simulated while searching for a share, and to confirm the one found."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4)
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
-"""Times the share of the run before: for less no step is made between the pilot and the full run."""
+"""Smallest ratio of the safe share to that of the previous run for which another step precedes the full run."""
 
 MOST_RAISE = 2.5
 """Largest ratio of a step's share of the amplitude to that of the previous run."""
@@ -71,23 +71,23 @@ class ChainSearch:
 
     @classmethod
     def of(cls, config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> "ChainSearch":
-        """At the beginning: the paths designed. Raises NoSafeTorque, ConfigError, ArmFileError."""
+        """Design the paths and draw the prior ensemble. Raises NoSafeTorque, ConfigError, ArmFileError."""
         config = chain_config(config)
         belief = ChainBelief.prior(config)
         paths = Paths.of(config, belief.torque)
         say(
-            f"Designed a path that leaves the least certain base parameter {100 * paths.identify.worst:.2g} % of its "
-            f"prior spread; the held-out one, of random phases, {100 * paths.held_out.worst:.2g} %."
+            f"Designed a path that leaves the worst base parameter {100 * paths.identify.worst:.2g} % of its prior "
+            f"standard error (held-out path, with random phases: {100 * paths.held_out.worst:.2g} %)."
         )
         return cls(config, run, shown_path, watch, say, belief, paths)
 
     @property
     def config(self) -> Config:
-        """The configuration with a stabiliser for the arm as it is thought to be."""
+        """The configuration with a stabiliser suited to the current ensemble."""
         return self.belief.with_stabiliser(self.given)
 
     def safe(self, config: Config, shares: tuple[float, ...]) -> Found:
-        """The first of the shares that is safe for all arms. Raises NoSafeTorque."""
+        """Find the first of the shares that is safe for all simulated arms. Raises NoSafeTorque."""
         said = ""
         for share in shares:
             plan = self.paths.plan(config, self.belief.torque, share)
@@ -100,12 +100,13 @@ class ChainSearch:
                 return Found(share, plan, foreseen)
             said = unsafe(config, foreseen)
         raise NoSafeTorque(
-            f"{config.path}: no motion is safe for all arms that could be this one, not even {100 * shares[-1]:.0f} % "
-            f"of the designed path: {said}. Describe the arm's masses better, or leave it more room."
+            f"{config.path}: no motion is safe for all arms consistent with the prior, not even "
+            f"{100 * shares[-1]:.0f} % of the designed path: {said}. Give the arm's masses more accurately, or "
+            "give it more room to move."
         )
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
-        """Play one step, compare with what was foreseen, learn."""
+        """Play one step, compare it with the prediction, and update the belief."""
         config = step_config(self.config)
         found = self.safe(config, shares)
         below = self.run.below(folder, config)
@@ -116,7 +117,10 @@ class ChainSearch:
         return found
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run; what ended it, where that tells of the arm alone. Raises what a run raises otherwise."""
+        """Play a run; return the error that ended it early, or None.
+
+        Only errors that are informative about the arm are returned; all others that a run raises are raised.
+        """
         error = None
         try:
             self.torque = run_experiment(config, folder, self.shown_path, self.watch, found.plan, self.belief.arms)
@@ -128,7 +132,7 @@ class ChainSearch:
         return error
 
     def learn(self, config: Config, folder: RunFolder) -> None:
-        """What the recording in a folder says of the arm."""
+        """Update the belief with the recording in a folder."""
         self.belief = self.belief.learn(config, load_samples(folder.samples_path, len(config.joints)))
 
     def _compare(
@@ -140,13 +144,13 @@ class ChainSearch:
         torque = found.plan.segments[0].peak_goal * np.array([joint.torque_per_goal for joint in config.joints])
         step = Step(name, torque, foreseen.median, foreseen.quantile, peaks, str(error or ""))
         self.steps.append(step)
-        self.say(f"{name}: {100 * found.share:.0f} % of the path. {step} Least clearance foreseen: {found.foreseen}.")
+        self.say(f"{name}: {100 * found.share:.0f} % of the path. {step} Predicted clearance: {found.foreseen}.")
         if error is not None:
             self.say(f"{name} ended early: {error} {self.torque}")
         elif not step.within:
             self.say(
-                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from what was "
-                "assumed."
+                f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
+                "assumptions."
             )
 
 
@@ -180,7 +184,7 @@ def identify_chain_in_steps(
 
 
 def _full(search: ChainSearch) -> str:
-    """The full run, smaller where it passes a limit or never settles."""
+    """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles."""
     tries = 3
     for number in range(1, tries + 1):
         config = search.config

@@ -1,4 +1,4 @@
-"""What is thought of an arm in space before and between runs: its description, and the torque that a motion takes."""
+"""Assumed model of a spatial arm before and between runs: its description, and the torque that a motion requires."""
 
 from dataclasses import dataclass
 
@@ -15,14 +15,14 @@ from hil.estimator.chain.prior import Prior
 
 Array = NDArray[np.float64]
 
-ARMATURE = 0.01  # kg m^2: what the feed-forward supposes of every rotor
-ROUGH_FRICTION = 0.02  # of a joint's largest torque: what the feed-forward supposes
-SLOW = 0.1  # rad/s: where the supposed friction turns round
+ARMATURE = 0.01  # kg m^2, assumed by the feed-forward for every joint
+ROUGH_FRICTION = 0.02  # of a joint's largest torque, assumed by the feed-forward
+SLOW = 0.1  # rad/s: width of the transition of the assumed dry friction around zero velocity
 
 
 @dataclass(frozen=True)
 class KnownChain:
-    """What the configuration says of an arm in space before anything is identified."""
+    """What is known of a spatial arm from its configuration, before anything is identified."""
 
     base: BaseParameters
     prior: Prior
@@ -32,7 +32,7 @@ class KnownChain:
 
 @dataclass(frozen=True)
 class ChainTorque:
-    """The torque of a motion, as far as the arm is known. rigid: base parameters; the rest (joints,) [SI]."""
+    """Inverse dynamics of an assumed model. rigid: base parameters; friction and offset (joints,) [SI]."""
 
     base: BaseParameters
     rigid: Array
@@ -41,14 +41,14 @@ class ChainTorque:
     offset: Array
 
     def of(self, path: Path) -> Array:
-        """To be played for a path (joints, samples) [N m], dry friction rounded off near standstill."""
+        """Torque that a path requires (joints, samples) [N m], with dry friction smoothed near standstill."""
         torque = self.base.regressor(path.position, path.velocity, path.acceleration) @ self.rigid
         friction = self.viscous[:, None] * path.velocity + self.coulomb[:, None] * np.tanh(path.velocity / SLOW)
         return np.asarray(torque + friction + self.offset[:, None])
 
 
 def known_chain(config: Config) -> KnownChain:
-    """From the configuration's description; raises ArmFileError."""
+    """Read the configuration's description. Raises ArmFileError."""
     arm = described_arm(config)
     gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
     base = BaseParameters.of(Chain(*arm.geometry, gravity))
@@ -57,7 +57,7 @@ def known_chain(config: Config) -> KnownChain:
 
 
 def described_torque(config: Config, known: KnownChain) -> ChainTorque:
-    """As the description has it, with a rough guess of friction."""
+    """The described arm's inverse dynamics, with a rough guess of friction."""
     rough = ROUGH_FRICTION * torque_limits(config)
     return ChainTorque(known.base, known.base.of_all(known.described), rough, rough, np.zeros_like(rough))
 

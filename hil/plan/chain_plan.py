@@ -1,8 +1,11 @@
-"""Excitation of a spatial arm: joint paths, played as the feed-forward torque that what is known of the arm gives.
+"""Excitation of a spatial arm: joint paths, played as the feed-forward torque of the assumed model.
 
 The stabiliser always pulls towards the rest pose. To hold the arm to the path instead, its contribution is compensated
-in advance: goal = feed-forward + stiffness (path - rest) + damping path velocity. The transitions from the rest pose to
-the path and back are part of the plan.
+in advance:
+
+    goal = feed-forward + stiffness * (path - rest) + damping * path velocity
+
+The transitions from the rest pose to the path and back are part of the plan.
 """
 
 from collections.abc import Callable
@@ -22,16 +25,17 @@ from hil.plan.plan import Plan, Segment, make_plan, plan_with
 
 Array = NDArray[np.float64]
 
-SETTLE_IN = 0.3  # s in which the feed-forward comes and goes
-TORQUE_SHARE = 0.8  # of a joint's torque that a path may take: the rest is for errors of what is known of the arm
+SETTLE_IN = 0.3  # s over which the feed-forward is faded in and out
+TORQUE_SHARE = 0.8  # of a joint's torque limit that a path may use: the rest is for errors of the assumed model
 
 
 @dataclass(frozen=True)
 class PathSegment(Segment):
-    """A path, its multisine being the torque that is played for it; `way` (samples, joints) [A] leads there.
+    """A path; its multisine is the torque that is played for it.
 
-    paths: the motions that are wanted: from the rest pose, the period, back. thought: what the torque was made with.
-    peaks: largest goal for the path alone (joints,) [A].
+    way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions:
+    transition, period, transition back. thought: the assumed model that gave the torque. peaks: largest goal for the
+    path without the stabiliser (joints,) [A].
     """
 
     way: Array
@@ -70,7 +74,7 @@ def make_chain_plan(config: Config) -> Plan:
 
 
 def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str, int], Path]) -> Plan:
-    """A plan of the paths that `path` gives for each role and seed. Raises ConfigError where one takes too much."""
+    """Plan the paths that `path` returns for each role and seed. Raises ConfigError if one needs too much torque."""
 
     def segment(config: Config, role: str, seed: int) -> PathSegment:
         return path_segment(config, thought, role, path(config, role, seed))
@@ -80,13 +84,13 @@ def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str,
 
 
 def lowering_samples(config: Config) -> int:
-    """The largest number that a lowering stop may take, its braking and its end included."""
+    """Largest number of samples of a lowering stop, including its braking and its end."""
     safety = config.safety
     return round((safety.lower_time + 1.0 + 2.0 * SETTLE_IN) * config.experiment.rate)
 
 
 def path_segment(config: Config, thought: ChainTorque, role: str, path: Path) -> PathSegment:
-    """One path with its ways; raises ConfigError where it takes too much torque."""
+    """Plan one path with its transitions. Raises ConfigError if it needs too much torque."""
     experiment = config.experiment
     assert experiment.band is not None  # checked with the configuration
     torque = path_torque(config, thought, path)
@@ -114,7 +118,10 @@ def path_segment(config: Config, thought: ChainTorque, role: str, path: Path) ->
 
 
 def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array | float = 1.0) -> Array:
-    """To be played for a path (joints, samples) [N m], `share` of its feed-forward, the stabiliser's part taken off."""
+    """Torque to play for a path (joints, samples) [N m], which compensates the stabiliser's pull to the rest pose.
+
+    share: factor on the feed-forward.
+    """
     assert config.stabiliser is not None
     stiffness, damping = (np.array(each)[:, None] for each in (config.stabiliser.stiffness, config.stabiliser.damping))
     rest = np.array(config.arm.rest_pose)[:, None]
@@ -123,7 +130,7 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
 
 
 def check_clearance(config: Config, plan: Plan) -> None:
-    """Raise ConfigError where the wanted motion itself comes too near anything; of real arms a dry run tells."""
+    """Raise ConfigError if the desired motion itself has too little clearance; real arms need a dry run."""
     space = Space.of(config)
     for segment in plan.segments:
         assert isinstance(segment, PathSegment)
@@ -131,9 +138,10 @@ def check_clearance(config: Config, plan: Plan) -> None:
             nearest = space.nearest(motion.position, on_the_way)
             if nearest.room < 0.0:
                 raise ConfigError(
-                    f"{config.path}: the path leads too near: {nearest}, at least {1e3 * nearest.needed:.0f} mm are "
-                    "wanted. Move joint_path.centre, lower joint_path.swing, or correct [clearance] and the URDF's "
-                    "collision geometry; `hil dry-run` shows where."
+                    f"{config.path}: the path has too little clearance: {nearest}, at least "
+                    f"{1e3 * nearest.needed:.0f} mm are required. Move joint_path.centre, "
+                    "lower joint_path.swing, or correct [clearance] and the URDF's collision geometry; "
+                    "`hil dry-run` shows where."
                 )
 
 

@@ -72,7 +72,7 @@ class Plan:
     settle_within: float
     drift_within: float
     lower_samples: int = 0
-    """The most that lowering an arm in space takes after a stop."""
+    """Largest number of samples for lowering a spatial arm after a stop."""
 
     def first_segment(self) -> "Plan":
         """The plan with only its first multisine."""

@@ -1,7 +1,8 @@
-"""The way on which a stop lowers an arm in space: from any pose to the rest pose, clear of everything, in bounded time.
+"""Way on which a stop lowers a spatial arm: from any pose to the rest pose, clear of obstacles, in bounded time.
 
-Straight where that is clear; otherwise straight to the first pose of the planned way there from which that way leads
-home, since it has been foreseen as clear.
+The way is straight in joint space if that is clear. Otherwise it leads straight to the first pose of the planned
+transition from the rest pose that can be reached clear of obstacles, and follows that transition, which is known to be
+clear, backwards.
 """
 
 import numpy as np
@@ -16,19 +17,19 @@ from hil.plan.plan import Plan
 Array = NDArray[np.float64]
 
 STATIONS = 16
-"""Poses of the planned way at which an arm may join it."""
+"""Number of poses of the planned transition at which an arm may join it."""
 
 LOOKED_AT = 25  # poses of a straight line
-PEAK = 1.875  # of a fifth-order polynomial's speed over its mean
+PEAK = 1.875  # ratio of a fifth-order polynomial's peak speed to its mean speed
 SHORTEST_S = 0.6
-ROUNDED_S = 0.16  # over which a corner between two straight lines is rounded off
+ROUNDED_S = 0.16  # s over which a corner between two straight lines is smoothed
 BRAKING = 40.0  # rad/s^2
 SHORTEST_BRAKE_S, LONGEST_BRAKE_S = 0.05, 0.2
 _ALLOWED_M = 0.001
 
 
 class WayHome:
-    """Ways to the rest pose; made before torque is on."""
+    """Computes ways to the rest pose. Created before torque is switched on."""
 
     def __init__(self, config: Config, plan: Plan) -> None:
         segment = plan.segments[0]
@@ -40,11 +41,11 @@ class WayHome:
         there = segment.paths[0].position
         chosen = np.unique(np.linspace(0, there.shape[1] - 1, STATIONS).round().astype(int))
         self._stations = there[:, chosen]
-        self.poses(self._rest)  # compiled
+        self.poses(self._rest)  # compile in advance
 
     @property
     def space(self) -> Space:
-        """What it keeps clear of."""
+        """The space in which the way must be clear."""
         return self._space
 
     def poses(self, pose: Array) -> Array:
@@ -60,7 +61,7 @@ class WayHome:
         return np.column_stack((pose, self._stations[:, best::-1], self._rest))
 
     def path(self, pose: Array, velocity: Array) -> Path:
-        """The whole way: braked from `velocity`, then home, at the rate of the stream."""
+        """The whole way, sampled at the stream's rate: braking from `velocity`, then home."""
         slowing = np.clip(np.abs(velocity).max() / BRAKING, SHORTEST_BRAKE_S, LONGEST_BRAKE_S)
         count = max(2, round(slowing * self._rate))
         time = np.arange(count) / self._rate
@@ -76,11 +77,11 @@ class WayHome:
         )
 
     def seconds(self, corners: Array) -> float:
-        """How long the way over these corners takes."""
+        """Duration of the way through these corners [s]."""
         return float(np.clip(PEAK * _lengths(corners).sum() / self._speed, SHORTEST_S, self._longest))
 
     def _along(self, corners: Array) -> Array:
-        """Positions (joints, samples) along straight lines, rounded off, from standstill to standstill."""
+        """Positions (joints, samples) along straight lines with smoothed corners, from standstill to standstill."""
         lengths = _lengths(corners)
         at = np.concatenate(([0.0], np.cumsum(lengths)))
         s = np.linspace(0.0, 1.0, max(2, round(self.seconds(corners) * self._rate)))
@@ -88,7 +89,7 @@ class WayHome:
         line = np.stack([np.interp(along, at, row) for row in corners])
         width = max(1, round(ROUNDED_S * self._rate))
         smooth = np.pad(line, ((0, 0), (width - 1, width - 1)), mode="edge")
-        for _ in range(2):  # twice: its speed, too, then changes without a jump
+        for _ in range(2):  # twice, so that the speed is continuous too
             smooth = np.apply_along_axis(np.convolve, 1, smooth, np.full(width, 1.0 / width), "valid")
         still = np.repeat(line[:, -1:], round(2 * SETTLE_IN * self._rate), axis=1)
         return np.column_stack((smooth, still))
@@ -105,6 +106,6 @@ def _line(first: Array, last: Array) -> Array:
 
 
 def _lengths(corners: Array) -> Array:
-    """Of the joint that moves most, from corner to corner (corners - 1,) [rad]."""
+    """Travel of the joint that moves most between successive corners (corners - 1,) [rad]."""
     lengths: Array = np.abs(np.diff(corners, axis=1)).max(axis=0)
     return lengths

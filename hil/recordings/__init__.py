@@ -1,1 +1,1 @@
-"""Recordings of other tools as tables and as recordings in SI units: CSV, Parquet and LeRobot, MCAP and ROS 2 bags."""
+"""Import of recordings made by other tools, converted to SI units: CSV, Parquet, LeRobot, MCAP and ROS 2 bags."""

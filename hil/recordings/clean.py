@@ -1,4 +1,4 @@
-"""Rows as they come: without a time, twice, out of order, with gaps or holes. What is done about each is said."""
+"""Cleaning of rows: missing times, repeated or unordered rows, gaps, missing torque. Every correction is reported."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,7 +18,10 @@ RESTART = 0.2  # s: a time that goes back by more begins a new recording
 
 @dataclass(frozen=True)
 class Rows:
-    """time (rows,) [s]; torque, position (joints, rows) [N m, rad]; notes: what was done, in sentences."""
+    """Rows of a recording.
+
+    time: (rows,) [s]. torque, position: (joints, rows) [N m, rad]. notes: one sentence per correction.
+    """
 
     time: Values
     torque: Values
@@ -26,15 +29,15 @@ class Rows:
     notes: tuple[str, ...] = ()
 
     def kept(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice, *notes: str) -> "Rows":
-        """These rows alone."""
+        """Select rows and append notes."""
         chosen_rows = self.time[chosen], self.torque[:, chosen], self.position[:, chosen]
         return Rows(*chosen_rows, (*self.notes, *notes))
 
 
 def cleaned(source: str, rows: Rows, held: bool) -> list[Rows]:
-    """The recordings in the rows of `source`, each in the order of time. held: whether torque holds until the next.
+    """Split the rows of `source` into recordings, each sorted by time. held: whether torque is held until the next row.
 
-    Raises CsvError for what cannot be put right without guessing.
+    Raises CsvError for defects that cannot be corrected without guessing.
     """
     rows = _with_time(source, rows)
     rows = _once(source, rows)
@@ -102,7 +105,7 @@ def _ordered(source: str, rows: Rows) -> Rows:
 
 
 def _filled(source: str, rows: Rows, held: bool) -> Rows:
-    """Short holes in the torque are filled in; long ones are left out with the rows around them."""
+    """Fill short gaps in the torque; drop the rows of long ones."""
     hole = ~np.isfinite(rows.torque).all(axis=0)
     if not hole.any():
         return rows
@@ -127,7 +130,7 @@ def _filled(source: str, rows: Rows, held: bool) -> Rows:
 
 
 def _apart(rows: Rows) -> list[Rows]:
-    """Rows on either side of a long gap are recordings of their own."""
+    """Split the rows at long gaps into separate recordings."""
     step = np.diff(rows.time)
     usual = float(np.median(step)) if step.size else 0.0
     if usual > MOST_GAP:

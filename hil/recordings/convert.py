@@ -1,4 +1,4 @@
-"""A table with what its columns mean becomes recordings in SI units."""
+"""Conversion of a table, given the meaning of its columns, to recordings in SI units."""
 
 from dataclasses import dataclass
 
@@ -21,9 +21,10 @@ SMALLEST_STEP = 1e-9  # rad, where readings show no steps: their noise is measur
 
 @dataclass(frozen=True)
 class Converted:
-    """recordings: in SI units. names: of each. stepped: whether the encoders' resolution is known, per joint.
+    """Recordings in SI units.
 
-    columns: with what was guessed. notes: what was guessed or put right, in sentences.
+    names: one per recording. stepped: whether each joint's encoder resolution is known. columns: including
+    guesses. notes: one sentence per guess or correction.
     """
 
     recordings: tuple[Recording, ...]
@@ -34,8 +35,11 @@ class Converted:
 
 
 def convert(table: Table, columns: Columns) -> Converted:
-    """The recordings in `table`. Raises CsvError for columns that are missing, unclear or no numbers, RecordingError
-    for data that cannot be a recording in these units."""
+    """Convert `table` to recordings.
+
+    Raises CsvError for columns that are missing, ambiguous or not numeric, and RecordingError for data that cannot be a
+    recording in these units.
+    """
     whole = guessed(table, columns)
     notes = [] if whole == columns else [said(whole, table)]
     assert whole.position is not None and whole.drive is not None  # or guessed would have raised
@@ -75,7 +79,7 @@ def _time(table: Table, columns: Columns) -> Values:
     full, values, stated = table.find(columns.time)
     unit = _unit(table, full, "time", stated, columns.time_unit)
     finite = values[np.isfinite(values)]
-    # From the first sample on, or a count of nanoseconds since 1970 loses its last digits.
+    # Subtract the first sample: as a float, nanoseconds since 1970 would lose their last digits.
     first = float(finite[0]) if finite.size else 0.0
     return np.asarray((values - first) * UNITS["time"][unit])
 
@@ -108,7 +112,7 @@ def _quantity(table: Table, name: str, kind: str, given: str | None, ticks: floa
 
 
 def _unit(table: Table, name: str, kind: str, stated: str | None, given: str | None) -> str:
-    """The unit of a column, by [columns] or the file; raises CsvError where these disagree or one is not known."""
+    """The unit of a column, from [columns] or the file. Raises CsvError if they disagree or a unit is unknown."""
     possible = UNITS[kind]
     read = None if stated is None else unit_of(stated)
     if read == "1" and kind != "pwm":

@@ -1,4 +1,4 @@
-"""CSV as other programs write it: any delimiter, decimal commas, a byte order mark, remarks, a line of units."""
+"""CSV files as written by other programs: any delimiter, decimal commas, byte order mark, comments, a line of units."""
 
 import csv
 from datetime import datetime
@@ -15,7 +15,7 @@ _REMARKS = ("#", "%", "//")
 
 
 def read_csv_table(path: Path) -> Table:
-    """The table in `path`; raises CsvError. An empty field or `nan` is a missing value."""
+    """Read the table in `path`. Raises CsvError. An empty field or `nan` is a missing value."""
     lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), start=1) if line.strip()]
     remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
@@ -63,13 +63,13 @@ def _text(path: Path) -> str:
 
 
 def _delimiter(lines: list[str]) -> str | None:
-    """The one that cuts the first lines into equally many fields, and most; None for white space."""
+    """Find the delimiter that splits the first lines into equally many fields, and most; None for white space."""
     some = lines[: min(len(lines), 20)]
     best: tuple[int, str | None] = (0, None)
     for each in (";", "\t", ",", "|"):
         counts = {line.count(each) for line in some[1:]} or {some[0].count(each)}
         least = min(counts)
-        # Decimal commas stand in every field: a semicolon that is there as often as another wins.
+        # Decimal commas may appear in every field, so a semicolon is preferred if it occurs as often as another.
         if least > 0 and some[0].count(each) > 0 and least > best[0] and not (each == "," and best[1] is not None):
             best = (least, each)
     if best[1] is None and any("," in line for line in some):
@@ -118,7 +118,7 @@ def _numbers(fields: list[str], decimal_comma: bool) -> Values:
         return np.array(fields, dtype=np.float64)
     except ValueError:
         pass
-    # Only a column that is used needs numbers: a remark beside them is no fault, and is infinite here.
+    # Only columns that are used must be numeric: text, such as a comment, is not an error and is stored as infinity.
     return np.array([_number(field, decimal_comma) for field in fields])
 
 

@@ -1,4 +1,4 @@
-"""The step of an encoder, as its readings show it."""
+"""Estimation of an encoder's resolution from its readings."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,12 +6,12 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 FEWEST_LEVELS = 5
-MOST_OFF = 0.12  # of a step: how far readings may lie from whole steps, by the digits that were written
-MOST_SHARE = 0.7  # of the readings: more different ones than that are no steps
+MOST_OFF = 0.12  # of a step: largest distance of a reading from a whole step, for values rounded in the file
+MOST_SHARE = 0.7  # of the readings: with more distinct values than this, no steps are recognised
 
 
 def encoder_step(position: Values) -> float | None:
-    """The step that all readings (samples,) are whole multiples of, apart; None where there is none."""
+    """Largest step of which all differences between readings (samples,) are multiples; None if there is none."""
     finite = position[np.isfinite(position)]
     if finite.size < FEWEST_LEVELS:
         return None
@@ -30,7 +30,7 @@ def encoder_step(position: Values) -> float | None:
 
 
 def _refined(away: Values, step: float) -> float | None:
-    """The step by regression on whole numbers, from near readings to far ones; None where they are no whole steps."""
+    """Refine a step by regression on integers, from near readings to far ones; None if they are not whole steps."""
     reach = 20.0 * step
     while True:
         near = away <= reach

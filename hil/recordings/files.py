@@ -1,4 +1,4 @@
-"""Which files are recordings, and the tables in them."""
+"""Recognition of recording files, and reading of their tables."""
 
 from pathlib import Path
 
@@ -13,14 +13,14 @@ SUFFIXES = (*TEXTS, ".parquet", ".mcap")
 
 
 def is_recording(path: Path) -> bool:
-    """Whether `path` is a recording of another tool by its name, and not a run folder."""
+    """Whether `path`, by its name, is a recording of another tool rather than a run folder."""
     if path.is_dir():
         return is_dataset(path) or is_bag(path)
     return path.suffix.lower() in SUFFIXES or path.suffix.lower() in {".db3", ".bag", ".h5", ".hdf5", ".xlsx", ".mat"}
 
 
 def read_tables(path: Path) -> list[Table]:
-    """The recordings in one file or folder; raises CsvError, which names it."""
+    """Read the tables in one file or folder. Raises CsvError, which names it."""
     if not path.exists():
         raise CsvError(f"{path}: cannot be read: No such file or directory.")
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""What the columns of a table seem to hold, by their names: for what [columns] does not say."""
+"""Guesses the meaning of columns from their names, if [columns] does not specify it."""
 
 import re
 from collections import defaultdict
@@ -24,7 +24,7 @@ _OF_UNIT = {
     "voltage": {"V", "mV"},
     "pwm": {"%"},
 }
-# Not what was measured of the joint, or not of its angle.
+# Not a measurement of the joint, or not of its angle.
 _NOT_MEASURED = re.compile(
     r"(?<![a-z])(des|desired|ref|reference|goal|target|sp|setpoint|cmd|commanded|sim|est)(?![a-z])", re.I
 )
@@ -35,7 +35,7 @@ _SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
 
 
 def guessed(table: Table, columns: Columns) -> Columns:
-    """`columns` with what it leaves out, where the table's names say it plainly. Raises CsvError where they do not."""
+    """Complete `columns` from the table's column names. Raises CsvError if these are not clear."""
     found: dict[str, object] = {}
     if columns.time is None and columns.rate is None:
         found["time"] = _time(table)
@@ -57,7 +57,7 @@ def guessed(table: Table, columns: Columns) -> Columns:
 
 
 def said(columns: Columns, table: Table) -> str:
-    """What was taken for what, in one sentence."""
+    """One sentence on how the columns were interpreted."""
     drive = columns.drive or "torque"
     names = (columns.time or f"{columns.rate:g} samples a second", columns.position or [], getattr(columns, drive))
     listed = [name if isinstance(name, str) else ", ".join(name) for name in names]
@@ -73,7 +73,7 @@ def _time(table: Table) -> str:
 
 
 def _group(table: Table, kind: str, columns: Columns, needed: bool = True) -> list[str] | None:
-    """The columns of one kind that belong together, one per joint; None, or CsvError if needed, where it is unclear."""
+    """Find the columns of one kind, one per joint; if unclear, return None, or raise CsvError if they are needed."""
     named: dict[str, list[str]] = defaultdict(list)
     for name in table.columns:
         bare, unit = split_head(name)
@@ -93,7 +93,7 @@ def _group(table: Table, kind: str, columns: Columns, needed: bool = True) -> li
         return groups[0]
     if kind != "position" and len(groups) > 1:
         commanded = [each for each in groups if _NOT_MEASURED.search(_spaced(each[0]))]
-        if len(commanded) == 1:  # what was commanded is an input; what was measured answers to the motion
+        if len(commanded) == 1:  # a commanded value is an input; a measured one depends on the motion
             return commanded[0]
     if needed or len(groups) > 1 or (named and not groups):
         raise _unclear(table, kind, [name for names in named.values() for name in names])
@@ -105,12 +105,12 @@ def _last(name: str) -> str:
 
 
 def _spaced(name: str) -> str:
-    """`pos_meas1` and `observation.state.0` as words, so that a word is found between them."""
+    """Split names such as `pos_meas1` and `observation.state.0` into words, for searching."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])|[_./\[\]\-]+", " ", name)
 
 
 def _stem(name: str) -> str:
-    """What the columns of several joints have in common: all but the joint's number, or its name after a dot."""
+    """The part of a column's name that is common to all joints: without the joint's number, or its name after a dot."""
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered

@@ -1,7 +1,7 @@
-"""MCAP files and ROS 2 bags of them: JSON messages as they are, ROS 2 messages decoded, topics brought together.
+"""MCAP files and ROS 2 bags that contain them: decodes JSON and ROS 2 messages and merges topics into one table.
 
-Every number of a message is a column, `/topic.field`, an entry of a list `/topic.field[2]`; a message with a list
-`name` beside lists of numbers, such as sensor_msgs/JointState, has its joints' names there instead:
+Every number in a message becomes a column: `/topic.field`, or `/topic.field[2]` for an entry of a list. If a message
+has a list `name` in addition to lists of numbers, as sensor_msgs/JointState does, these names replace the indices:
 `/joint_states.effort.elbow`.
 """
 
@@ -18,13 +18,13 @@ from hil.errors import CsvError
 from hil.recordings.table import Table, Values
 
 TIME = "time"
-LARGEST_LIST = 64  # more is a picture or a cloud of points
+LARGEST_LIST = 64  # a larger one is an image or a point cloud
 _PLAIN = (bool, int, float)
 
 
 @dataclass
 class _Topic:
-    """What one topic said: when [ns since 1970], and each number by its name."""
+    """Messages of one topic: times [ns since 1970] and values by column name."""
 
     time: list[int] = field(default_factory=list)
     values: dict[str, list[float]] = field(default_factory=dict)
@@ -45,7 +45,7 @@ def is_bag(path: Path) -> bool:
 
 
 def read_bag(folder: Path) -> list[Table]:
-    """The table of a ROS 2 bag whose storage is MCAP; raises CsvError."""
+    """Read the table of a ROS 2 bag with MCAP storage. Raises CsvError."""
     files = sorted(folder.glob("*.mcap"))
     if not files:
         kept = ", ".join(sorted({path.suffix for path in folder.iterdir() if path.suffix != ".yaml"})) or "nothing"
@@ -57,7 +57,7 @@ def read_bag(folder: Path) -> list[Table]:
 
 
 def read_mcap(path: Path) -> list[Table]:
-    """The table in one MCAP file; raises CsvError."""
+    """Read the table in one MCAP file. Raises CsvError."""
     return [_table(str(path), [path])]
 
 
@@ -69,11 +69,11 @@ def _table(source: str, files: list[Path]) -> Table:
     topics = {name: each for name, each in topics.items() if each.values}
     if not topics:
         raise CsvError(f"{source}: holds no messages with numbers.")
-    # The topic with most samples gives the rows: every other is held until its next message.
+    # The topic with the most samples defines the rows; values of other topics are held until their next message.
     first = max(topics, key=lambda name: len(topics[name].time))
     order = np.argsort(topics[first].time, kind="stable")
     at = np.array(topics[first].time)[order]
-    # Counted from the first, since nanoseconds since 1970 are too many digits for a float.
+    # Relative to the first: nanoseconds since 1970 have too many digits for a float.
     columns: dict[str, Values] = {TIME: (at - at[0]) * 1e-9}
     for each in topics.values():
         places = np.argsort(each.time, kind="stable")
@@ -87,7 +87,7 @@ def _table(source: str, files: list[Path]) -> Table:
 
 
 def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
-    """(topic, time [ns since 1970], message) of what can be decoded; raises CsvError where nothing can."""
+    """Yield (topic, time [ns since 1970], message) of each decodable message. Raises CsvError if there is none."""
     try:
         from mcap.exceptions import McapError
         from mcap.reader import make_reader
@@ -130,7 +130,7 @@ def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Any] | None:
 
 
 def _stamp(message: Any, log_time: int) -> int:
-    """The time that the message's header gives, else when it was logged [ns since 1970]."""
+    """Time stamp in the message's header, otherwise its log time [ns since 1970]."""
     stamp = _get(_get(message, "header"), "stamp")
     seconds, nanoseconds = _get(stamp, "sec"), _get(stamp, "nanosec")
     if isinstance(seconds, int) and isinstance(nanoseconds, int) and (seconds or nanoseconds):

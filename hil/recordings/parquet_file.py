@@ -1,4 +1,4 @@
-"""Parquet tables, and LeRobot datasets: folders of them with meta/info.json beside."""
+"""Parquet tables, and LeRobot datasets: folders of Parquet files with a meta/info.json."""
 
 import json
 from pathlib import Path
@@ -19,12 +19,12 @@ def is_dataset(path: Path) -> bool:
 
 
 def read_parquet(path: Path) -> list[Table]:
-    """The tables in `path`, one for each episode where it has episodes. Raises CsvError."""
+    """Read the tables in `path`, one per episode if there are episodes. Raises CsvError."""
     return _tables(path, {})
 
 
 def read_dataset(folder: Path) -> list[Table]:
-    """The episodes of a LeRobot dataset, in their order; raises CsvError."""
+    """Read the episodes of a LeRobot dataset, in order. Raises CsvError."""
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
         features = dict(info.get("features", {}))
@@ -68,7 +68,7 @@ def _tables(path: Path, features: dict[str, Any]) -> list[Table]:
 
 
 def _flat(name: str, column: Any, feature: dict[str, Any]) -> dict[str, Values]:
-    """A column as columns of numbers: one for each entry of a list, named as the dataset names it; none for texts."""
+    """Convert a column to numeric columns: one per list entry, named as in the dataset; none for text."""
     import pyarrow as pa
 
     kind = column.type

@@ -1,4 +1,4 @@
-"""A recording whose torque repeats as one mean period of its settled part: less to simulate, less noise."""
+"""Reduction of a recording with periodic torque to the mean period of its settled part: less simulation, less noise."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 
-EVEN = 0.02  # of an interval: how far the times of samples may be from equal spacing
+EVEN = 0.02  # of an interval: largest deviation of the sample times from equal spacing
 SHORTEST = 64  # samples in a period
 SAME_TORQUE = 1e-3  # RMS difference over the torque's RMS
-SAME_MOTION = 0.02  # RMS difference over the motion's RMS, as `hil identify` takes a motion as settled
+SAME_MOTION = 0.02  # RMS difference over the motion's RMS, as in the settling criterion of `hil identify`
 
 
 @dataclass(frozen=True)
 class MeanPeriod:
-    """recording: the mean of `periods` settled periods of `seconds` [s] each."""
+    """A mean period. recording: mean of `periods` settled periods of `seconds` [s] each."""
 
     recording: Recording
     periods: int
@@ -24,7 +24,7 @@ class MeanPeriod:
 
 
 def mean_period(recording: Recording) -> MeanPeriod | None:
-    """The settled part's mean period; None where the torque does not repeat, or the motion never settles."""
+    """Mean period of the settled part; None if the torque is not periodic or the motion never settles."""
     interval = recording.interval
     step = np.diff(recording.time)
     if not np.all(np.abs(step - interval) < EVEN * interval):
@@ -47,7 +47,7 @@ def mean_period(recording: Recording) -> MeanPeriod | None:
 
 
 def _period(torque: Array) -> int | None:
-    """Samples after which the torque (joints, samples) repeats, at least twice; None where it does not."""
+    """Period of the torque (joints, samples) in samples, with at least two repetitions; None if it is not periodic."""
     moved = torque - torque.mean(axis=1, keepdims=True)
     samples = moved.shape[1]
     power = float(np.mean(moved**2))
@@ -59,7 +59,7 @@ def _period(torque: Array) -> int | None:
     most = samples // 2
     candidates: NDArray[np.int64] = SHORTEST + np.flatnonzero(alike[SHORTEST : most + 1] > 0.9)
     for lag in candidates.tolist():
-        # The beginning may be a ramp: the last two periods decide.
+        # The recording may begin with a ramp, so only the last two periods are compared.
         latest, former = moved[:, -lag:], moved[:, -2 * lag : -lag]
         if float(np.mean((latest - former) ** 2)) < SAME_TORQUE**2 * power:
             return int(lag)
@@ -67,7 +67,7 @@ def _period(torque: Array) -> int | None:
 
 
 def _settled(position: Array, noise: Array) -> int:
-    """How many of the periods, from the last backwards, repeat: positions (joints, periods, samples)."""
+    """Number of periods, counted backwards from the last, that repeat. position: (joints, periods, samples)."""
     count = 1
     motion = np.nanstd(position[:, -1], axis=1)
     for latest in range(position.shape[1] - 1, 0, -1):

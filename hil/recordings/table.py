@@ -1,4 +1,4 @@
-"""A table of named columns of numbers, wherever it was read from."""
+"""A table of named numeric columns, independent of the file format."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,11 +15,11 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Table:
-    """One recording as it stands in a file.
+    """One recording as stored in a file.
 
     columns: (rows,) by name, NaN where a value is missing and infinite where it is not a number. units: as stated in
-    the file, by column. first_row: the number that the file gives its first row, in the words of a message (a CSV
-    file's header is line 1).
+    the file, by column. first_row: number of the first row, for messages (a CSV file's header is
+    line 1).
     """
 
     source: str
@@ -34,9 +34,9 @@ class Table:
         return len(next(iter(self.columns.values()), ()))
 
     def find(self, name: str) -> tuple[str, Values, str | None]:
-        """The column that `name` means: its full name, values, and the unit stated in the file, as written.
+        """Find the column `name`; return its full name, values, and the unit stated in the file, as written.
 
-        The name may stand without the unit, and in other letter case. Raises CsvError.
+        `name` may omit the unit and is not case-sensitive. Raises CsvError.
         """
         full = self._full_name(name)
         values = self.columns[full]
@@ -63,7 +63,7 @@ class Table:
         )
 
     def listed(self) -> str:
-        """The names of the columns for a message; of very many only the first."""
+        """Column names for a message; only the first ones if there are many."""
         names = list(self.columns)
         more = f" and {len(names) - 40} more" if len(names) > 40 else ""
         return ", ".join(names[:40]) + more

@@ -1,4 +1,4 @@
-"""Units as people write them into the heads of their columns, and what each is in SI."""
+"""Units as written in column headers, and their values in SI."""
 
 import re
 
@@ -12,7 +12,7 @@ UNITS = {
     "voltage": VOLTAGE_UNITS,
     "pwm": PWM_UNITS,
 }
-"""The units of each kind of quantity, in SI (ticks: of an encoder, whose size [columns] says)."""
+"""SI value of each unit, by kind of quantity (the size of an encoder tick is given by [columns])."""
 
 _SPELLINGS = {
     "s": "s sec secs second seconds",
@@ -38,17 +38,17 @@ _SPELLINGS = {
 _KNOWN = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
 _SLASH = re.compile(r"^(.*?)\s*/\s*(\S+)$")
-# Only what nobody would call a joint: `q_a` is no current.
+# Only units that cannot be the name of a joint: `q_a` is not a current.
 _SUFFIX = re.compile(r"^(.+)_(deg|rad|mrad|ms|us|ns|sec|nm|mnm|ma|mv|ticks|turns|percent|pct)$", re.IGNORECASE)
 
 
 def unit_of(text: str) -> str | None:
-    """The unit that is meant by `text`; None for one that is not known here."""
+    """The unit denoted by `text`; None if it is unknown."""
     return _KNOWN.get(text.strip().lower().replace(" ", ""))
 
 
 def split_head(head: str) -> tuple[str, str | None]:
-    """A column's head as its name and the unit it states, as written; None where it states none."""
+    """Split a column header into name and unit, as written; the unit is None if there is none."""
     bracketed = _BRACKETS.match(head)
     if bracketed and bracketed[1]:
         return bracketed[1].strip(), bracketed[2].strip()

@@ -13,7 +13,7 @@ model_choice with friction = "auto": the models tried, the one chosen, its gain 
 timing       how well the stream kept its deadlines, and the duration of the estimation
 arm          facts needed to use the model: gravity, rest pose, and per joint name, servo, mode, limits, torque per
              goal [N m/A, or N m/V in pwm mode]
-chain        only of an arm in space: its geometry, and what each base parameter is made of
+chain        only for a spatial arm: its geometry, and the combination that each base parameter stands for
 truth        only on a fake arm: the base parameters it was built with
 physical     masses, centres and inertias, where [known] says something
 stabiliser   what it gave of the torque, where there was one

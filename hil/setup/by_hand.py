@@ -37,20 +37,20 @@ class Pose:
 
 @dataclass(frozen=True)
 class Moved:
-    """What came of one joint's motion by hand."""
+    """Outcome of moving one joint by hand."""
 
     joint: str
     asked: str
     """What the user was asked to do with it."""
     angles: tuple[float, ...]
-    """By which all joints moved [rad]."""
+    """Angles by which all joints moved [rad]."""
     well: bool
     found: str
-    """In words, with what to change where it is not as described."""
+    """Finding in words, with what to change if it differs from the description."""
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
-    """The pose of these angles [rad]."""
+    """The pose at these angles [rad]."""
     x, y, z = end_point(described_arm(config), np.array(angles)).tolist()
     return Pose(angles, (x, y, z))
 

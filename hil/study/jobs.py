@@ -75,7 +75,7 @@ def run_jobs(
 
 
 class _Flight(Generic[Item, Result]):
-    """The tasks that workers have: one job each, or several where jobs are short beside what a task costs."""
+    """Tasks in progress: one job each, or several if jobs are short compared with the overhead of a task."""
 
     def __init__(
         self, client: "Client", function: Callable[[Item], Result], waiting: Iterator[tuple[int, Item]]

@@ -1,4 +1,4 @@
-"""Values of an estimate from a recording made elsewhere that no servo arm has: most often a unit."""
+"""Detection of values that no servo arm has in estimates from imported recordings; the usual cause is a wrong unit."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gra
 
 
 def undetermined(estimate: ShootingEstimate) -> list[str]:
-    """One sentence that names the terms whose value says nothing, since their standard error is as large."""
+    """One sentence naming the terms that are undetermined, because their standard error is as large as their value."""
     found = [
         f"{name} ({value:.3g} +- {std:.2g})"
         for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True)

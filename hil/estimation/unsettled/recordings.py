@@ -164,7 +164,7 @@ def _arm(read: _Read, gravity: float) -> ArmFacts:
 
 
 def _joint_names(columns: Sequence[str]) -> list[str]:
-    """What the columns call the joints; numbers where they name none."""
+    """Joint names from the column names; numbers if there are none."""
     last = [re.split(r"[./]", split_head(name)[0])[-1] for name in columns]
     named = len(set(last)) == len(last) and not any(re.search(r"\d", name) for name in last) and len(last) > 1
     return last if named else [f"joint_{number}" for number in range(1, len(columns) + 1)]

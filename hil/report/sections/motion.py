@@ -1,4 +1,4 @@
-"""The arm moving through the fitted period, beside the torque that moved it; then the commands that come next."""
+"""Animation of the arm during the fitted period with the torque that moved it, then the suggested next commands."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Clearance of an arm in space: capsules around its links, distances to itself, the floor and boxes."""
+"""Clearance of a spatial arm: capsules around its links, distances from itself, the floor and boxes."""
 
 import struct
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_the_floor_can_be_elsewhere_or_missing(tmp_path: Path) -> None:
 
 def test_an_unknown_name_to_ignore_is_named(tmp_path: Path) -> None:
     text = TEXT.replace("[clearance]\n", '[clearance]\nignore = [["hand", "flor"]]\n', 1)
-    with pytest.raises(ConfigError, match="no 'flor'"):
+    with pytest.raises(ConfigError, match="unknown name 'flor'"):
         Space.of(configured(tmp_path, text))
 
 

@@ -156,7 +156,7 @@ def test_a_path_that_leads_too_near_is_refused_on_a_real_port(tmp_path: Path) ->
     text = TEXT.replace('url = "fake://"', 'url = "/dev/ttyUSB0"').replace('floor = "none"', "floor = 0.0")
     config = parse_config(text, FOUR)
     run = RunFolder.create(tmp_path / "run", config)
-    with pytest.raises(ConfigError, match=r"too near: .*floor"):
+    with pytest.raises(ConfigError, match=r"too little clearance: .*floor"):
         run_experiment(config, run, config.path, lambda _: None)
 
 

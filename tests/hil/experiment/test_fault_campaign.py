@@ -21,7 +21,7 @@ SEEN_LATER = 0.05
 """Share of the injections at most whose time counts from when the fault could be seen, later than it began."""
 
 LATE_AT_20_HZ, LATE_MS = frozenset({Kind.STRANGE_GOAL}), 250.0
-"""A goal that another program sends between two samples is gone when the servo is asked: only the motion tells."""
+"""Another program's goal between two samples is overwritten before the next status: only the motion shows it."""
 
 NOT_STABLE = "fake_inverted at 20 Hz"
 """A setting that cannot be played: a software spring delayed by 50 ms."""

@@ -139,7 +139,7 @@ def test_the_model_alone_stops_a_motor_that_does_not_do_as_told(
 def test_a_joint_that_is_elsewhere_than_a_period_before_is_said_so(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A short push that leaves the model unimpressed: here, because there is none."""
+    """A short push that the model does not detect; here, the model check is disabled."""
     monkeypatch.setattr(ModelWatch, "look", lambda *_: None)
 
     def push() -> None:

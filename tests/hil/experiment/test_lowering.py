@@ -1,4 +1,4 @@
-"""A stop of an arm in space: it is lowered where its servos still take commands, and cut where they do not."""
+"""Stops of a spatial arm: it is lowered if its servos still accept commands; otherwise torque is cut."""
 
 import os
 import signal

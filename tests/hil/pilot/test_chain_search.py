@@ -1,4 +1,4 @@
-"""Arms in space from description, limits and rest pose to the result, on the fake bus; the smallest one here."""
+"""Spatial arms from description, limits and rest pose to the result, on the fake bus; here the smallest one."""
 
 import numpy as np
 import pytest

@@ -18,7 +18,7 @@ ARM = load_config(CONFIGS / "fake_viperx_300.toml")
 
 
 class VirtualClock:
-    """Time passes when somebody waits."""
+    """Time advances when the program waits."""
 
     def __init__(self) -> None:
         self.time = 0.0
@@ -63,7 +63,7 @@ def test_words_are_those_of_the_motion() -> None:
 
 
 def test_every_joint_is_asked_for_and_waited_for() -> None:
-    """Each is moved in 0.5 s after it is asked for, and held; the fourth is moved the wrong way."""
+    """Each joint is moved within 0.5 s of the request and then held; the fourth is moved in the wrong direction."""
     clock, asked = VirtualClock(), list[tuple[float, str]]()
 
     def read() -> tuple[float, ...]:
