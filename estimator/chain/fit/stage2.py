@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.coordinates import ChainCoordinates, kind_of
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.objective import ChainProblem
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.stage1 import ChainLinear
-from hil.estimator.chain.uncertainty import coloured_covariance
+from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
+from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.stage1 import ChainLinear
+from hil.estimator.chain.fit.uncertainty import coloured_covariance
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import (

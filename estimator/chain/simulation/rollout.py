@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import TERMS
-from hil.estimator.chain.kernels import accelerate, invert, move, place, room
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.model.kernels import accelerate, invert, move, place, room
 from hil.estimator.compiled import compiled
 
 LONGEST_STEP = 1.3e-3  # s

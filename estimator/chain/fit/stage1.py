@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 

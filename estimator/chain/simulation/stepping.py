@@ -23,7 +23,7 @@ from typing import Any
 
 import numba
 
-from hil.estimator.chain.kernels import accelerate, differentiate, invert, move, place, regress
+from hil.estimator.chain.model.kernels import accelerate, differentiate, invert, move, place, regress
 from hil.estimator.compiled import compiled
 from hil.estimator.simulation.arm import FADED, GAMMA
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.coordinates import LONGEST, ChainCoordinates
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.simulation import ChainRun, Simulation, pieces
+from hil.estimator.chain.fit.coordinates import LONGEST, ChainCoordinates
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation, pieces
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.objective import ChainProblem
+from hil.estimator.chain.fit.objective import ChainProblem
 
 MOST_SAMPLES = 1 << 13  # of a period: enough to know a level to a tenth
 SUPPOSED = 10.0  # degrees of freedom of white noise, and of all joints' level, in each one's

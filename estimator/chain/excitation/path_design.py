@@ -2,8 +2,8 @@
 
 An evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A. Ostermeier,
 Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite Fourier series of
-`hil.estimator.chain.excitation`: the criterion has no gradient that would be cheaper than its value. Every variation is
-scaled into the limits of position and speed and then shrunk until `allowed` accepts it.
+`hil.estimator.chain.excitation.fourier_path`, as a gradient would cost far more than one value of the criterion. Every
+variation is scaled to the limits of position and speed and then shrunk until `allowed` accepts it.
 """
 
 from collections.abc import Callable
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.excitation import Path
-from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.excitation.fourier_path import Path
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.errors import ExcitationError
 
 LOOKED_AT = 120  # samples of each variation

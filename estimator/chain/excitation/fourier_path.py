@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import mass_matrix
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.stage1 import columns_of_friction
+from hil.estimator.chain.fit.stage1 import columns_of_friction
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import mass_matrix
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import PeriodicMotion
 from hil.estimator.errors import ExcitationError
 

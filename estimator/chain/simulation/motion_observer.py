@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import places
-from hil.estimator.chain.kernels import accelerate, move, place, regress, room
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import places
+from hil.estimator.chain.model.kernels import accelerate, move, place, regress, room
 from hil.estimator.compiled import compiled
 
 FILTER_S = 0.02

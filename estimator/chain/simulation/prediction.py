@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.simulation import ChainRun, Simulation
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
 from hil.estimator.simulation.arm import steps_per_sample
