@@ -61,7 +61,7 @@ def columns_of(model: ChainModel, motion: PeriodicMotion) -> Array:
 
 
 def columns_of_friction(motion: PeriodicMotion) -> Array:
-    """The regressor of viscous and Coulomb friction and of offsets (joints, samples, 3 joints), term by term."""
+    """Return the regressor of viscous and Coulomb friction and of offsets (joints, samples, 3 joints), term by term."""
     joints, samples = motion.velocity.shape
     Y = np.zeros((joints, samples, 3 * joints))
     for joint, velocity in enumerate(motion.velocity):

@@ -13,8 +13,8 @@ from hil.estimator.simulation.arm import steps_per_sample
 from hil.estimator.simulation.closed_loop import Feedback
 
 PERIODS = 3  # number of periods simulated, of which the last is used
-FINER = 4  # steps in place of one near standstill
-NEVER = 1e6  # N m: a limit that is never reached
+FINER = 4  # smaller integration steps that replace one near standstill
+NEVER = 1e6  # N m: a torque limit that is never reached
 
 
 def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeriod) -> Array:

@@ -62,7 +62,7 @@ class Simulation:
             np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
             np.array(start, dtype=np.float64, order="C"),
         )
-        # Derivatives that are not wanted are written behind all columns.
+        # Unwanted derivatives are written to a spare column after all others.
         where = np.array([at.get(name, width) for name in base.names] + [width])
         self._columns = (
             where[places(n, base.columns)],
