@@ -12,8 +12,8 @@ from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 Between = Literal["held", "linear"]
 
 FEWEST_SAMPLES = 32
-LEAST_VALID = 0.5  # of a joint's samples
-LEAST_MOTION = 4.0  # encoder steps from end to end
+LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
+LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
 MOST_GAP = 0.2  # s between samples; with longer intervals the motion would not be resolved
 MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # intervals longer than this many usual ones, and this many seconds, are gaps
 LONGEST_GAP = 10.0  # s within one recording

@@ -70,7 +70,7 @@ class Segmented:
     """Gradient of each segment by the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
     expected: Expected | None = None
-    """What of `information` was expected, not measured."""
+    """The prior's contribution to `information` (shared, shared)."""
 
     def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
         """Return the sandwich covariance of the shared coordinates (shared, shared), taking segments as independent.

@@ -107,7 +107,7 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
 
 def _predicted(held_out: Array | None, length: float) -> str:
     if held_out is None:
-        return "No held-out motion validated it: the recording is too short to keep a part of it back."
+        return "No held-out motion validated it: the recording is too short to hold a part of it out."
     return (
         f"Fitted to every other segment of {length:g} s, it predicts the others to within "
         f"{100.0 * float(held_out.max()):.2g} % of the motion's RMS."
@@ -118,6 +118,6 @@ def _weakest(name: str, part: float) -> str:
     if part <= WELL_KNOWN:
         return f"The least well known parameter is {name}, to {100 * part:.2g} %."
     if not np.isfinite(part):
-        return f"This motion reveals nothing of {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
+        return f"This motion provides no information on {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
     improvement = IMPROVEMENT[kind_of(name)]
     return f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}."

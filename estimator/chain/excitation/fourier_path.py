@@ -117,7 +117,7 @@ def design_path(
 
 @dataclass(frozen=True)
 class Goal:
-    """How accurately a path determines the torque of other motions in its box, if only the prior is known before."""
+    """How accurately a path, together with the prior, determines the torque of other motions in its box."""
 
     base: BaseParameters
     prior: Prior
