@@ -246,7 +246,10 @@ def colour(residual: Array) -> float:
 
 
 def richer_models(model: Model) -> dict[str, Model]:
-    """Models with one option, or one law of friction, more: those that are linear in what they add."""
+    """Return the models with one more option or the next friction law, by the part that is added.
+
+    Presliding is left out, since the motion is not linear in its parameters.
+    """
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     richer: dict[str, Model] = {option: model.having(option) for option in absent if option != "presliding"}
     higher = FRICTIONS[FRICTIONS.index(model.friction) + 1 :][:1]

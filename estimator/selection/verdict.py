@@ -96,7 +96,7 @@ def _trust(validation: Validation, evidence: Evidence) -> Trust:
 
 
 def _is_weak(validation: Validation, name: str) -> bool:
-    """Whether a parameter is poorly known and the arm's torque depends on it."""
+    """Return whether a parameter is poorly known and the arm's torque depends on it."""
     return validation.relative_std[name] > WEAK and not validation.torque_std[name] <= LITTLE_EFFECT
 
 

@@ -51,18 +51,18 @@ class ChainCoordinates:
     """Minimum width of every Coulomb step [rad/s]."""
 
     def values(self, x: Array) -> Array:
-        """Parameters (parameters,) at the coordinates `x`."""
+        """Return the parameters (parameters,) at the coordinates `x`."""
         value: Array = np.where(self._positive, np.exp(np.where(self._positive, x, 0.0)), x * self._scales)
         return value
 
     def coordinates(self, value: Array) -> Array:
-        """Coordinates of `value` (parameters,), moved into the physical range."""
+        """Return the coordinates of `value` (parameters,), moved into the physical range."""
         positive = np.log(np.where(self._positive, np.maximum(value, self._least), 1.0))
         x: Array = np.where(self._positive, positive, value / self._scales)
         return x
 
     def slopes(self, x: Array) -> Array:
-        """Derivative of each parameter by its coordinate (parameters,)."""
+        """Return the derivative of each parameter by its coordinate (parameters,)."""
         slope: Array = np.where(self._positive, self.values(x), self._scales)
         return slope
 
