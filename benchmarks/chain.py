@@ -35,17 +35,17 @@ from typing import Any
 import numpy as np
 
 from hil.description.urdf import read_urdf
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import inverse_dynamics, mass_matrix
-from hil.estimator.chain.excitation import Path as Motion
-from hil.estimator.chain.excitation import design_path
-from hil.estimator.chain.geometry import Chain
+from hil.estimator.chain.excitation.fourier_path import Path as Motion
+from hil.estimator.chain.excitation.fourier_path import design_path
+from hil.estimator.chain.fit.regression import fit_filtered
+from hil.estimator.chain.fit.stage1 import COULOMB_WIDTH
 from hil.estimator.chain.identify import identify_chain
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prediction import predict, relative_error
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.regression import fit_filtered
-from hil.estimator.chain.stage1 import COULOMB_WIDTH
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix
+from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.chain.simulation.prediction import predict, relative_error
 from hil.estimator.data.recording import Recording
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError

@@ -24,7 +24,7 @@ from hil.drivers.errors import DriverError
 from hil.drivers.servo_model import servo_model
 from hil.drivers.servo_prior import servo_prior
 from hil.errors import HilError
-from hil.estimator.chain.rollout import ChainArms, weights
+from hil.estimator.chain.simulation.rollout import ChainArms, weights
 from hil.estimator.errors import EstimationError
 from hil.plan.chain_model import KnownChain, known_chain
 

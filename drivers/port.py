@@ -244,7 +244,7 @@ def _never_ready(_timeout_ms: float | None = None, /) -> list[tuple[int, int]]:
 
 
 def _why(error: BaseException, baud: int | None = None) -> str:
-    """The reason, without the numbers and repetitions that come with it."""
+    """Return the reason for a failure, without the error numbers and repetitions in the exception's text."""
     text = str(error.args[-1] if error.args else error)
     of_device = "open port" in text or "configure port" in text
     for known, said in _REASONS.items():

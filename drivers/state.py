@@ -215,7 +215,7 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
     of: the joint index of each servo, in ascending order. count: number of joints.
     Goals and currents are summed; angle, velocity and clock are the first servo's; of the voltages the lowest is taken,
-    of the temperatures the highest; an error or a missing reply of one servo applies to its joint. `apart` tells how
+    of the temperatures the highest; an error or a missing reply of one servo applies to its joint. `apart` shows how
     the servos of one joint disagree.
     """
     servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]

@@ -1,11 +1,11 @@
-"""Cutting torque: every servo is told and polled, whatever fails and whoever interrupts.
+"""Cutting torque: torque off is sent to every servo and read back, regardless of failures and interrupts.
 
 The order matters. Torque off is sent to all servos at once, which takes 0.3 ms. Then each servo is polled once; one
 that does not reply costs about 40 ms, so torque off is sent to all again afterwards: a servo may receive without being
 able to reply, and a packet may have been lost. If a servo still cannot be confirmed, the bus stays silent for as long
 as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives and does not obey, because it
 refuses or has another ID by now. For the same reason servos that did not answer the last exchange are not polled
-before. Then the remaining servos are tried again, patiently.
+before. Then the remaining servos are tried again, several times.
 
 Ctrl-C raises KeyboardInterrupt wherever the program happens to be, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds

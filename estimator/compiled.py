@@ -28,8 +28,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 
 @cache
 def sources_digest(estimator: Path) -> str:
-    """Return a hash of all source files that are compiled into loops."""
+    """Return a hash of all source files in FOLDERS and their subfolders."""
     digest = hashlib.sha256()
-    for path in sorted(path for folder in FOLDERS for path in (estimator / folder).glob("*.py")):
-        digest.update(path.name.encode() + path.read_bytes())
+    for path in sorted(path for folder in FOLDERS for path in (estimator / folder).rglob("*.py")):
+        digest.update(path.relative_to(estimator).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()

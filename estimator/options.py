@@ -166,15 +166,15 @@ class ShootingOptions:
 
     ftol: float = 3e-5
     ftol_refine: float = 1e-3
-    """Of fits between which segments are downweighted."""
+    """Tolerance of the fits between which segments are downweighted."""
     ftol_start: float = 1e-2
-    """Of those that only lead near a minimum."""
+    """Tolerance of the fits that only need to come close to a minimum."""
     max_step: float = 1e-3
-    """Of the integration, in the last fit [s]."""
+    """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """In the fits before: off by a few hundredths of a standard error, for a third of the time [s]."""
+    """Longest integration step of the earlier fits [s]: three times as fast, off by hundredths of a standard error."""
     start_segments: int = 80
-    """That many of the segments, evenly chosen, lead near a minimum."""
+    """Maximum number of segments, evenly chosen, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
     """A width below 3e-3 rad/s is slow to simulate and has no visible effect in a second of motion."""
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()

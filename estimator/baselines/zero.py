@@ -1,4 +1,4 @@
-"""Where the angles of a recording are counted from: gravity tells, before anything is fitted."""
+"""Zero angle of a recording's joints, estimated from gravity before any fit."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,15 +12,15 @@ from hil.estimator.errors import EstimationError
 from hil.estimator.models.terms import base_names
 
 CUTOFF, WIDTH = 8.0, 0.05  # Hz, rad/s
-EXPLAINED = 0.5  # of the torque's residual: what turning the angles must save
-LEAST = 0.3  # rad: less is the fit's to find
-SURE = 0.05  # of the largest torque: less gravity than that tells no angle
+EXPLAINED = 0.5  # maximum ratio of the torque's residual with free zero angles to that with the given ones
+LEAST = 0.3  # rad: smaller zero errors are left to the fit
+SURE = 0.05  # fraction of the largest torque: weaker gravity does not reveal an angle
 
 
 def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
-    """Angles (joints,) [rad] to add to the recordings' so that joint 1 is counted from the horizontal.
+    """Return the angles (joints,) [rad] to add to the recordings' so that joint 1 is measured from the horizontal.
 
-    None where nothing says that they are not. Torque of gravity is regressed on the cosine and the sine of the angle.
+    None if there is no evidence that it is not. The torque of gravity is regressed on cosine and sine of the angle.
     """
     joints = recordings[0].joints
     names = base_names(joints)

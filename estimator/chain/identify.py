@@ -7,10 +7,10 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.stage1 import fit_lines
-from hil.estimator.chain.stage2 import fit_periods
+from hil.estimator.chain.fit.stage1 import fit_lines
+from hil.estimator.chain.fit.stage2 import fit_periods
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ModelError
 from hil.estimator.fit.fitted_parameters import FittedParameters

@@ -14,7 +14,7 @@ BAND = 8  # lines that are evaluated together
 
 
 _AHEAD = np.array((3.0, -3.0, 1.0))
-"""Weights of the three nearest samples, nearest first, for the one beyond them: a parabola."""
+"""Weights of the three nearest samples, nearest first, for quadratic extrapolation by one sample."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ def white_noise(position: Array) -> Array:
 
 
 def _jump(position: Array) -> Array:
-    """Return by how much a period (joints, samples) fails to close (joints,): the motion between two samples taken off.
+    """Return by how much a period (joints, samples) fails to close (joints,), less the motion between two samples.
 
-    At low rates a joint moves by many encoder steps from the last sample to the next first one.
+    At low rates a joint moves by many encoder steps from the last sample of a period to the first of the next.
     """
     if position.shape[1] < len(_AHEAD):
         return np.zeros(len(position))

@@ -12,13 +12,13 @@ from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 Between = Literal["held", "linear"]
 
 FEWEST_SAMPLES = 32
-LEAST_VALID = 0.5  # of a joint's samples
-LEAST_MOTION = 4.0  # encoder steps from end to end
-MOST_GAP = 0.2  # s between samples: what moves in between is not seen
-MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # from which on samples are missing: usual intervals, s
+LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
+LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
+MOST_GAP = 0.2  # s between samples; with longer intervals the motion would not be resolved
+MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # intervals longer than this many usual ones, and this many seconds, are gaps
 LONGEST_GAP = 10.0  # s within one recording
-LEAST_NOISE = 1e-5  # rad: no encoder of an arm has less
-MOST_ANGLE = 200.0  # rad: more is degrees or encoder steps
+LEAST_NOISE = 1e-5  # rad: lower bound for any arm's encoder
+MOST_ANGLE = 200.0  # rad: larger values must be degrees or encoder steps
 MOST_SPEED = 500.0  # rad/s between samples, likewise
 MOST_TORQUE = 1e4  # N m
 
@@ -63,12 +63,12 @@ class Recording:
 
     @property
     def longest_interval(self) -> float:
-        """Samples further apart have a gap between them [s]."""
+        """Interval between samples above which there is a gap [s]."""
         return max(MOST_INTERVALS * self.interval, SHORTEST_GAP)
 
     @cached_property
     def noise(self) -> Array:
-        """Standard deviation of one position (joints,) [rad]: what is measured to be white, and rounding at least."""
+        """Standard deviation of one position (joints,) [rad]: the measured white noise, at least that of rounding."""
         rounding = self.position_step / np.sqrt(12.0)
         white = np.array([_white_noise(self.time, row) for row in self.position])
         return np.asarray(np.maximum(rounding, white))
@@ -101,7 +101,7 @@ class Recording:
                 k = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, at.size - 2)
                 late = wanted - at[k]
                 slope = (torque[k + 1] - torque[k]) / rise[k] * ((wanted >= at[0]) & (wanted <= at[-1]))
-                # Beyond either end the end value is held.
+                # Beyond either end, the end value is held.
                 start = np.where(wanted > at[-1], total[-1] - torque[-1] * rise[-1], total[k])
                 level = np.where(wanted > at[-1], torque[-1], torque[k])
                 integral = start + late * (level + 0.5 * slope * late)
@@ -110,9 +110,9 @@ class Recording:
 
 
 def _white_noise(time: Array, row: Array) -> float:
-    """Standard deviation of what neighbouring samples do not share [rad]: from the cubic through four of five.
+    """Return the standard deviation of white noise [rad], from fourth-order differences of neighbouring samples.
 
-    The median over the recording: quick motion, which no cubic follows, is the smaller part of it.
+    The median over the recording is used, since motion too fast for a cubic to follow is only a small part of it.
     """
     valid = np.isfinite(row)
     time, row = time[valid], row[valid]
@@ -126,7 +126,7 @@ def _white_noise(time: Array, row: Array) -> float:
         for j in range(5):
             if i != j:
                 weight[:, i] /= t[:, i] - t[:, j]
-    # Divided differences of fourth order: a cubic has none.
+    # Divided differences of fourth order, which vanish for a cubic.
     left = np.sum(weight * y, axis=1) / np.sqrt(np.sum(weight**2, axis=1))
     return max(LEAST_NOISE, float(np.median(np.abs(left))) / 0.6745)
 

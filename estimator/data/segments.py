@@ -37,7 +37,7 @@ class RecordingSegment:
     state: Array
     """Angles and velocities at its start by a local fit (2, joints) [rad, rad/s]."""
     samples: slice
-    """Which of the recording's samples are its own."""
+    """The recording's samples that belong to it."""
 
     def at_samples(self, grid: Array) -> Array:
         """Interpolate values on the grid (joints, grid points, ...) at the sampling times (joints, samples, ...)."""
@@ -61,7 +61,7 @@ class Grid:
 
     @classmethod
     def of(cls, recording: Recording, longest: float = LONGEST_STEP) -> "Grid":
-        """From the first sample to the last, in steps of at most `longest` [s]."""
+        """Return the grid from the first sample to the last, in steps of at most `longest` [s]."""
         span = float(recording.time[-1] - recording.time[0])
         count = int(np.ceil(span / longest - 1e-9))
         step = span / count
@@ -71,7 +71,7 @@ class Grid:
 def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[RecordingSegment]:
     """Cut a recording into equal pieces of about `length` [s]; `number` is the recording's index.
 
-    A piece in which the recording has a gap is left out. Raises RecordingError when no piece holds FEWEST samples.
+    Pieces in which the recording has a gap are left out. Raises RecordingError if no piece contains FEWEST samples.
     """
     steps = len(grid.edges) - 1
     pieces = max(1, round(steps * grid.step / length))

@@ -130,7 +130,7 @@ def robust_covariance(
     if prior.any():
         size, directions = np.linalg.eigh(prior[np.ix_(seen, seen)] / lengths)
         root = directions * np.sqrt(np.maximum(size, 0.0))
-        # (found^-1 + prior)^-1 without inverting what may be nearly singular.
+        # (found^-1 + prior)^-1 without inverting a matrix that may be nearly singular.
         inner = np.eye(len(found)) + root.T @ found @ root
         found = found - found @ root @ np.linalg.solve(inner, root.T @ found)
     covariance[np.ix_(seen, seen)] = found / lengths
@@ -140,7 +140,7 @@ def robust_covariance(
 
 
 def larger_covariance(robust: Array, white: Array) -> Array:
-    """A covariance at least as large as both along the directions in which they differ."""
+    """Return a covariance at least as large as both, along the directions in which they differ."""
     size, directions = np.linalg.eigh(white)
     root = directions * np.sqrt(np.maximum(size, 1e-300))
     ratio = np.linalg.solve(root, np.linalg.solve(root, robust).T)

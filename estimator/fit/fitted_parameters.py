@@ -1,4 +1,4 @@
-"""What every fitted model offers: parameters by name, standard errors and the residual in encoder steps."""
+"""Common interface of all fitted models: parameters by name, standard errors and the residual in encoder steps."""
 
 from dataclasses import dataclass
 

@@ -6,11 +6,11 @@ techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of I
 not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the state between
 them.
 
-Short segments come first, since they converge from a poor initial guess, and only some of them, since a neighbourhood
-is all that is wanted; longer ones then refine the result, first with long steps of integration. A segment whose
-residual is larger than usual, because a joint stuck in it, say, as no smooth friction sticks, is downweighted
-accordingly: with equal weights the segments that the model explains worst would dominate. What is usual of small terms
-(`Term.spread`) is a prior, in units of what the model leaves.
+Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
+close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
+residual is larger than usual is downweighted accordingly, for instance if a joint stuck in it, which no smooth friction
+reproduces: with equal weights, the segments that the model explains worst would dominate. The typical size of small
+terms (`Term.spread`) serves as a prior, weighted relative to the residual.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -95,7 +95,10 @@ class Shooting:
         step: float | None = None,
         options: ShootingOptions = DEFAULTS,
     ) -> None:
-        """`most`: of the segments, evenly chosen; `step`: the longest of the integration [s]."""
+        """Cut the recordings into segments.
+
+        most: maximum number of segments, evenly chosen; by default all. step: longest integration step [s].
+        """
         self._options = options
         self._recordings = recordings
         self.zeros = len(recordings) * model.joints if zeros else 0
@@ -130,7 +133,7 @@ class Shooting:
     def position_by_values(
         self, segment: RecordingSegment, values: Mapping[str, float], offsets: Array, own: Array
     ) -> Array:
-        """The same by parameters [SI], the `offsets` of the zeros and the segment's own coordinates."""
+        """Return the same from parameters [SI], the `offsets` of the zeros and the segment's own coordinates."""
         state = own.reshape(2, -1) * self.state_scale
         return self.position(segment, self._with_zeros(values, segment, offsets), state)
 
@@ -143,11 +146,11 @@ class Shooting:
         return self._rows(number, position)
 
     def derivative(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> tuple[Array, Array]:
-        """The same, and its derivatives by the shared coordinates, then by the segment's own (rows, all)."""
+        """Return the residual and its derivatives by the shared coordinates, then by the segment's own (rows, all)."""
         count = len(coordinates.names)
         values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
         rows, columns = self.derivative_by_values(number, values, shared[count:], own, coordinates.names)
-        # A motion that diverges has no finite derivatives; the minimiser says so.
+        # A diverging motion has no finite derivatives; the minimiser reports this.
         with np.errstate(over="ignore", invalid="ignore"):
             columns[:, :count] = columns[:, :count] @ coordinates.slopes(shared[:count])
         return rows, columns
@@ -155,7 +158,11 @@ class Shooting:
     def derivative_by_values(
         self, number: int, values: Mapping[str, float], offsets: Array, own: Array, names: Sequence[str]
     ) -> tuple[Array, Array]:
-        """The same with the parameters `values` [SI], by those of `names`, by `offsets` of the zeros, by its own."""
+        """Return the residual at the parameters `values` [SI], and its derivatives (rows, all).
+
+        The derivatives are by the parameters `names`, then by the `offsets` of the zeros, then by the segment's own
+        coordinates.
+        """
         segment = self.segments[number]
         physics = self._with_zeros(values, segment, offsets)
         joints = self._model.joints
@@ -194,7 +201,7 @@ class Shooting:
         return rms
 
     def over_noise(self, coordinates: Coordinates, found: Segmented) -> Array:
-        """RMS residual in units of the noise (joints,)."""
+        """Return the RMS residual in units of the noise (joints,)."""
         errors, samples = self.errors(coordinates, found), np.stack([_samples(each) for each in self.segments])
         mean = np.sum(errors**2 * samples, axis=0) / samples.sum(axis=0)
         return np.asarray(np.sqrt(mean) / self.noise[:, 0])
@@ -205,11 +212,11 @@ class Shooting:
         self._trust = np.minimum(1.0, usual / np.maximum(errors, 1e-12))
 
     def weight_as(self, other: "Shooting") -> None:
-        """Weight the segments as `other`, which has the same, does."""
+        """Use the weights of `other`, which has the same segments."""
         self._trust = other._trust
 
     def expected(self, coordinates: Coordinates, shared: Array, own: Array) -> Expected:
-        """What is usual of small terms, held against what the model leaves at these coordinates."""
+        """Return the prior on small terms, weighted relative to the residual at these coordinates."""
         count = len(coordinates.names)
         inertia = float(coordinates.scales[coordinates.names.index("inertia_1")])
         prior = CoordinatePrior.of(coordinates.names, coordinates.scales, Sizes(*self._scales, inertia))
@@ -218,7 +225,7 @@ class Shooting:
         if not precision.any():
             return Expected.nothing(shared.size)
         rows = [self.residual(coordinates, number, shared, each) for number, each in enumerate(own)]
-        with np.errstate(over="ignore"):  # a motion that diverges
+        with np.errstate(over="ignore"):  # if the motion diverges
             weight = min(max(1.0, float(np.mean(np.concatenate(rows) ** 2))), MOST_WEIGHT)
         return Expected(centre, weight * precision, weight)
 
@@ -227,7 +234,7 @@ class Shooting:
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
     def _zeros_of(self, segment: RecordingSegment) -> slice:
-        """Where a segment's encoder zeros stand among those of all recordings; nowhere if they are known."""
+        """Return the places of a segment's encoder zeros among those of all recordings; none if they are known."""
         if not self.zeros:
             return slice(0, 0)
         first = segment.recording * self._model.joints
@@ -281,12 +288,23 @@ def estimate_by_shooting(
 ) -> ShootingEstimate:
     """Estimate parameters by maximum likelihood over all `recordings`, cut into segments.
 
-    `start`: base parameters (base parameters,) [SI], for instance of `hil.estimator.baselines.idim`. The same
-    recordings give the same numbers. `zeros`: what each recording's encoders read at angle 0 is unknown too, one
-    offset a joint and recording, as of servos whose zero is set at every start; with gravity they are seen, without
-    they are not. `of` takes some of each recording's segments and leaves the others for a check. `near`: an estimate of
-    the same recordings by another model, or of other segments, whose end is the only initial guess. Raises
-    RecordingError if no segment is long enough, ConvergenceError.
+    The result is deterministic.
+
+    Args:
+        recordings: recordings of one arm.
+        model: the model to fit.
+        start: initial guess of the base parameters (base parameters,) [SI], such as that of
+            `hil.estimator.baselines.idim`.
+        length: nominal length of a segment [s].
+        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos whose zero is set anew
+            at every start. They can only be determined with gravity.
+        of: which segments of each recording to fit; the others are left for validation.
+        near: estimate with another model or other segments of the same recordings, used as the only initial guess.
+        options: tolerances and limits.
+
+    Raises:
+        RecordingError: if no segment is long enough.
+        ConvergenceError: if no minimum is found.
     """
 
     def posed(part: float, most: int | None, step: float) -> Shooting:
@@ -313,7 +331,7 @@ def estimate_by_shooting(
 def _from_guesses(
     short: Shooting, long: Shooting, coordinates: Coordinates, model: Model, start: Array, options: ShootingOptions
 ) -> Array:
-    """Near the best minimum: friction's rise has local ones, so that there are several guesses."""
+    """Return shared coordinates near the best minimum, from several guesses: Stribeck friction causes local minima."""
     ends: list[Segmented] = []
     lost: list[ConvergenceError] = []
     for x in _initial_guesses(short, coordinates, model, start, options):
@@ -330,7 +348,7 @@ def _from_guesses(
 def _from_estimate(
     near: ShootingEstimate, coordinates: Coordinates, model: Model, zeros: int, options: ShootingOptions
 ) -> Array:
-    """Shared coordinates where `near` ended, what it lacks at its initial value."""
+    """Return the shared coordinates of `near`, with initial guesses for parameters that it lacks."""
     known = near.parameters
     for joint in range(1, model.joints + 1):
         known.setdefault(f"coulomb_width_{joint}", options.initial_width)

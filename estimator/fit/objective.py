@@ -102,7 +102,7 @@ class Objective:
         return Quadratic(cost, normal, gradient)
 
     def expected_normal(self, x: Array) -> Array:
-        """What is expected beforehand, as its share of the normal equations (parameters, parameters)."""
+        """Return the prior's contribution to the normal equations (parameters, parameters)."""
         return self._expected(x).normal[: self.count, : self.count]
 
     def minimise(self, x: Array, ftol: float, damping: float | None = None, at: Quadratic | None = None) -> Minimum:

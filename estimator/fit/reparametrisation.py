@@ -140,26 +140,26 @@ class CoordinatePrior:
 
 @dataclass(frozen=True)
 class Lever:
-    """What is expected of two parameters together: coupling is `ratio` times gravity_2, whatever they are."""
+    """Prior on two parameters together: coupling is expected to be `ratio` times gravity_2."""
 
     coupling: int
     gravity: int
-    """Their places among the parameters."""
+    """Indices of these among the parameters."""
     ratio: float
     """`Model.lever` [s^2]."""
     std: float
-    """Of coupling less that [kg m^2]."""
+    """Standard deviation of coupling - ratio gravity_2 [kg m^2]."""
 
     @classmethod
     def of(cls, model: Model, gravity_2: float, sizes: "Sizes") -> "Lever | None":
-        """For a model that knows it; gravity_2: about what it is [N m], as a scale."""
+        """Return the prior of a model with a lever, otherwise None; gravity_2: rough value [N m], used as a scale."""
         if model.lever is None or model.joints != 2:
             return None
         std = LEVER_STD * model.lever * max(abs(gravity_2), LEAST_WEIGHT * sizes.torque)
         return cls(model.names.index("coupling"), model.names.index("gravity_2"), model.lever, std)
 
     def residual(self, value: Array) -> tuple[float, Array]:
-        """How far the parameters `value` (parameters,) are from it, in standard deviations, and the slopes of that."""
+        """Return the deviation of the parameters `value` (parameters,) in standard deviations, and its derivatives."""
         slope = np.zeros(value.size)
         slope[self.coupling], slope[self.gravity] = 1.0 / self.std, -self.ratio / self.std
         return float(slope @ value), slope

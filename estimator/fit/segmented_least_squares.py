@@ -31,23 +31,26 @@ MIN_PART = 1e-4  # squared component of a coordinate in such a direction; anythi
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of the shared coordinates before any measurement: independent normal distributions."""
+    """Prior on the shared coordinates: independent normal distributions."""
 
     centre: Array
-    """(shared,)."""
+    """Means (shared,)."""
     precision: Array
-    """Inverse variances times `weight` (shared,), 0 where nothing is expected."""
+    """Inverse variances times `weight` (shared,), 0 without a prior."""
     weight: float = 1.0
-    """Mean square of the residual in units of the noise, as far as it is correlated: what the model leaves tells as
-    much less as it is larger, and so must the prior be held against it."""
+    """Mean square of the residual in units of the noise.
+
+    If the residual is larger than the noise, the data carry correspondingly less information, so the prior is given the
+    same factor.
+    """
 
     @classmethod
     def nothing(cls, size: int) -> "Expected":
-        """No prior on any of `size` coordinates."""
+        """Return no prior on any of `size` coordinates."""
         return cls(np.zeros(size), np.zeros(size))
 
     def cost(self, x: Array) -> float:
-        """What the coordinates `x` (shared,) add to the sum of squares."""
+        """Return the prior's contribution to the sum of squares at the coordinates `x` (shared,)."""
         return float(np.sum(self.precision * (x - self.centre) ** 2))
 
 
@@ -67,7 +70,7 @@ class Segmented:
     """Gradient of each segment by the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
     expected: Expected | None = None
-    """What of `information` was expected, not measured."""
+    """The prior's contribution to `information` (shared, shared)."""
 
     def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
         """Return the sandwich covariance of the shared coordinates (shared, shared), taking segments as independent.
@@ -157,11 +160,20 @@ def minimise_segmented(
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `shared` (shared,) and `own` (segments, own) are starts in coordinates of about 1; `expected` adds what is known of
-    the shared ones beforehand. Ends when the relative decrease
-    of a step is below `ftol`, or after `options.max_iterations` when it gained less than `options.unfinished`.
-    `residual` and `derivative` are called from several threads; the result does not depend on their number. Raises
-    ConvergenceError.
+    `residual` and `derivative` are called from several threads; the result does not depend on their number.
+
+    Args:
+        residual: returns the residuals of a segment.
+        derivative: returns the residuals of a segment and their derivatives.
+        shared: initial shared coordinates (shared,), of order 1.
+        own: initial coordinates of each segment (segments, own), of order 1.
+        ftol: stop when the relative decrease of a step is below this.
+        options: limits of the iteration.
+        expected: prior on the shared coordinates.
+
+    Raises:
+        ConvergenceError: if the simulation diverges, or if the relative decrease still exceeds `options.unfinished`
+            after `options.max_iterations`.
     """
     prior = expected or Expected.nothing(shared.size)
     with ThreadPoolExecutor(thread_count()) as threads:

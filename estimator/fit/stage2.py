@@ -27,7 +27,7 @@ from hil.estimator.options import LikelihoodOptions
 
 DEFAULTS = LikelihoodOptions()
 HARDLY = 0.05
-"""Of its usual initial guess: what a term begins with near the minimum of a model without it."""
+"""Fraction of a term's usual initial guess that is used near the minimum of a model without the term."""
 
 
 @dataclass(frozen=True)
@@ -110,13 +110,13 @@ def _near_values(
 ) -> Array:
     narrow = _standstill_guesses(linear, options)[0]
     unnamed = dict(zip(model.names, _guess(model, linear, {}, narrow, options).tolist(), strict=True))
-    # What a plainer model does without begins as next to nothing, or its minimum is left at once.
+    # Terms that the simpler model lacks start close to zero; otherwise the first step would leave its minimum.
     hardly = {name: HARDLY * value for name, value in unnamed.items() if _is_nothing_when_small(name)}
     return np.array([{**unnamed, **hardly, **parameters}[name] for name in model.names])
 
 
 def _is_nothing_when_small(name: str) -> bool:
-    """Whether a term vanishes with its value and has one to begin with."""
+    """Return whether a parameter's term vanishes as it goes to zero, and whether it has an initial guess."""
     term = term_of(name)
     return term.range == "positive" and term.part in FRICTIONS and not term.standstill and bool(term.initial)
 

@@ -17,7 +17,7 @@ from hil.estimator.models.terms import (
 )
 
 LEVER_STD = 0.05
-"""Relative standard deviation of a link's length by a ruler, over gravity by the tilt that somebody gave."""
+"""Relative standard deviation of a measured link length over gravity, which depends on the configured tilt."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,17 @@ class Model:
     options: Collection[Option] = frozenset()
     """Always a frozenset after construction."""
     by_voltage: Collection[int] = frozenset()
-    """Joints, from 1, that are driven by voltage; a share back_emf of their viscous friction passes the drive's lag
-    (`hil.estimator.simulation.back_emf`). Always a frozenset after construction."""
+    """Joints (from 1) that are driven by voltage.
+
+    A share `back_emf` of their viscous friction passes the drive's lag (`hil.estimator.simulation.back_emf`). Always a
+    frozenset after construction.
+    """
     lever: float | None = None
-    """Measured length of link 1 over gravity [s^2]: coupling is expected to be this times gravity_2, within
-    `LEVER_STD`. It decides only where the motion does not."""
+    """Measured length of link 1 over gravity [s^2], if known.
+
+    Coupling is expected to be this times gravity_2, within `LEVER_STD`. This prior only matters if the motion does not
+    determine the two.
+    """
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "options", frozenset(self.options))

@@ -21,7 +21,7 @@ SLIDING = 0.05  # rad/s: velocity above which a joint slides, with its bristles 
 
 
 LEAST_INERTIA = 0.2
-"""Of a joint's own: what back-EMF that comes late may leave of it. Less is no arm."""
+"""Minimum fraction of a joint's own inertia that remains after the correction for delayed back-EMF."""
 
 
 def place_of(term: str) -> int:
@@ -34,7 +34,7 @@ def place_of(term: str) -> int:
 
 VISCOUS, GENERATED = place_of("viscous"), place_of("back_emf")
 OWN_INERTIA = CONSTANTS.index("inertia_1"), CONSTANTS.index("armature_2")
-"""Where the inertia stands that only the joint itself feels, the rotor's among it."""
+"""Indices of the constants that include each joint's own inertia, such as that of its rotor."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,10 @@ class Physics:
     """Physical constants of one simulation."""
 
     vector: Array
-    """Constants in the order of CONSTANTS (constants,) [SI]; back_emf is not the share but the back-EMF itself
-    [N m s/rad]."""
+    """Constants in the order of CONSTANTS (constants,) [SI].
+
+    Here back_emf is not a share of viscous friction but the coefficient itself [N m s/rad].
+    """
     delay: float
     """Pure delay of the torque [s]."""
     lag: float
@@ -82,7 +84,7 @@ class Physics:
 
     @property
     def late(self) -> Array:
-        """By how much the joints' torques come late in all, delay and lag together (2,) [s]."""
+        """Total delay of each joint's torque: pure delay plus lag (2,) [s]."""
         late: Array = self.lags + max(self.delay, 0.0)
         return late
 

@@ -244,7 +244,7 @@ _DECLARED = (
     Term(
         "back_emf",
         "1",
-        "share of viscous friction that the motor generates: it passes the drive's lag as the voltage does",
+        "share of viscous friction due to back-EMF, which passes the drive's lag like the voltage",
         part="voltage",
         initial=0.92,
         log_spread=0.08,

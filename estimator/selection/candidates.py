@@ -161,7 +161,7 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 def ranked(
     about: Linearised, fitted: Sequence[str], richer: Mapping[str, Model], known: Mapping[str, float]
 ) -> list[Candidate]:
-    """Score tests of the models `richer`, by the part that each adds to the parameters `fitted`."""
+    """Return the score tests of the models `richer`, given by the part that each adds to the parameters `fitted`."""
     new = {part: tuple(n for n in more.names if n not in fitted) for part, more in richer.items()}
     base, _ = about.fall(fitted)
     found = []
@@ -196,15 +196,14 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def unruled(model: Model) -> list[str]:
-    """Parameters that the model lacks and that have an expected size."""
+    """Return the parameters that the model lacks and whose typical size is known."""
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
     return [name for name in left_out if term_of(name).spread is not None]
 
 
 def widened(about: Linearised, names: Sequence[str], covariance: Array, left_out: Sequence[str]) -> Array:
-    """The covariance of the fitted parameters `names` including that those `left_out` may not be what they are taken
-    for."""
+    """Return the covariance of the fitted parameters `names`, including the uncertainty of those `left_out`."""
     fitted = [*about.places(names), *about.states]
     extra = about.places(left_out)
     scale = np.sqrt(np.maximum(np.diag(about.normal), 1e-300))
@@ -247,7 +246,10 @@ def colour(residual: Array) -> float:
 
 
 def richer_models(model: Model) -> dict[str, Model]:
-    """Models with one option, or one law of friction, more: those that are linear in what they add."""
+    """Return the models with one more option or the next friction law, by the part that is added.
+
+    Presliding is left out, since the motion is not linear in its parameters.
+    """
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     richer: dict[str, Model] = {option: model.having(option) for option in absent if option != "presliding"}
     higher = FRICTIONS[FRICTIONS.index(model.friction) + 1 :][:1]

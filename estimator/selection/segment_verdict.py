@@ -1,4 +1,4 @@
-"""The verdict on an estimate from any motion: as `hil.estimator.selection.verdict`, from what segments tell."""
+"""The verdict on an estimate from any motion, as `hil.estimator.selection.verdict` but based on segments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from hil.estimator.selection.verdict import (
     Verdict,
 )
 
-LITTLE_TORQUE = 0.1  # of the RMS torque: less gravity than that is as good as none
+LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 IMPROVEMENT = {
     "inertia": "faster motion",
     "coupling": "faster motion of both joints together",
@@ -34,22 +34,25 @@ IMPROVEMENT = {
 
 @dataclass(frozen=True)
 class SegmentEvidence:
-    """What is known beside the estimate."""
+    """Evidence in addition to the estimate."""
 
     held_out: Array | None
-    """Error of predictions of segments not fitted, over the motion's RMS (joints,)."""
+    """RMS error of predictions of held-out segments, relative to the motion's RMS (joints,)."""
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     doubts: tuple[str, ...] = ()
     """Implausible values, as sentences."""
     faulty: bool = False
-    """Whether a warning forbids its use."""
+    """Whether a warning rules out using the estimate."""
     doubtful: bool = False
-    """Whether a warning casts doubt on it."""
+    """Whether a warning casts doubt on the estimate."""
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) -> dict[str, float]:
-    """Relative standard error of each base parameter except offsets; of little gravity, against the torque."""
+    """Return the relative standard error of each base parameter except offsets.
+
+    If gravity is negligible, its error is relative to LITTLE_TORQUE of the RMS torque.
+    """
     torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
     relative = {}
     for name, value, std in zip(estimate.model.base_names, estimate.value, estimate.std, strict=False):
@@ -61,7 +64,7 @@ def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) ->
 
 
 def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, evidence: SegmentEvidence) -> Verdict:
-    """The verdict on `estimate`, whose standard errors include what its model leaves out."""
+    """Return the verdict on `estimate`, whose standard errors include the effect of omitted terms."""
     relative = relative_std(recordings, estimate)
     left, held_out = float(estimate.residual_over_noise.max()), evidence.held_out
     weakest = max(relative, key=lambda name: relative[name])
@@ -104,7 +107,7 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
 
 def _predicted(held_out: Array | None, length: float) -> str:
     if held_out is None:
-        return "No held-out motion validated it: the recording is too short to keep a part of it back."
+        return "No held-out motion validated it: the recording is too short to hold a part of it out."
     return (
         f"Fitted to every other segment of {length:g} s, it predicts the others to within "
         f"{100.0 * float(held_out.max()):.2g} % of the motion's RMS."
@@ -115,6 +118,6 @@ def _weakest(name: str, part: float) -> str:
     if part <= WELL_KNOWN:
         return f"The least well known parameter is {name}, to {100 * part:.2g} %."
     if not np.isfinite(part):
-        return f"This motion reveals nothing of {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
+        return f"This motion provides no information on {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
     improvement = IMPROVEMENT[kind_of(name)]
     return f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}."

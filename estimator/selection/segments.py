@@ -1,4 +1,4 @@
-"""What segments of any motion tell beyond the fit: missing terms, error bars that include them, held-out motion."""
+"""Validation of fits to segments: missing terms, standard errors that include them, prediction of held-out motion."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,22 +14,22 @@ from hil.estimator.options import ShootingOptions
 from hil.estimator.selection.candidates import Candidate, Linearised, colour, ranked, richer_models, unruled, widened
 
 NOT_HERE: tuple[Option, ...] = ("zeros", "encoder", "lags", "ripple")
-"""What multiple shooting has in another form (each recording's zeros), or not at all."""
+"""Options that multiple shooting replaces (by the zeros of each recording) or does not support."""
 COARSE = ShootingOptions().coarse_step
-KNOWN_SHARE = 1.0 / 3.0  # of a held-out segment: tells the state that the rest is predicted from
+KNOWN_SHARE = 1.0 / 3.0  # fraction of a held-out segment that determines its initial state; the rest is predicted
 STATE_STEPS = 6
-FEWEST_ROWS = 3  # per unknown of the state
+FEWEST_ROWS = 3  # minimum number of samples per unknown of the initial state
 
 
 def missing_terms(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[Candidate]:
-    """Terms that could be added to the estimate's model, most significant first, by score tests."""
+    """Return the terms that could be added to the estimate's model, most significant first, by score tests."""
     richer = {part: more for part, more in richer_models(estimate.model).items() if part not in NOT_HERE}
     names = {name for more in richer.values() for name in more.names if name not in estimate.names}
     return ranked(linearised(recordings, estimate, sorted(names)), estimate.names, richer, {})
 
 
 def considered(recordings: Sequence[Recording], estimate: ShootingEstimate) -> ShootingEstimate:
-    """The estimate with error bars that include omitted terms which cannot be ruled out."""
+    """Return the estimate with standard errors that include omitted terms which cannot be ruled out."""
     left_out = [name for name in unruled(estimate.model) if term_of(name).part not in NOT_HERE]
     if not left_out:
         return estimate
@@ -38,9 +38,10 @@ def considered(recordings: Sequence[Recording], estimate: ShootingEstimate) -> S
 
 
 def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, names: Sequence[str]) -> Linearised:
-    """The weighted sum of squares about `estimate`, the segments' own states eliminated, by parameters and zeros.
+    """Return the quadratic approximation of the weighted sum of squares about `estimate`, by parameters and zeros.
 
-    `names`: parameters beside the estimate's, which are expanded about where they are absent.
+    The initial states of the segments are eliminated. names: additional parameters, expanded about the values at which
+    they have no effect.
     """
     problem = _posed(recordings, estimate)
     every = (*estimate.names, *(name for name in names if name not in estimate.names))
@@ -56,7 +57,7 @@ def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, name
         weight = np.broadcast_to(1.0 / size, shape).reshape(-1)
         r, J = rows * weight, columns * weight[:, None]
         mine, state = J[:, :causes], J[:, causes:]
-        # What the state at the segment's start explains is no news of the parameters.
+        # Changes that the segment's initial state explains carry no information about the parameters.
         Q = np.linalg.qr(state)[0]
         mine, r = mine - Q @ (Q.T @ mine), r - Q @ (Q.T @ r)
         normal += mine.T @ mine
@@ -79,10 +80,10 @@ def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, name
 def held_out_errors(
     recordings: Sequence[Recording], estimate: ShootingEstimate, of: slice = ALL
 ) -> tuple[Array, float]:
-    """Error of predictions of segments, over the motion's RMS: of each joint (joints,), and of the usual segment.
+    """Return the RMS error of predicted segments relative to the motion's RMS: per joint (joints,), and the median.
 
-    The state at a segment's start is what its first third says; the rest is predicted by torque alone. The usual
-    segment is the median: where an arm turns over, one can be off by any amount.
+    The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
+    median is that over segments, since the error of a segment in which the arm tumbles can be arbitrarily large.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints
@@ -112,7 +113,7 @@ def held_out_errors(
 
 
 def predicted_positions(recordings: Sequence[Recording], estimate: ShootingEstimate) -> tuple[Array, ...]:
-    """Positions (joints, samples) [rad] of each recording, segment by segment from its estimated state; NaN between."""
+    """Return the simulated positions of each recording (joints, samples) [rad]; NaN outside the fitted segments."""
     problem = _posed(recordings, estimate)
     offsets = estimate.zeros.reshape(-1) / ShootingOptions().angle_scale
     predicted = tuple(np.full(each.position.shape, np.nan) for each in recordings)

@@ -146,14 +146,17 @@ def choose(
 
 @dataclass(frozen=True)
 class Fitting:
-    """The fit of one model to one set of periods, as a value that another process can be given."""
+    """The data for fitting models to one set of periods, in a form that can be passed to another process."""
 
     periods: Sequence[SettledPeriod]
     held_out: SettledPeriod | None
     starts: Sequence[Mapping[str, float]]
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
-        """From where `near` ended, with `values` for what it lacks, or from scratch; raises ConvergenceError."""
+        """Fit `model` from the result of `near`, using `values` for what it lacks, or from scratch.
+
+        Raises ConvergenceError.
+        """
         started = time.perf_counter()
         place = None
         if near is not None and near.estimate is not None:
@@ -199,13 +202,13 @@ class Selection:
         """All trials in chronological order."""
 
     def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
-        """Begin a fit that may be needed, if there is an executor; one that is not needed is no trial."""
+        """Start a fit that may be needed, if there is an executor; it only becomes a trial once it is needed."""
         key = (model, id(near), coarse)
         if self._executor is not None and key not in self._begun:
             self._begun[key] = self._executor.submit(self._fitting.trial, model, near, {}, coarse)
 
     def end(self) -> None:
-        """Give up fits that were begun and not needed."""
+        """Cancel fits that were started but not needed."""
         for future in self._begun.values():
             future.cancel()
 
@@ -372,8 +375,10 @@ def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) ->
 def pruned_model(
     model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
 ) -> Model:
-    """`model` without what its parameters (parameters,) and covariance do not tell from nothing at `level`; `fixed`
-    stays in."""
+    """Return `model` without the parts that do not differ significantly from zero at `level`; `fixed` is kept.
+
+    value, covariance: parameters (parameters,) and their covariance, in the order of `names`.
+    """
     names, value, covariance = list(names), value.copy(), covariance.copy()
     covariance[~np.isfinite(covariance)] = 0.0
     while True:

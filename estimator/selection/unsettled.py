@@ -1,12 +1,12 @@
 """Friction model selection for recordings without a settled period.
 
-As for settled periods (`hil.estimator.selection.settled`): Stribeck friction first; if that does not explain the
-motion or score tests find something, all else that is smooth at once, with what is usual of it as the prior; then
-insignificant terms are removed. Every fit but the first begins where one before ended.
+The procedure is that for settled periods (`hil.estimator.selection.settled`). Stribeck friction is fitted first. If it
+does not explain the motion, or if score tests find something, all other smooth terms are added at once, with their
+typical sizes as a prior; then insignificant terms are removed. Every fit but the first starts from an earlier result.
 
-Where the motion is explained down to the noise, the likelihood decides. Where it is not, what a richer model gains may
-be another term's error: then every other segment of each recording is fitted, the others are predicted, and the model,
-with friction that yields before it slides among them, that predicts them best is fitted once more to all.
+If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
+another missing term. Then every other segment of each recording is fitted and the remaining ones are predicted, also by
+models with presliding friction. The model that predicts them best is fitted once more to all segments.
 """
 
 import time
@@ -29,10 +29,10 @@ from hil.estimator.selection.settled import pruned_model
 DEFAULTS = SelectionOptions()
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
-"""What is nothing where it is small, and so costs a fit nothing but its columns."""
+"""Terms that vanish smoothly, so that including them costs a fit little."""
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
-"""Of fits that are only compared."""
+"""Options of fits that are only compared with each other."""
 EXPLAINED = 1.1  # residual over noise: the noise is estimated from the same samples
 NEARLY = 1.5  # residual over noise up to which the likelihood can be trusted to choose
 
@@ -45,7 +45,7 @@ class SegmentTrial:
     held_out: Array | None
     """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Median of the segments' relative errors over all joints: a segment in which the arm turns over can be far off."""
+    """Median of the segments' relative errors over all joints; one in which the arm tumbles can be far off."""
     seconds: float
 
 
@@ -59,7 +59,7 @@ class SegmentChoice:
 
     @property
     def gained(self) -> float:
-        """The plainest model's error over the chosen one's."""
+        """Ratio of the simplest model's error to the chosen one's."""
         fitted = [each for each in self.trials if each.held_out is not None]
         return min(fitted, key=lambda each: len(each.model.names)).score / self.chosen.score
 
@@ -76,9 +76,8 @@ def choose_by_shooting(
 ) -> SegmentChoice:
     """Fit friction with the terms that the recordings support.
 
-    Arguments as of `estimate_by_shooting`; `torque_scale`: whether the ratio of the torque constants stays in whatever
-    it is. Raises RecordingError for recordings of fewer than two segments each, ConvergenceError when no model can be
-    fitted.
+    Arguments as for `estimate_by_shooting`; torque_scale: whether the ratio of the torque constants is kept in any
+    case. Raises RecordingError if no recording has two segments, ConvergenceError if no model can be fitted.
     """
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(
@@ -98,7 +97,10 @@ def choose_by_shooting(
 
 
 def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, start: Array) -> Array | None:
-    """Error of the estimate's model, fitted to every other segment, on the others (joints,); None for one segment."""
+    """Return the error of the estimate's model on every other segment when fitted to the remaining ones (joints,).
+
+    None if no recording has two segments.
+    """
     length, zeros = estimate.segment_length, bool(estimate.zeros.size)
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         return None
@@ -107,7 +109,7 @@ def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, 
 
 
 class _Search:
-    """Fits of one set of recordings, each from where another ended."""
+    """Fits of one set of recordings, each starting from the result of an earlier one."""
 
     def __init__(
         self,
@@ -133,7 +135,7 @@ class _Search:
         of: slice = ALL,
         options: ShootingOptions = FINE,
     ) -> ShootingEstimate | None:
-        """An estimate; None where the fit finds no end."""
+        """Return an estimate; None if the fit does not converge."""
         try:
             return estimate_by_shooting(
                 self._recordings,
@@ -149,9 +151,9 @@ class _Search:
             return None
 
     def trial(self, near: ShootingEstimate, model: Model) -> SegmentTrial:
-        """How well `model` predicts segments that it is not fitted to; the fit begins where `near` ended.
+        """Return how well `model` predicts segments to which it was not fitted, starting the fit from `near`.
 
-        That end has seen the held-out segments, but only chooses the minimum, not where in it the fit ends.
+        `near` was also fitted to these segments, but it only determines which local minimum is found, not its location.
         """
         if model not in self._trials:
             began = time.perf_counter()
@@ -161,7 +163,7 @@ class _Search:
         return self._trials[model]
 
     def grown(self, plain: ShootingEstimate) -> ShootingEstimate:
-        """The richest model that the recordings support."""
+        """Return the estimate with the richest model that the recordings support."""
         if _left(plain) < EXPLAINED and not self._seen(plain):
             return self._pruned(plain)
         smooth = replace(plain.model, friction=FRICTIONS[-1]).having(*SMOOTH)
@@ -172,7 +174,7 @@ class _Search:
         return self._by_prediction(plain)
 
     def _by_prediction(self, plain: ShootingEstimate) -> ShootingEstimate:
-        """Where nothing explains the motion: what predicts best, of models from plain to rich."""
+        """Return the estimate whose model predicts best, for motions that no model explains."""
         best, near = self.trial(plain, plain.model), plain
         loaded = replace(plain.model, friction=FRICTIONS[-1])
         for richer in (loaded, loaded.having("presliding"), loaded.having(*SMOOTH)):
@@ -183,7 +185,7 @@ class _Search:
         return self.fit(best.model, near) or plain
 
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
-        """The choice, after all segments were fitted: the plainer one if it predicts the held-out ones much better."""
+        """Return the choice: `best`, or the simplest model if that predicts held-out segments much better."""
         simple = Model(plain.model.joints, "coulomb", plain.model.drive)
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)
         if plainest.score < self._options.overrule_ratio * chosen.score:
@@ -197,7 +199,7 @@ class _Search:
         return bool(found) and found[0].evidence > 1.0
 
     def _pruned(self, best: ShootingEstimate) -> ShootingEstimate:
-        """Fitted finely, without what is not told from nothing."""
+        """Return the final fit without insignificant terms."""
         for level in self._options.prune_levels:
             model = pruned_model(best.model, best.names, best.value, best.covariance, level, self._fixed)
             if model == best.model:
@@ -209,11 +211,11 @@ class _Search:
         return self.fit(best.model, best) or best
 
     def _gain(self, richer: ShootingEstimate, plainer: ShootingEstimate) -> float:
-        """Twice the gain in log-likelihood."""
+        """Return twice the gain in log-likelihood."""
         return 2.0 * self._samples * float(np.log(_left(plainer) / _left(richer)))
 
     def _worth(self, richer: ShootingEstimate, plainer: ShootingEstimate) -> float:
-        """The gain required of additional terms: the penalty of the Bayesian information criterion."""
+        """Return the gain required of additional terms: the penalty of the Bayesian information criterion."""
         return max(1, len(richer.names) - len(plainer.names)) * float(np.log(self._samples))
 
     @property
@@ -222,5 +224,5 @@ class _Search:
 
 
 def _left(estimate: ShootingEstimate) -> float:
-    """RMS residual in units of the noise."""
+    """Return the RMS residual in units of the noise."""
     return max(1e-6, float(np.sqrt(np.mean(estimate.residual_over_noise**2))))

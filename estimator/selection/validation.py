@@ -60,8 +60,7 @@ class Validation:
     relative_std: dict[str, float]
     """Relative standard error of each base parameter except offsets."""
     torque_std: dict[str, float]
-    """Standard error of the torque that each of these contributes to the fitted motion, RMS over that of the joint's
-    torque, worst joint."""
+    """Standard error of the torque that each of these contributes, over the joint's torque (RMS, worst joint)."""
     levels: Levels
 
     @property
@@ -109,7 +108,7 @@ def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]
 
 
 def _torque_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
-    """Standard error of each base parameter except offsets, as a share of the torque that moved the joints."""
+    """Return the standard error of each base parameter except offsets, as a fraction of the joints' torque."""
     lines = lines_of(estimate.position)
     motion = motion_of(lines, cut_off(lines), period.fundamental, period.samples)
     torque = np.sqrt(np.mean(period.torque**2, axis=1))

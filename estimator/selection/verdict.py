@@ -96,7 +96,7 @@ def _trust(validation: Validation, evidence: Evidence) -> Trust:
 
 
 def _is_weak(validation: Validation, name: str) -> bool:
-    """Whether a parameter is poorly known and the arm's torque depends on it."""
+    """Return whether a parameter is poorly known and the arm's torque depends on it."""
     return validation.relative_std[name] > WEAK and not validation.torque_std[name] <= LITTLE_EFFECT
 
 
@@ -156,7 +156,7 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     """Return the response on lines that were left unexcited, and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        return ("experiment.detection = true would tell odd causes (friction) from even ones (offsets, direction).",)
+        return ("experiment.detection = true would separate odd (friction) from even causes (offsets, direction).",)
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 
@@ -166,8 +166,8 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     found = (
         f"On lines that were not excited, joint {joint + 1} responds with {share(levels.odd.motion)} of an excited "
         f"line's motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, "
-        f"direction-dependent effects); noise is {share(levels.noise)}. The model leaves {share(levels.odd.left)} and "
-        f"{share(levels.even.left)}."
+        f"direction-dependent effects); noise is {share(levels.noise)}. The model does not explain "
+        f"{share(levels.odd.left)} and {share(levels.even.left)}."
     )
     beyond = [
         hint

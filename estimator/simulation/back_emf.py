@@ -1,18 +1,18 @@
-"""Back-EMF of joints driven by voltage: a part of the motor's torque, and as late as the voltage.
+"""Back-EMF of joints driven by voltage: a part of the motor's torque, subject to the same lag as the voltage.
 
-A voltage u drives the current i through the winding, lag i' = (u - k v) / R - i: what the motor generates passes the
-same lag as the command. Of viscous friction the share `back_emf` is k^2 / R. A first-order lag of it is, with the motor
-written as a voltage that lags and a brake that does not,
+A voltage u drives the current i through the winding, lag i' = (u - k v) / R - i, so the back-EMF passes the same lag as
+the command. The fraction `back_emf` of viscous friction is due to it, b = k^2 / R. The equivalent motor, with a lagging
+voltage and a brake b without lag, is
 
     1 / (lag J s^2 + J s + b) = 1 / ((lag' s + 1) ((J - b lag') s + b)),    lag' (J - b lag') = lag J
 
-exactly so for a joint of inertia J and brake b: the same motion as that of a command with the lag lag' on a joint whose
-inertia is less by b lag'. That is how it is simulated: `Physics.of` takes back_emf viscous (lag + delay) off the
-inertia that only this joint feels. On an XL430 that is 5 to 10 % of it. The lag found is lag', a little more than the
-winding's. What friction does to the motor's current comes too late by lag' - lag (`neglected`).
+which is exact for a joint of inertia J: it moves like a joint whose inertia is smaller by b lag', under a command with
+the lag lag'. It is simulated in this way: `Physics.of` subtracts back_emf viscous (lag + delay) from the joint's own
+inertia, 5 to 10 % of it on an XL430. The estimated lag is lag', slightly larger than that of the winding. The effect of
+friction on the motor's current is late by lag' - lag (see `neglected`).
 
-Ripple, saturation and friction under load belong to the motor's torque, so to the voltage's less what is generated
-(`hil.estimator.simulation.arm`).
+Ripple, saturation and load-dependent friction act on the motor's torque, which is that of the voltage minus that of the
+back-EMF (`hil.estimator.simulation.arm`).
 """
 
 import numpy as np
@@ -21,11 +21,11 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, GENERATED, OWN_INERTIA, VISCOUS, Physics
 
 _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_difference_2": (1,)}
-"""Of which joints a parameter makes the torque late."""
+"""Joints whose torque each of these parameters delays."""
 
 
 def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
-    """What the simulation must differentiate by for derivatives by `names`."""
+    """Return the constants by which the simulation must differentiate to yield derivatives by `names`."""
     through = [
         CONSTANTS[place]
         for joint in _generating(physics)
@@ -36,8 +36,10 @@ def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Array:
-    """Derivatives (joints, samples, causes) by the parameters `names` and the rest, from those of the simulation by
-    `causes_of` them and the rest, where viscous friction and back-EMF are two constants and inertia is a third.
+    """Return the derivatives (joints, samples, causes) by the parameters `names`, followed by the remaining causes.
+
+    They are computed from `derivative`, the simulation's derivatives by `causes_of` these names and the same remaining
+    causes. In the simulation viscous friction, back-EMF and the joint's inertia are separate constants.
     """
     joints = _generating(physics)
     if not joints:
@@ -64,10 +66,10 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
 
 
 def neglected(physics: Physics) -> dict[str, float]:
-    """Standard deviations of the joints' own inertias by what this description neglects, by name [kg m^2].
+    """Return the standard deviations of the joints' own inertias due to what this description neglects [kg m^2].
 
-    Friction reaches the motor's current by lag' - lag too late, which is to second order in b lag' / J: nothing on most
-    arms, but 5 % of the inertia of an XL430 that carries next to nothing.
+    Friction affects the motor's current later by lag' - lag, which is of second order in b lag' / J: negligible on most
+    arms, but 5 % of the inertia of an XL430 with hardly any load. The result is by name.
     """
     found = {}
     for joint in _generating(physics):
@@ -78,5 +80,5 @@ def neglected(physics: Physics) -> dict[str, float]:
 
 
 def _generating(physics: Physics) -> list[int]:
-    """Joints, from 0, that are driven by voltage."""
+    """Return the joints (from 0) that are driven by voltage."""
     return [int(joint) for joint in np.flatnonzero(physics.vector[GENERATED : GENERATED + 2])]

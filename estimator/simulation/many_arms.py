@@ -66,7 +66,7 @@ class ManyArms:
         return int(self.scale.shape[1])
 
     def part(self, first: int, last: int) -> "ManyArms":
-        """The arms from number `first` up to, not including, `last`."""
+        """Return the arms with indices from `first` to `last` - 1."""
         return ManyArms(self.physics[first:last], self.scale[first:last], self.pose[first:last], self.feedback)
 
     def peaks(

@@ -22,7 +22,7 @@ from hil.fakes.bus.joints import Joints
 from hil.fakes.plants.plant import CanBeHeld, Plant, PlantError
 
 _PULL_S = 0.01
-"""Time constant with which the hand corrects the joint's deviation from the wanted path [s]."""
+"""Time constant with which the hand corrects the joint's deviation from the planned path [s]."""
 
 
 class Move(BaseModel):

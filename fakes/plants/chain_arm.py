@@ -53,7 +53,7 @@ class ChainArm(BaseModel):
         for name, angle, drive in zip(self.joints, self.start, self.drives, strict=True):
             told = [term for term in PLANAR_ONLY if getattr(drive, term)]
             if told:
-                raise ValueError(f"drives: {told[0]} of {name}: is only supported by planar fake arms; leave it out")
+                raise ValueError(f"drives: {told[0]} of {name} is only supported by planar fake arms; leave it out")
             if drive.stops is not None and not drive.stops[0] <= angle <= drive.stops[1]:
                 raise ValueError(f"start: {angle:g} rad for joint {name} is beyond its stops {list(drive.stops)}")
         _ = self.description

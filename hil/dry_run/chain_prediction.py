@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.clearance.space import Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.prediction import Prediction, limits_of, peaks_of
-from hil.estimator.chain.rollout import ChainArms, Loop, Motions, roll_out
+from hil.estimator.chain.simulation.rollout import ChainArms, Loop, Motions, roll_out
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from hil.config.schema import Config, PriorConfig
 from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior
-from hil.estimator.chain.dynamics import TERMS
-from hil.estimator.chain.rollout import ChainArms
+from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.plan.chain_model import KnownChain
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prediction import predict
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.simulation.prediction import predict
 from hil.fakes.plants.arm import armature
 from hil.plan.chain_model import KnownChain, known_chain
 from hil.plan.plan import HELD_OUT, IDENTIFY

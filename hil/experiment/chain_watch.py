@@ -13,8 +13,8 @@ from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.dry_run.chain_prior import prior_arms
 from hil.errors import Cause, SafetyStop
-from hil.estimator.chain.motion_observer import ChainObserver
-from hil.estimator.chain.rollout import ChainArms
+from hil.estimator.chain.simulation.motion_observer import ChainObserver
+from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.plan.chain_model import known_chain
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from hil.drivers.latency import command_to_set, latency_timer
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
-from hil.estimator.chain.rollout import ChainArms
+from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.guard import MOST_OUTSIDE_RAD
 from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits

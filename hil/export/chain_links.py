@@ -9,9 +9,9 @@ from hil.chain_model import ChainArmModel
 from hil.description.arm import ArmDescription, ArmFileError, Body
 from hil.description.files import read_arm
 from hil.errors import ExportError
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.geometry import Chain
-from hil.estimator.chain.physical_links import nearest_links
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.physical_links import nearest_links
 from hil.export.source import Source
 
 FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added

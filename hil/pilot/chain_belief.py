@@ -13,7 +13,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from hil.config.schema import Config, StabiliserConfig
 from hil.dry_run.chain_prior import prior_arms
-from hil.estimator.chain.rollout import ChainArms, inertias, is_physical
+from hil.estimator.chain.simulation.rollout import ChainArms, inertias, is_physical
 from hil.experiment.chain_watch import linear_parameters
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
 from hil.runs.recording import Phase

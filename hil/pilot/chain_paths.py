@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.errors import NoSafeTorque
-from hil.estimator.chain.excitation import Path
-from hil.estimator.chain.path_design import Design, PathDesigner, PathLimits
+from hil.estimator.chain.excitation.fourier_path import Path
+from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits
 from hil.estimator.errors import ExcitationError
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
 from hil.plan.chain_plan import path_plan

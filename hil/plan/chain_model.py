@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.description.urdf import rotation_of
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.excitation import Path
-from hil.estimator.chain.geometry import Chain
-from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.excitation.fourier_path import Path
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.prior import Prior
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimator.chain.excitation import Path, design_path
+from hil.estimator.chain.excitation.fourier_path import Path, design_path
 from hil.estimator.excitation.multisine import Multisine
 from hil.plan.chain_model import ChainTorque, KnownChain, described_torque, known_chain, torque_limits
 from hil.plan.plan import Plan, Segment, make_plan, plan_with

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil.clearance.space import Space
 from hil.config.schema import Config
-from hil.estimator.chain.excitation import Path
+from hil.estimator.chain.excitation.fourier_path import Path
 from hil.plan.chain_plan import SETTLE_IN, PathSegment
 from hil.plan.plan import Plan
 

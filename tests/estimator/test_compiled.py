@@ -8,11 +8,11 @@ from hil.estimator.simulation import arm, sensitivity
 
 def test_a_change_of_any_compiled_source_changes_the_digest(tmp_path: Path) -> None:
     for folder in compiled.FOLDERS:
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "one.py").write_text("A = 1\n", encoding="utf-8")
+        (tmp_path / folder / "deeper").mkdir(parents=True)
+        (tmp_path / folder / "deeper" / "one.py").write_text("A = 1\n", encoding="utf-8")
     seen = {compiled.sources_digest(tmp_path)}
     for folder in compiled.FOLDERS:
-        (tmp_path / folder / "one.py").write_text("A = 2\n", encoding="utf-8")
+        (tmp_path / folder / "deeper" / "one.py").write_text("A = 2\n", encoding="utf-8")
         compiled.sources_digest.cache_clear()
         seen.add(compiled.sources_digest(tmp_path))
     compiled.sources_digest.cache_clear()

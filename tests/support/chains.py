@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hil.estimator.chain.dynamics import TERMS
-from hil.estimator.chain.geometry import Chain
+from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.model.geometry import Chain
 
 
 def random_urdf(joints: int, seed: int) -> str:

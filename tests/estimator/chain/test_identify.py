@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks import chain as bench
+from hil.estimator.chain.fit.regression import fit_filtered
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prediction import predict, relative_error
-from hil.estimator.chain.regression import fit_filtered
-from hil.estimator.chain.simulation import ChainRun, Simulation
-from hil.estimator.chain.stepping import JOINT_TERMS
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.simulation.prediction import predict, relative_error
+from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
+from hil.estimator.chain.simulation.stepping import JOINT_TERMS
 from hil.estimator.data.recording import Recording
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ModelError

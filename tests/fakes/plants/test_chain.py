@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hil.estimator.chain.dynamics import inverse_dynamics, mass_matrix
-from hil.estimator.chain.geometry import Chain
+from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix
+from hil.estimator.chain.model.geometry import Chain
 from hil.fakes.plants.arm import Drive, armature
 from hil.fakes.plants.chain import SpatialChain
 from hil.fakes.plants.chain_arm import ChainArm

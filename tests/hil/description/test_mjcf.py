@@ -8,8 +8,8 @@ import pytest
 
 from hil.description.arm import ArmFileError
 from hil.description.files import read_arm
-from hil.estimator.chain.dynamics import inverse_dynamics
-from hil.estimator.chain.geometry import Chain
+from hil.estimator.chain.model.dynamics import inverse_dynamics
+from hil.estimator.chain.model.geometry import Chain
 from tests.support.chains import random_urdf
 
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -17,8 +17,8 @@ from hil.estimation.chain_estimate import unmoved
 from hil.estimation.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimation.unsettled.estimate import estimate_unsettled
-from hil.estimator.chain.dynamics import inverse_dynamics
-from hil.estimator.chain.geometry import Chain, parameter_names
+from hil.estimator.chain.model.dynamics import inverse_dynamics
+from hil.estimator.chain.model.geometry import Chain, parameter_names
 from hil.experiment.run import run_experiment
 from hil.export.formats import export
 from hil.plan.chain_plan import make_chain_plan

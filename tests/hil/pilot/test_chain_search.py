@@ -9,7 +9,7 @@ from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import unsafe
 from hil.errors import NoSafeTorque
-from hil.estimator.chain.excitation import Path as Motion
+from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.chain_search import step_config

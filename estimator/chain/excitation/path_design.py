@@ -2,8 +2,8 @@
 
 An evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A. Ostermeier,
 Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite Fourier series of
-`hil.estimator.chain.excitation`: the criterion has no gradient that would be cheaper than its value. Every variation is
-scaled into the limits of position and speed and then shrunk until `allowed` accepts it.
+`hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is scaled to the
+limits of position and speed and then shrunk until `allowed` accepts it.
 """
 
 from collections.abc import Callable
@@ -12,26 +12,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.excitation import Path
-from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.excitation.fourier_path import Path
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.errors import ExcitationError
 
-LOOKED_AT = 120  # samples of each variation
-NOISE = 0.02  # of a joint's torque: what a regression is thought to leave
+LOOKED_AT = 120  # samples at which a variation is evaluated
+NOISE = 0.02  # assumed residual of a regression, relative to a joint's RMS torque
 CENTRES = 48
 OFFSPRING, PARENTS = 20, 6
 GENERATIONS = 60
 FIRST_STEP, FASTER, SLOWER = 0.3, 1.1, 0.9
 SHRINKS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
-SWING_SHARE = 0.9  # of the room between a centre and the nearer limit
+SWING_SHARE = 0.9  # fraction of the distance from a centre to the nearer limit
 LEAST_SWING_SHARE = 0.15
-_MEAN_SHARE = 0.1  # of the criterion: how certain the others are
+_MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the worst one has the rest
 
 
 @dataclass(frozen=True)
 class PathLimits:
-    """low, high [rad], speed [rad/s] (joints,). allowed: whether torque and clearance of a path are in order."""
+    """Limits of angle `low` and `high` [rad] and `speed` [rad/s] (joints,).
+
+    `allowed` returns whether a path respects the limits of torque and clearance.
+    """
 
     low: Array
     high: Array
@@ -41,8 +44,11 @@ class PathLimits:
 
 @dataclass(frozen=True)
 class Design:
-    """lines: Fourier coefficients (joints, harmonics), complex; centre (joints,) [rad]; the path that they make within
-    the limits; worst and the median relative standard error that it leaves, in units of the prior's scale."""
+    """A path within the limits, and how well it determines the base parameters.
+
+    centre: (joints,) [rad]. lines: complex Fourier coefficients (joints, harmonics), before scaling to the limits.
+    worst, median: standard errors of the base parameters after the path, relative to the prior's standard deviation.
+    """
 
     centre: Array
     lines: Array
@@ -71,7 +77,7 @@ class PathDesigner:
         self._joints = len(limits.low)
 
     def plain(self, centre: Array, seed: int) -> Design:
-        """Random phases about a centre, scaled into the limits. Raises ExcitationError where nothing is allowed."""
+        """Return a random path about a centre, scaled to the limits; raises ExcitationError if it is not allowed."""
         random = np.random.default_rng(seed)
         found = self._finished(centre, self._random_lines(random))
         if found is None:
@@ -79,7 +85,7 @@ class PathDesigner:
         return found
 
     def design(self, seed: int, generations: int = GENERATIONS) -> Design:
-        """The best path found; raises ExcitationError where none is allowed."""
+        """Return the best path found; raises ExcitationError if none is allowed."""
         random = np.random.default_rng(seed)
         centre, lines = self._start(random)
         mean = np.concatenate((self._shares_of(centre), lines.real.reshape(-1), lines.imag.reshape(-1)))
@@ -105,18 +111,18 @@ class PathDesigner:
         return found
 
     def scaled(self, design: Design, share: float) -> Path:
-        """The same path, smaller about its centre."""
+        """Return the design's path with its amplitude scaled by `share`."""
         centre = design.path.position.mean(axis=1, keepdims=True)
         path = design.path
         return Path(centre + share * (path.position - centre), share * path.velocity, share * path.acceleration)
 
     def worth(self, path: Path) -> tuple[float, float]:
-        """Worst and median relative standard error of the base parameters that a path leaves."""
+        """Return the worst and the median relative standard error of the base parameters after a path."""
         errors = self._errors(path, max(1, path.position.shape[1] // LOOKED_AT))
         return float(errors.max()), float(np.median(errors))
 
     def _start(self, random: np.random.Generator) -> tuple[Array, Array]:
-        """The best of random paths about random centres, the middle of the limits among them."""
+        """Return centre and coefficients of the best random path, about random centres or the middle of the limits."""
         low, high = self._limits.low, self._limits.high
         best: tuple[float, Array, Array] | None = None
         for number in range(CENTRES):
@@ -147,7 +153,7 @@ class PathDesigner:
         return float((1.0 - _MEAN_SHARE) * errors.max() + _MEAN_SHARE * errors.mean())
 
     def _errors(self, path: Path, every: int) -> Array:
-        """Relative standard errors (base parameters,): over the prior's standard deviation, as of a whole period."""
+        """Return standard errors after one whole period (base parameters,), relative to the prior's."""
         some = slice(0, None, every)
         Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
         level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1)) + 1e-6
@@ -168,7 +174,7 @@ class PathDesigner:
         return Design(centre, lines, path, worst, median)
 
     def _fitted(self, centre: Array, lines: Array, waves: tuple[Array, Array, Array]) -> Path | None:
-        """The path of these coefficients as large as limits of position and speed let it, then as `allowed` does."""
+        """Return the path scaled to the limits of position and speed and shrunk until allowed; None if it never is."""
         room = np.minimum(centre - self._limits.low, self._limits.high - centre)
         span = self._limits.high - self._limits.low
         swing = np.maximum(SWING_SHARE * room, 0.0)
@@ -192,7 +198,7 @@ class PathDesigner:
         return None
 
     def _waves(self, samples: int) -> tuple[Array, Array, Array]:
-        """exp(i k w t) and its derivatives by time (harmonics, samples)."""
+        """Return exp(i k w t) and its first two time derivatives (harmonics, samples)."""
         turn = 2j * np.pi * np.arange(1, self._count + 1)[:, None] / self._period
         wave = np.exp(turn * np.arange(samples) * self._period / samples)
         return wave, turn * wave, turn**2 * wave

@@ -1,11 +1,12 @@
-"""Checks sample by sample whether the motion of an arm in space is consistent with what is known of it.
+"""Checks at every sample whether the motion of a spatial arm is consistent with what is known about it.
 
-Angles, velocities and commanded torques pass the same first-order low-pass, whose own slope gives accelerations. What
-then lacks of the commanded torque, `torque - Y(q, v, a) theta`, is compared with what the parameters' covariance, the
-velocities' rounding and a noise that is learnt leave open. Parameters are learnt from sample to sample (a Kalman filter
-on constants that drift slowly), so that what is allowed narrows as the arm moves. As in
-`hil.estimator.models.momentum_observer`, which planar arms use, an alarm takes `HOLD_S`, more than `TIMES` standard
-deviations, more than friction can hold while the joint stands, and more than a share of the largest planned torque.
+Angles, velocities and commanded torques pass the same first-order low-pass filter, which also yields accelerations.
+The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, due to the parameters' covariance,
+rounding of the velocities, and noise that is estimated while the arm moves. The parameters are updated as well (a
+Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
+`hil.estimator.models.momentum_observer`, which planar arms use, an alarm requires a residual that, after subtraction of
+the friction that can hold a joint at rest, exceeds `TIMES` standard deviations and a fraction of the largest planned
+torque for `HOLD_S`; large residuals raise it sooner.
 """
 
 import math
@@ -15,43 +16,52 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import places
-from hil.estimator.chain.kernels import accelerate, move, place, regress, room
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import places
+from hil.estimator.chain.model.kernels import accelerate, move, place, regress, room
 from hil.estimator.compiled import compiled
 
 FILTER_S = 0.02
 HOLD_S = 0.02
 TIMES = 4.0
 FLOOR_SHARE = 0.25
-"""Of the largest planned torque: less is never an alarm."""
+"""Fraction of the largest planned torque; a smaller residual never raises an alarm."""
 
 FIRST_NOISE_SHARE = 0.1
-STANDING = 0.05  # rad/s below which a joint may be held by its dry friction
-STATIC = 1.5  # static friction over Coulomb's
-VELOCITY_STD = 0.0135  # rad/s: a register's step and some noise
+STANDING = 0.05  # rad/s: below this, dry friction may hold a joint
+STATIC = 1.5  # ratio of static to Coulomb friction
+VELOCITY_STD = 0.0135  # rad/s: resolution of the register and some noise
 NOISE_S = 1.0
 CLIPPED = 9.0
 DRIFT, LEAST_DRIFT = 0.03, 1e-3
 MOST_WEIGHT = 4.0
 WARM_S = 3 * FILTER_S
 LONGEST_GAP = 3.0
-# Rows of the memory of single numbers, per joint: filtered angle, velocity, torque; acceleration, noise variance, how
-# long it stood, time of alarm, samples of it, lacking torque. Then of all: time since the last lesson, age.
+# Rows of the observer's memory. Per joint: filtered angle, velocity and torque, acceleration, noise variance, filtered
+# indicator of standstill (0 to 1), time and number of samples above the limit, residual torque. The last row applies to
+# the whole arm: time since the last update of the parameters, time since the start.
 ANGLE, VELOCITY, TORQUE, SLOPE, NOISE, STANDS, HELD, SAMPLES, LACKING, TIMES_OF_ALL = range(10)
 
 
 class ChainObserver:
-    """mean: base parameters, then viscous and dry friction and offsets (base + 3 joints,) [SI]; covariance of them.
+    """Detects motion that is inconsistent with the arm's parameters, and refines these as the arm moves.
 
-    largest: planned torque of each joint (joints,) [N m]. interval: from one sample to the next [s].
+    mean: base parameters, then viscous friction, dry friction and offsets (base + 3 joints,) [SI].
+    covariance: of `mean`.
+    largest: largest planned torque of each joint (joints,) [N m].
+    interval: sampling interval [s].
+
+    Raises ValueError for arrays of other shapes.
     """
 
     def __init__(self, base: BaseParameters, mean: Array, covariance: Array, largest: Array, interval: float) -> None:
         n = base.chain.joints
         count = base.count + 3 * n
         if mean.shape != (count,) or covariance.shape != (count, count) or largest.shape != (n,):
-            raise ValueError(f"{mean.shape}, {covariance.shape} and {largest.shape} for {count} parameters, {n} joints")
+            raise ValueError(
+                f"mean {mean.shape}, covariance {covariance.shape} and largest {largest.shape} must be "
+                f"{(count,)}, {(count, count)} and {(n,)}"
+            )
         self._theta, self._covariance = np.array(mean), np.array(covariance)
         self._memory = np.zeros((10, max(n, 2)))
         self._first = np.array((FIRST_NOISE_SHARE * largest) ** 2)
@@ -62,14 +72,20 @@ class ChainObserver:
         self._work = room(n), np.zeros((n, base.count + 1)), np.zeros(count), np.zeros(count), np.zeros((n, 10))
         self._joints = n
         nothing = np.zeros(n)
-        self.observe(nothing, nothing, nothing, math.inf, False)  # compiled, and begun anew
+        self.observe(nothing, nothing, nothing, math.inf, False)  # these calls compile the loop; the last one resets it
         self.observe(nothing, nothing, nothing, interval, False)
         self.observe(nothing, nothing, nothing, math.inf, False)
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: bool) -> int:
-        """One sample: angles [rad], velocities [rad/s], torques commanded since the previous sample [N m], the time
-        since then [s], and whether nothing but its motors holds the arm. Returns the joint (from 0) whose motion no arm
-        explains, -1 for none."""
+        """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1 if there is none.
+
+        Args:
+            position: angles [rad].
+            velocity: velocities [rad/s].
+            torque: torques commanded since the previous sample [N m].
+            seconds: time since the previous sample [s].
+            is_free: whether only the motors hold the arm.
+        """
         return _observe(
             *(self._memory, self._theta, self._covariance, self._constants, self._chain, self._work),
             *(np.asarray(each, dtype=np.float64) for each in (position, velocity, torque)),
@@ -78,12 +94,12 @@ class ChainObserver:
 
     @property
     def lacking(self) -> list[float]:
-        """Latest torque per joint that is missing from the commanded one to explain the motion (joints,) [N m]."""
+        """Latest residual of each joint: commanded torque minus that which explains the motion (joints,) [N m]."""
         return [float(value) for value in self._memory[LACKING, : self._joints]]
 
     @property
     def parameters(self) -> Array:
-        """What has been learnt so far."""
+        """Current estimate of the parameters, in the order of `mean`."""
         return self._theta.copy()
 
 
@@ -161,7 +177,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         friction = base + n + j
         dry = max(theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0)), 0.0)
         holds = STATIC * dry * min(max(memory[STANDS, j], 0.0), 1.0)
-        # What rounding of the velocity leaves in the acceleration, times the joint's own inertia.
+        # Error of the acceleration due to the velocity's rounding, times the joint's own inertia.
         inertia = 0.0
         if memory[SLOPE, j] != 0.0:
             inertia = abs(_own_inertia(rooms, column, theta, base, j))
@@ -189,7 +205,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
 
 
 def _own_inertia_of(rooms: Any, column: Any, theta: Any, base: int, j: int) -> float:
-    """Inertia that joint j feels alone, of the base parameters: its regressor at unit acceleration."""
+    """Return the diagonal element of the mass matrix for joint j, from the base parameters."""
     frame, motion = rooms[0], rooms[1]
     n = frame.shape[0]
     s = motion[j, 0]
@@ -218,7 +234,7 @@ def _own_inertia_of(rooms: Any, column: Any, theta: Any, base: int, j: int) -> f
 
 
 def _of_column(theta: Any, at: int, base: int) -> float:
-    """A base parameter, or zero for one that is none."""
+    """Return the base parameter in column `at`, or zero if there is none."""
     value: float = theta[at] if at < base else 0.0
     return value
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import inverse_dynamics, mass_matrix
-from hil.estimator.chain.rollout import ChainArms, Loop, is_physical, roll_out, weights
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix
+from hil.estimator.chain.simulation.rollout import ChainArms, Loop, is_physical, roll_out, weights
 from tests.support.chains import random_chain, random_parameters
 
 RATE = 400.0

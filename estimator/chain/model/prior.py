@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import TERMS
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import TERMS
 
 SPREAD = 1.0  # relative standard deviation of every described parameter: descriptions are rarely accurate
 LEAST_OFFSET = 0.02  # m: minimum standard deviation of a centre of mass

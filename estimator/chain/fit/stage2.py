@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.coordinates import ChainCoordinates, kind_of
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.objective import ChainProblem
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.stage1 import ChainLinear
-from hil.estimator.chain.uncertainty import coloured_covariance
+from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
+from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.stage1 import ChainLinear
+from hil.estimator.chain.fit.uncertainty import coloured_covariance
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import (
@@ -41,24 +41,27 @@ class ChainOptions:
     softness: tuple[float, ...] = (3.0, 1.5, 1.0)
     """Natural frequencies of the observer, in order of use [Hz].
 
-    A softer observer reveals more of the arm; one that is much softer loses the motion.
+    A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
     """Cost increase, beyond what the softness explains, above which the previous observer is kept (a ratio)."""
     coarse_step: float = 2.6e-3
-    """Of integration [s]."""
+    """Integration step [s]."""
     fine_step: float = 1.3e-3
-    """[s] Of the last iterations."""
+    """Integration step of the last iterations [s]."""
     finer: int = 16
-    """Steps in place of one of those near standstill, where friction changes fast."""
+    """Number of smaller steps that replace one near standstill, where friction changes fast."""
     width_floor: float = 3e-4
-    """Least width of every Coulomb step [rad/s]: friction that sticks is hardly told from this."""
+    """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     min_initial_lag: float = 5e-4
-    """[s]"""
+    """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
-    """Of the last steps in friction's shapes, in which the sum is far from quadratic."""
+    """Fraction of their maximum change per step that friction-shape parameters may use in the last iterations.
+
+    The sum of squares is far from quadratic in them.
+    """
     ftol_coarse: float = 1e-2
     ftol_near: float = 3e-3
     ftol_nearer: float = 1e-3
@@ -72,11 +75,14 @@ class ChainOptions:
 
 
 DEFAULTS = ChainOptions()
-REPEATED = 4  # equal readings in a row that still count as that many: a joint in motion gives as many
+REPEATED = 4  # equal readings in a row that still count in full: a moving joint gives as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 LAST = MinimiserOptions(max_damping=10.0)
-"""Of the last iterations. Where a joint just sticks or just does not, the sum of squares has small steps: what only
-heavily damped steps gain is such a step."""
+"""Options of the last iterations.
+
+Where a joint is on the verge of sticking, the sum of squares has small steps. A decrease that is only achieved with
+heavy damping is such a step and is not pursued.
+"""
 
 
 @dataclass(frozen=True)
@@ -143,7 +149,8 @@ def fit_periods(
     nearer = replace(sticking, weights=weights, reach=options.reach).minimise(near.x, options.ftol_nearer)
     last = replace(sticking, weights=weights, steps=problem.steps, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
-    # Damping holds back what is hardly determined; without it before, many limits of steps would stop the rest.
+    # Damping holds back poorly determined coordinates, so it is removed now. Without it from the beginning, many
+    # coordinates would reach their step limits and hold up the others.
     minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
     spent += near.iterations + nearer.iterations + damped.iterations + minimum.iterations
     return _fit(last, minimum, outliers, COVARIANCE, spent)
@@ -193,11 +200,11 @@ def _steps(periods: Sequence[SettledPeriod], longest: float) -> int:
 
 
 def _repeated(period: SettledPeriod) -> Array:
-    """Weight of each sample (joints, samples) for what it shares with those beside it, 1 where they are independent.
+    """Return the weight of each sample (joints, samples), less than 1 if it shares its error with its neighbours.
 
-    While a joint sticks, its encoder repeats one reading with one rounding error. Counted as often as it is repeated,
-    that error would have the simulated joint creep towards it, through friction softened near standstill: a stretch of
-    equal readings counts as one reading.
+    While a joint sticks, its encoder repeats one reading with one rounding error. Counted at every sample, that error
+    would make the simulated joint creep towards the reading, through friction that is smoothed near standstill.
+    Therefore any number of equal readings in a row counts as at most REPEATED readings.
     """
     weight = np.ones_like(period.position)
     for row, position in zip(weight, period.position, strict=True):
@@ -225,7 +232,7 @@ def _fit(
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
     white = robust_covariance(minimum.at, None, samples, count)
     covariance = coloured_covariance(problem, x, minimum.at.normal)[:count, :count]
-    if structured > 0.0:  # a model's error repeats itself: it may also be larger at some times than at others
+    if structured > 0.0:  # a model error repeats itself and may be larger at some times than at others
         robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
         covariance = _larger(covariance, robust)
     value = problem.coordinates.values(x[:count])
@@ -243,7 +250,7 @@ def _fit(
 
 
 def _larger(one: Array, other: Array) -> Array:
-    """A covariance at least as large as both; infinite where one is."""
+    """Return a covariance at least as large as both; infinite where one of them is."""
     length = np.sqrt(np.maximum(np.diag(one), np.diag(other)))
     known = np.flatnonzero(np.isfinite(length) & (length > 0.0))
     at, lengths = np.ix_(known, known), np.outer(length[known], length[known])

@@ -31,11 +31,13 @@ SHAPES = {
     "stribeck_velocity": (0.15, 0.7),
     "load": (0.03, 1.5),
 }
-"""Shape of friction near standstill: what is likely [its unit] and the standard deviation of its logarithm. A joint
-that is never slow says nothing of it, and without that would let it go anywhere."""
-RESHAPING = 1.0  # of their logarithms, in one step
-NARROWING, WIDENING = 1.6, 1.1  # of a width's logarithm, in one step
-LONGEST = 2.0  # of any coordinate, in one step
+"""Priors on the shape of friction near standstill: typical value [its unit] and standard deviation of its logarithm.
+
+Without them, these parameters would be undetermined for a joint that never moves slowly.
+"""
+RESHAPING = 1.0  # maximum change of their logarithms in one step
+NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase of a width's logarithm in one step
+LONGEST = 2.0  # maximum change of any coordinate in one step
 
 
 @dataclass(frozen=True)
@@ -46,27 +48,28 @@ class ChainCoordinates:
     scales: Array
     """Scales of the base parameters, at their indices; ignored for others (parameters,)."""
     width_floor: float
-    """The least width of every Coulomb step [rad/s]."""
+    """Minimum width of every Coulomb step [rad/s]."""
 
     def values(self, x: Array) -> Array:
-        """Parameters (parameters,) at the coordinates `x`."""
+        """Return the parameters (parameters,) at the coordinates `x`."""
         value: Array = np.where(self._positive, np.exp(np.where(self._positive, x, 0.0)), x * self._scales)
         return value
 
     def coordinates(self, value: Array) -> Array:
-        """Coordinates of `value` (parameters,), moved into the physical range."""
+        """Return the coordinates of `value` (parameters,), moved into the physical range."""
         positive = np.log(np.where(self._positive, np.maximum(value, self._least), 1.0))
         x: Array = np.where(self._positive, positive, value / self._scales)
         return x
 
     def slopes(self, x: Array) -> Array:
-        """Derivative of each parameter by its coordinate (parameters,)."""
+        """Return the derivative of each parameter by its coordinate (parameters,)."""
         slope: Array = np.where(self._positive, self.values(x), self._scales)
         return slope
 
     def limit(self, x: Array, reach: float, least: Array, most: Array) -> None:
-        """Lower in place what coordinates may change by in one step from `x`, those of friction's shape to `reach` of
-        what they ever may: a width that has come to its floor stays there as long as the others' steps would narrow it.
+        """Set the smallest and largest change of each coordinate in one step from `x`, in place.
+
+        Friction-shape parameters may change by the fraction `reach` of their maximum. No width falls below its floor.
         """
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)

@@ -1,9 +1,9 @@
 """Excitation of a chain by paths that are finite Fourier series of the joint angles.
 
-Played as the torque that a rough model of the arm needs for it, with a spring and a damper in software around it. The
-series is optimised for what is wanted of the result: the torque of other motions in the same range, worst joint. Every
-unknown of the regression takes part, friction and offsets too: a joint that moves little cannot tell gravity from an
-offset, and no criterion on the inertial parameters alone sees that.
+The arm is driven with the torque that an approximate model requires for the path, plus a software spring and damper.
+The series is optimised for the purpose of the result: to predict the torque of other motions in the same range, for the
+worst joint. The criterion includes all unknowns of the regression, friction and offsets too: if a joint moves little,
+its gravity torque cannot be distinguished from an offset, which a criterion on inertial parameters alone would miss.
 """
 
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import mass_matrix
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.stage1 import columns_of_friction
+from hil.estimator.chain.fit.stage1 import columns_of_friction
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import mass_matrix
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import PeriodicMotion
 from hil.estimator.errors import ExcitationError
 
-CANDIDATES = 24  # paths drawn at random
-IMPROVEMENTS = 96  # changes of the best one that are tried
-CHANGE, LEAST_CHANGE = 0.5, 0.1  # of its coefficients, at the beginning and at the end
-STEEPEST = 2.0  # power of a harmonic's number by which the drawn coefficients fall
-OTHERS = 3  # motions whose torque is to be foretold
-CHANGED = 0.3  # of them at a time
+CANDIDATES = 24  # random initial paths
+IMPROVEMENTS = 96  # random changes of the best path that are tried
+CHANGE, LEAST_CHANGE = 0.5, 0.1  # first and last size of a change, relative to the path's coefficients
+STEEPEST = 2.0  # largest power of the harmonic's number by which random coefficients decrease
+OTHERS = 3  # random motions whose torque is to be predicted
+CHANGED = 0.3  # fraction of the coefficients changed at a time
 SAMPLES_PER_HARMONIC = 12
-NOISE = 4.4e-4  # rad: of an angle, by the rounding of 4096 steps a turn
-SOFTNESS = 1.0  # Hz: of the observer in stage 2, which forgets what lies further back
+NOISE = 4.4e-4  # rad: standard deviation of an angle rounded to 4096 steps per turn
+SOFTNESS = 1.0  # Hz: natural frequency of stage 2's observer, which limits how long a torque affects the residual
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,11 @@ class Path:
 
 @dataclass(frozen=True)
 class Box:
-    """Where a path may go: each joint within `swing` (joints,) [rad] of `centre` (joints,) [rad] and no faster than
-    `speed` (joints,) [rad/s], in `period` [s], with `harmonics`."""
+    """Limits of a path with a given `period` [s] and number of `harmonics`.
+
+    Each joint stays within `swing` (joints,) [rad] of `centre` (joints,) [rad] and moves no faster than `speed`
+    (joints,) [rad/s].
+    """
 
     centre: Array
     swing: Array
@@ -52,7 +55,7 @@ class Box:
     harmonics: int
 
     def path(self, lines: NDArray[np.complex128], samples: int) -> Path:
-        """The path of coefficients `lines` (joints, harmonics), scaled to fill the box."""
+        """Return the path with the coefficients `lines` (joints, harmonics), scaled to fill the box."""
         spectrum = np.zeros((self.centre.size, samples // 2 + 1), dtype=np.complex128)
         spectrum[:, 1 : self.harmonics + 1] = lines
         turn = 2j * np.pi * np.arange(spectrum.shape[1]) / self.period
@@ -62,8 +65,10 @@ class Box:
         return Path(self.centre[:, None] + scale * position, scale * velocity, scale * acceleration)
 
     def draw(self, rng: np.random.Generator) -> NDArray[np.complex128]:
-        """Coefficients of random phases and amplitudes (joints, harmonics): of some joints slow and wide motions, of
-        others fast ones."""
+        """Return coefficients (joints, harmonics) with random phases and amplitudes.
+
+        The spectra of some joints are steep, for slow and wide motions; those of others are flat, for fast ones.
+        """
         shape = self.centre.size, self.harmonics
         slower = np.arange(1, self.harmonics + 1) ** -rng.uniform(0.0, STEEPEST, (self.centre.size, 1))
         lines = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
@@ -112,16 +117,16 @@ def design_path(
 
 @dataclass(frozen=True)
 class Goal:
-    """How well a path determines the torque of other motions in its box, before anything is known but the prior."""
+    """How accurately a path, together with the prior, determines the torque of other motions in its box."""
 
     base: BaseParameters
     prior: Prior
     box: Box
     readings: int
-    """Samples of the recording."""
+    """Number of samples of the recording."""
 
     def error(self, lines: NDArray[np.complex128]) -> float:
-        """Expected RMS error of the rigid-body torque of other motions over its RMS, worst joint."""
+        """Return the expected RMS error of the rigid-body torque of other motions relative to its RMS, worst joint."""
         rows = self._seen(self._columns(self.box.path(lines, self._samples))) * self._lengths
         information = rows.T @ rows
         information[np.diag_indices_from(information)] += 1.0
@@ -134,14 +139,17 @@ class Goal:
         return SAMPLES_PER_HARMONIC * self.box.harmonics
 
     def _columns(self, path: Path) -> Array:
-        """Regressor of base parameters, friction and offsets (joints, samples, unknowns)."""
+        """Return the regressor of base parameters, friction and offsets (joints, samples, unknowns)."""
         rigid = self.base.regressor(path.position, path.velocity, path.acceleration)
         motion = PeriodicMotion(path.position, path.velocity, path.acceleration)
         return np.concatenate((rigid, columns_of_friction(motion)), axis=2)
 
     def _seen(self, columns: Array) -> Array:
-        """What torques show in angles, in units of their noise (joints samples, unknowns): through the joint's inertia,
-        drawn to the measurements by the observer. Each of the few samples stands for several readings."""
+        """Return the effect of each unknown on the angles, in units of their noise (joints samples, unknowns).
+
+        A torque acts on the angle through the joint's inertia, and the observer pulls the angle towards the
+        measurements. Each of the few samples represents several samples of the recording.
+        """
         spectrum = np.fft.rfft(columns, axis=1) * self._response[:, :, None]
         noise = NOISE * np.sqrt(self._samples / self.readings)
         shown: Array = np.fft.irfft(spectrum, self._samples, axis=1) / noise
@@ -149,7 +157,7 @@ class Goal:
 
     @cached_property
     def _response(self) -> Array:
-        """Of each joint's angle to torque (joints, lines) [rad/(N m)]."""
+        """Frequency response of each joint's angle to its torque (joints, lines) [rad/(N m)]."""
         described = self.base.as_all(self.prior.value)
         inertia = np.diag(mass_matrix(self.base.chain, described, self.box.centre))
         turn = 2j * np.pi * np.arange(self._samples // 2 + 1) / self.box.period
@@ -159,13 +167,13 @@ class Goal:
 
     @cached_property
     def _lengths(self) -> Array:
-        """Of each unknown: standard deviation of its prior; friction's is a joint's torque."""
+        """Prior standard deviation of each unknown; for friction and offset, the joint's RMS torque."""
         friction = np.repeat(self._level_of_joint[None, :], 3, axis=0).reshape(-1)
         return np.concatenate((self.prior.std, friction))
 
     @cached_property
     def _motions(self) -> Array:
-        """Rigid columns of other motions (joints, samples, base parameters)."""
+        """Regressor of the base parameters for the other motions (joints, samples, base parameters)."""
         rng = np.random.default_rng(0)
         paths = [self.box.path(self.box.draw(rng), self._samples) for _ in range(OTHERS)]
         parts = [self.base.regressor(path.position, path.velocity, path.acceleration) for path in paths]
@@ -173,7 +181,7 @@ class Goal:
 
     @cached_property
     def _level_of_joint(self) -> Array:
-        """RMS torque of those (joints,) [N m]."""
+        """RMS torque of the other motions (joints,) [N m]."""
         level: Array = np.sqrt(np.mean((self._motions @ self.prior.value) ** 2, axis=1)) + 1e-9
         return level
 
@@ -184,5 +192,5 @@ class Goal:
 
     @cached_property
     def _others(self) -> Array:
-        """The motions' columns in units of the prior (joints, samples, base parameters)."""
+        """The same regressor in units of the prior's standard deviations (joints, samples, base parameters)."""
         return self._motions * self.prior.std

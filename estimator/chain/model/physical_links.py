@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import TERMS
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import TERMS
 
 PULL = 0.03  # weight of a unit change of a coordinate, relative to one standard error of a base parameter
 LEAST_MASS = 1e-4  # kg

@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.dynamics import TERMS, Columns, regressor
-from hil.estimator.chain.geometry import Chain, parameter_names, unit_of
+from hil.estimator.chain.model.dynamics import TERMS, Columns, regressor
+from hil.estimator.chain.model.geometry import Chain, parameter_names, unit_of
 
 ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, inertias, armature, mass
 SAMPLES = 150

@@ -1,12 +1,13 @@
-"""Standard errors of a chain's fit, from the noise at the frequencies where the fit reads the motion.
+"""Standard errors of a chain's fit, from the noise at the frequencies that determine the parameters.
 
-Rounding of a moving joint is not white: fast sawteeth put its power above the few hertz of the motion, where the
-parameters are read. How much is left there is measured. At frequency f the fit has taken up the share h(f) of the
-noise, the leverage of its Jacobian, so that the residual's power there is the noise's times 1 - h. Each joint's level
-is the mean over frequencies weighted by leverage; for errors of a model, which are slow, it is far above that of white
-noise. Short recordings leave few degrees of freedom to measure it by: the joints' mean level and white noise count as
-some more. Where the fit takes up nearly all, as at frequency zero, nothing is measured, and the noise is taken as
-white. The covariance is the sandwich N^-1 S N^-1, S the information of each frequency times the noise there.
+Rounding errors of a moving joint are not white: they form a fast sawtooth with most of its power above the few hertz
+of the motion, which determine the parameters. The noise that remains there is estimated from the residual. At frequency
+f the fit absorbs the fraction h(f) of the noise, the leverage of its Jacobian, so the power of the residual is that of
+the noise times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for model errors,
+which are slow, it is far above that of white noise. Since short recordings have few degrees of freedom, each level is
+shrunk towards the mean level of all joints, and that towards white noise. Where the fit absorbs nearly all noise, as at
+frequency zero, the level cannot be estimated and white noise is assumed. The covariance is the sandwich N^-1 S N^-1,
+where S sums the information of each frequency times the noise there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.objective import ChainProblem
+from hil.estimator.chain.fit.objective import ChainProblem
 
-MOST_SAMPLES = 1 << 13  # of a period: enough to know a level to a tenth
-SUPPOSED = 10.0  # degrees of freedom of white noise, and of all joints' level, in each one's
+MOST_SAMPLES = 1 << 13  # of a period: enough to estimate a noise level to within a tenth
+SUPPOSED = 10.0  # degrees of freedom assigned to white noise, and to the common level in that of each joint
 
 
 def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array:
-    """Covariance of all coordinates (coordinates, coordinates) at the minimum `x` with this normal matrix."""
+    """Return the covariance (coordinates, coordinates) at the minimum `x`, where the normal matrix is `normal`."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     lengths = np.outer(scale, scale)
     inverse = np.linalg.pinv(normal / lengths, hermitian=True)
@@ -34,7 +35,7 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
         noise = levels[part.joint] + part.share**2 * (1.0 - levels[part.joint])
         seen += part.information(np.ones_like(noise))
         middle += part.information(noise)
-    # What the data do not account for in the normal matrix is the prior's.
+    # The part of the normal matrix that does not come from the data comes from the prior.
     covariance: Array = inverse @ (normal / lengths - seen + middle) @ inverse / lengths
     return covariance
 
@@ -45,16 +46,16 @@ class _Spectrum:
 
     joint: int
     lines: NDArray[np.complex128]
-    """Of the Jacobian by scaled coordinates (lines, coordinates), as a real and orthonormal transform has them."""
+    """Jacobian by scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform."""
     power: Array
-    """Of the residual (lines,), 1 for white noise of the weights' variance."""
+    """Power of the residual (lines,); 1 for white noise with the variance that the weights assume."""
     share: Array
     """Leverage (lines,)."""
     stands_for: float
-    """How many times as many samples there are."""
+    """Number of the period's samples over the number used."""
 
     def information(self, noise: Array) -> Array:
-        """Sum over frequencies of the information times the noise (lines,) there."""
+        """Return the sum over frequencies of the information times the noise (lines,) there."""
         weighted = self.lines * noise[:, None]
         total: Array = self.stands_for * (self.lines.real.T @ weighted.real + self.lines.imag.T @ weighted.imag)
         return total
@@ -64,7 +65,7 @@ def _spectra(problem: ChainProblem, x: Array, index: int, scale: Array, inverse:
     samples = problem.periods[index].samples
     for joint, (residual, jacobian) in enumerate(problem.weighted(x, index, MOST_SAMPLES)):
         count = len(residual)
-        once = np.full(count // 2 + 1, np.sqrt(2.0 / count))  # every line but the ends stands for two
+        once = np.full(count // 2 + 1, np.sqrt(2.0 / count))  # every line but the first and last counts twice
         once[0] = np.sqrt(1.0 / count)
         if count % 2 == 0:
             once[-1] = once[0]
@@ -76,7 +77,7 @@ def _spectra(problem: ChainProblem, x: Array, index: int, scale: Array, inverse:
 
 
 def _levels(parts: Sequence[_Spectrum], joints: int) -> Array:
-    """Of each joint's noise (joints,) where the fit reads it, 1 if it is white."""
+    """Return each joint's noise level (joints,) at the frequencies that determine the parameters; 1 if it is white."""
     power, expected, spread = np.zeros((3, joints))
     for part in parts:
         power[part.joint] += float(part.share @ part.power)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hil.description.urdf import read_urdf
-from hil.estimator.chain.dynamics import inverse_dynamics, mass_matrix, regressor, torque_derivatives
-from hil.estimator.chain.geometry import Chain
+from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix, regressor, torque_derivatives
+from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.errors import ModelError, ShapeError
 from tests.support.chains import random_chain, random_parameters, random_urdf
 

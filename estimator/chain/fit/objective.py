@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.coordinates import LONGEST, ChainCoordinates
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.simulation import ChainRun, Simulation, pieces
+from hil.estimator.chain.fit.coordinates import LONGEST, ChainCoordinates
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation, pieces
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise
@@ -46,9 +46,9 @@ class ChainProblem:
     softness: float
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
-    """Integration steps in place of one where a joint may be near standstill."""
+    """Number of smaller integration steps that replace one where a joint may be near standstill."""
     reach: float = 1.0
-    """Of one step in the shapes of friction, over what they may change by far from the minimum."""
+    """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
 
     @property
     def count(self) -> int:
@@ -116,8 +116,10 @@ class ChainProblem:
         options: MinimiserOptions = MINIMISER,
         at: Quadratic | None = None,
     ) -> Minimum:
-        """Minimise the sum of squares from `x`, until its relative decrease is less than `ftol`; `at`: the sum there,
-        where it is known."""
+        """Minimise the sum of squares from `x` until its relative decrease is less than `ftol`.
+
+        at: the sum of squares at `x`, if known.
+        """
 
         def limits(point: Array) -> tuple[Array, Array]:
             least, most = np.full(point.size, -LONGEST), np.full(point.size, LONGEST)
@@ -153,8 +155,10 @@ class ChainProblem:
         return total
 
     def weighted(self, x: Array, index: int, most: int) -> Iterator[tuple[Array, Array]]:
-        """Of each joint, at most `most` samples of a period's weighted residual (samples,) and its Jacobian by all
-        coordinates (samples, coordinates)."""
+        """Yield each joint's weighted residual (samples,) in a period and its Jacobian (samples, coordinates).
+
+        Only the first `most` samples are used, rounded up to whole pieces.
+        """
         period, weight = self.periods[index], self.weights[index]
         where, slopes = self._where(x, index)
         residuals, jacobians = [], []

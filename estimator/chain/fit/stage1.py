@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prior import Prior
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 
@@ -61,7 +61,7 @@ def columns_of(model: ChainModel, motion: PeriodicMotion) -> Array:
 
 
 def columns_of_friction(motion: PeriodicMotion) -> Array:
-    """The regressor of viscous and Coulomb friction and of offsets (joints, samples, 3 joints), term by term."""
+    """Return the regressor of viscous and Coulomb friction and of offsets (joints, samples, 3 joints), term by term."""
     joints, samples = motion.velocity.shape
     Y = np.zeros((joints, samples, 3 * joints))
     for joint, velocity in enumerate(motion.velocity):

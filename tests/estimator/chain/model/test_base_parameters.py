@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from hil.description.urdf import read_urdf
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import inverse_dynamics
-from hil.estimator.chain.geometry import Chain
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import inverse_dynamics
+from hil.estimator.chain.model.geometry import Chain
 from tests.support.chains import random_chain, random_parameters
 from tests.support.paths import CONFIGS
 

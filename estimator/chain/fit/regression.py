@@ -13,9 +13,9 @@ from scipy.signal import butter, sosfiltfilt
 
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import ORDER, PER_CYCLE, TRIM, uniform
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.prior import Prior
-from hil.estimator.chain.stage1 import PASSES, columns_of, solve
+from hil.estimator.chain.fit.stage1 import PASSES, columns_of, solve
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import PeriodicMotion
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError

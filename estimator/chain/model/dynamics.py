@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.geometry import LINK_TERMS, Chain
-from hil.estimator.chain.kernels import accelerate, differentiate, move, place, regress, room
+from hil.estimator.chain.model.geometry import LINK_TERMS, Chain
+from hil.estimator.chain.model.kernels import accelerate, differentiate, move, place, regress, room
 from hil.estimator.errors import ShapeError
 
 TERMS = len(LINK_TERMS) + 1

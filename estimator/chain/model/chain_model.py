@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from hil.estimator.chain.base_parameters import BaseParameters
+from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.errors import ModelError
 
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]

@@ -5,16 +5,16 @@ import math
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.model import ChainModel
-from hil.estimator.chain.simulation import ChainRun, Simulation
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
 from hil.estimator.simulation.arm import steps_per_sample
 from hil.estimator.simulation.closed_loop import Feedback
 
 PERIODS = 3  # number of periods simulated, of which the last is used
-FINER = 4  # steps in place of one near standstill
-NEVER = 1e6  # N m: a limit that is never reached
+FINER = 4  # smaller integration steps that replace one near standstill
+NEVER = 1e6  # N m: a torque limit that is never reached
 
 
 def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeriod) -> Array:

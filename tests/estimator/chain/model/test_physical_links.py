@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.physical_links import nearest_links
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.physical_links import nearest_links
 from tests.support.chains import random_chain, random_parameters
 
 

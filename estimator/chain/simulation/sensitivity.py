@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import places, split
-from hil.estimator.chain.kernels import room
-from hil.estimator.chain.stepping import JOINT_TERMS, run
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import places, split
+from hil.estimator.chain.model.kernels import room
+from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
 """Values that disable a term that the model lacks; zero for all other terms."""
@@ -62,7 +62,7 @@ class Simulation:
             np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
             np.array(start, dtype=np.float64, order="C"),
         )
-        # Derivatives that are not wanted are written behind all columns.
+        # Unwanted derivatives are written to a spare column after all others.
         where = np.array([at.get(name, width) for name in base.names] + [width])
         self._columns = (
             where[places(n, base.columns)],

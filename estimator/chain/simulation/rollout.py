@@ -1,8 +1,9 @@
-"""Chains under goal torques in closed loop: what an experiment would do to arms that could be the real one.
+"""Closed-loop simulation of chains under goal torques: what an experiment would do to arms that may be the real one.
 
-At each sample a goal torque and a software spring and damper act, the latter on angles and velocities of the sample
-before, as in the real loop. In between the motion is stepped by linearly implicit Euler, friction's slope taken at the
-old velocity: of first order, which a loop that is closed at every sample makes harmless.
+At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from angles and
+velocities of the previous sample as in the real loop. In between, the motion is integrated by the linearly implicit
+Euler method, with the slope of friction at the old velocity. It is of first order only; the feedback at every sample
+keeps its errors small.
 """
 
 import math
@@ -13,24 +14,27 @@ from typing import Any
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.base_parameters import BaseParameters
-from hil.estimator.chain.dynamics import TERMS
-from hil.estimator.chain.kernels import accelerate, invert, move, place, room
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.model.kernels import accelerate, invert, move, place, room
 from hil.estimator.compiled import compiled
 
 LONGEST_STEP = 1.3e-3  # s
 RAN_AWAY = 1e3  # rad/s
-NEAR_REST = 0.2  # rad: where what the arm lies on may carry it
-YIELDS = 0.03  # rad, under a joint's largest torque: how far that gives way
-PRESSED_SHARE = 0.03  # of a joint's largest torque: less weight presses a joint on nothing
+NEAR_REST = 0.2  # rad: distance from the rest pose within which the surface under it may support the arm
+YIELDS = 0.03  # rad: how far that surface gives way under a joint's largest torque
+PRESSED_SHARE = 0.03  # of a joint's largest torque: a smaller gravity torque does not press a joint against the surface
 VISCOUS, COULOMB, OFFSET, WIDTH, SCALE, LAG = range(6)
 DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", "lag")
 
 
 @dataclass(frozen=True)
 class ChainArms:
-    """Arms that could be the real one. rigid: base parameters (arms, base parameters) [SI]; drive: DRIVE_TERMS
-    (arms, 6, joints) [SI], torque_scale being the true over the commanded torque."""
+    """An ensemble of arms, each of which may be the real one.
+
+    rigid: base parameters (arms, base parameters) [SI].
+    drive: DRIVE_TERMS (arms, 6, joints) [SI]; `torque_scale` is the ratio of true to commanded torque.
+    """
 
     base: BaseParameters
     rigid: Array
@@ -38,27 +42,33 @@ class ChainArms:
 
     @property
     def size(self) -> int:
-        """How many."""
+        """Number of arms."""
         return len(self.rigid)
 
     def first(self, count: int) -> "ChainArms":
-        """A smaller ensemble."""
+        """Return the first `count` arms."""
         return ChainArms(self.base, self.rigid[:count], self.drive[:count])
 
     def chosen(self, arms: Any) -> "ChainArms":
-        """Those of these indices."""
+        """Return the arms with these indices."""
         return ChainArms(self.base, self.rigid[arms], self.drive[arms])
 
     @property
     def mean(self) -> "ChainArms":
-        """One arm, in the middle of all."""
+        """One arm with the mean base parameters and the median drive parameters."""
         return ChainArms(self.base, self.rigid.mean(axis=0)[None], np.median(self.drive, axis=0)[None])
 
 
 @dataclass(frozen=True)
 class Loop:
-    """The software's part. goal: torques (samples, joints) [N m]; spring [N m/rad] and damper [N m s/rad] to `pose`
-    (joints,) [rad], in which the arm lies: near it no joint that gravity presses down goes farther; limit [N m]."""
+    """The software's part of the closed loop.
+
+    rate: samples per second.
+    goal: torques (samples, joints) [N m].
+    stiffness, damping: of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
+    pose: rest pose (joints,) [rad], on a surface that stops joints from being moved further down by gravity.
+    limit: largest commanded torque (joints,) [N m].
+    """
 
     rate: float
     goal: Array
@@ -70,8 +80,10 @@ class Loop:
 
 @dataclass(frozen=True)
 class Motions:
-    """Of each arm at each sample: angles and velocities (arms, samples, joints) [rad, rad/s], commanded torques
-    [N m]; all NaN after an arm has run away."""
+    """Angles, velocities and commanded torques of all arms (arms, samples, joints) [rad, rad/s, N m].
+
+    NaN after an arm's motion has diverged.
+    """
 
     position: Array
     velocity: Array
@@ -79,7 +91,10 @@ class Motions:
 
 
 def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = None) -> Motions:
-    """Motions of all arms from angles `start` (joints,) or (arms, joints) [rad], at rest unless `speed` is given."""
+    """Return the motions of all arms from angles `start` (joints,) or (arms, joints) [rad].
+
+    They start at rest unless `speed` is given, of the same shape [rad/s].
+    """
     n, samples = arms.base.chain.joints, len(loop.goal)
     at = np.broadcast_to(start, (arms.size, n))
     moving = np.zeros((arms.size, n)) if speed is None else np.broadcast_to(speed, (arms.size, n))
@@ -103,7 +118,7 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
 
 
 def weights(arms: ChainArms, pose: Array) -> Array:
-    """Torque that holds each arm still in a pose (arms, joints) [N m], friction not included."""
+    """Return the torque that holds each arm still in a pose (arms, joints) [N m], without friction."""
     n = arms.base.chain.joints
     at, still = np.broadcast_to(pose, (arms.size, n)), np.zeros(n)
     out = np.empty((arms.size, n))
@@ -119,8 +134,11 @@ def weights(arms: ChainArms, pose: Array) -> Array:
 
 
 def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
-    """Inertia that each joint feels with the others held, the mean over the poses (poses, joints), and with the others
-    free, the least; per arm (arms, joints) [kg m^2]."""
+    """Return two inertias of each joint, each (arms, joints) [kg m^2].
+
+    The first is the mean over `poses` (poses, joints) with the other joints held, the second the minimum over `poses`
+    with the other joints free.
+    """
     n = arms.base.chain.joints
     work, still = room(n), np.zeros(n)
     rotation, translation, axis, _ = arms.base.chain.arrays
@@ -136,7 +154,7 @@ def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
 
 
 def is_physical(arms: ChainArms, poses: Array) -> Any:
-    """Of which arms the mass matrix is positive definite in all poses (poses, joints) (arms,)."""
+    """Return whether each arm's mass matrix is positive definite in all `poses` (poses, joints), as (arms,)."""
     n = arms.base.chain.joints
     work, still = room(n), np.zeros(n)
     rotation, translation, axis, _ = arms.base.chain.arrays
@@ -190,7 +208,7 @@ def _roll_loop(  # noqa: PLR0912
             place(rotation, translation, axis, q, work[0], work[1])
             move(link, armature, v, work)
             accelerate(armature, gravity, v, still, work)
-            carried = 1.0  # share of what lies under the rest pose that is met, fading with the distance from it
+            carried = 1.0  # fraction of the surface's stiffness that acts; less further from the rest pose
             for j in range(n):
                 carried = min(carried, 2.0 - 2.0 * abs(q[j] - pose[j]) / NEAR_REST)
             for j in range(n):

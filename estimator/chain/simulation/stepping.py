@@ -23,7 +23,7 @@ from typing import Any
 
 import numba
 
-from hil.estimator.chain.kernels import accelerate, differentiate, invert, move, place, regress
+from hil.estimator.chain.model.kernels import accelerate, differentiate, invert, move, place, regress
 from hil.estimator.compiled import compiled
 from hil.estimator.simulation.arm import FADED, GAMMA
 
@@ -33,9 +33,9 @@ JOINT_TERMS = (
     *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
     *("torque_scale", "zero"),
 )
-NEAR = 6.0  # widths of friction's step, from standstill
-CROSSED = 1.0  # of these widths in one step
-WORST = 1e4  # rad or rad/s: a simulation that comes here has run away
+NEAR = 6.0  # distance from standstill within which steps may be divided, in widths of friction's step
+CROSSED = 1.0  # such widths that a joint may cross in one step
+WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
 
 
 def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
@@ -185,8 +185,11 @@ def _follow(
 
 
 def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
-    """Into how many steps this one must be cut, so that a joint that may come through the steep part of its friction
-    crosses a width in one; k: last accelerations. A joint that sticks needs no shorter steps."""
+    """Return the number of smaller steps, at most `most`, that replace this one.
+
+    A joint that may pass through the steep part of its friction crosses at most CROSSED widths in one of them. A joint
+    that sticks needs no smaller steps. k: last accelerations.
+    """
     needed = 1.0
     for j in range(v.size):
         ahead = v[j] + 2.0 * step * k[j]
@@ -211,9 +214,11 @@ def _run_loop(  # noqa: PLR0912
     position: Any,
     derivative: Any,
 ) -> bool:
-    """Simulate as many samples as `torque` (samples, steps, joints) has, from state (2, joints), into position
-    (samples, joints) and derivative (samples, joints, causes); without derivatives where there are no causes. A step in
-    which a joint may come near standstill is cut into as many as `finer`."""
+    """Simulate the samples of `torque` (samples, steps, joints) from `state` (2, joints); return False if it diverges.
+
+    The results are written to `position` (samples, joints) and, unless there are no causes, `derivative` (samples,
+    joints, causes). A step in which a joint may come near standstill is divided into up to `finer` smaller ones.
+    """
     work, solve, motion, by, zq, zv, dk, dl, R, direct, twice = room
     q1, v1, k, m, nothing, ahead = motion
     q, v = state[0], state[1]

@@ -1,0 +1,1 @@
+"""Motions of a chain that reveal its parameters."""

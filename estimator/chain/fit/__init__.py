@@ -1,0 +1,1 @@
+"""Parameters of a chain estimated from recordings."""

@@ -1,0 +1,1 @@
+"""Rigid-body dynamics of a chain, its parameters and their prior."""
