@@ -30,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
+from benchmarks.bus.pty import responder_binary, served_pty
 from benchmarks.machine import machine
-from benchmarks.pty import responder_binary, served_pty
 from hil.config.schema import load_config
 from hil.drivers.control_table import load_control_table
 from hil.drivers.exchange import Exchange

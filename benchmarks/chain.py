@@ -26,14 +26,18 @@ classic                the same figures for filtered inverse-dynamics least squa
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
 
+from benchmarks.machine import machine
 from hil.description.urdf import read_urdf
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.fourier_path import design_path
@@ -284,8 +288,6 @@ def worst(found: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=6)

@@ -19,16 +19,19 @@ fitted to each swing-up, and parameters fitted to the swing-ups or to all record
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
-from machine import machine
 from scipy.optimize import minimize
 from scipy.signal import savgol_filter
 
+from benchmarks.machine import machine
 from hil.config.csv_columns import load_recording_config
 from hil.estimation.model_from_config import wanted_model
 from hil.estimator.baselines.idim import fit_inverse_dynamics, uniform

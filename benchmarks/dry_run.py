@@ -18,11 +18,15 @@ worst_std_ratio       designed over plain multisine, same limits and duration: w
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
 
+from benchmarks.machine import machine
 from hil.config.schema import Config, parse_config
 from hil.dry_run.amplitude import with_peaks
 from hil.dry_run.waves import design_problem
@@ -107,8 +111,6 @@ FRICTION = {"coulomb_width": 0.01, "stribeck_rise": 0.4, "stribeck_velocity": 0.
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=200)

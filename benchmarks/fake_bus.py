@@ -22,9 +22,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import serial
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import serial
+
+from benchmarks.machine import machine
 from hil.config.schema import load_config
 from hil.drivers.packet import BROADCAST_ID, Framer, Instruction, encode
 from hil.experiment.run import run_experiment

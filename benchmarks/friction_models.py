@@ -10,14 +10,17 @@ skipped.
 
 import argparse
 import json
+import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from identify import figures, identify
-from machine import machine
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.machine import machine
 from hil.config.schema import parse_config
 from hil.errors import SafetyStop
 

@@ -12,10 +12,13 @@ import resource
 import subprocess
 import sys
 import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from machine import machine
 
+from benchmarks.machine import machine
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import design_multisine
 from hil.estimator.fit.stage1 import fit_lines

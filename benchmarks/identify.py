@@ -18,8 +18,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.machine import machine
 from hil.config.schema import Config, load_config
 from hil.errors import SafetyStop
 from hil.estimation.settled_estimate import estimate_run

@@ -12,11 +12,15 @@ as for a good encoder, whose rounding errors are not white where a joint moves s
 import argparse
 import json
 import math
+import sys
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import numpy as np
+
+from benchmarks.machine import machine
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.identify import identify

@@ -10,11 +10,14 @@ corrected plant (second order with friction), and 10 samples per second. The fig
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
-import numpy as np
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import numpy as np
+
+from benchmarks.machine import machine
 from hil.estimator.baselines.paper import (
     AMPLITUDES,
     FUNDAMENTAL,

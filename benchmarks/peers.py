@@ -20,13 +20,15 @@ import argparse
 import json
 import os
 import statistics
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.machine import machine
 from hil.config.schema import load_config
 from hil.estimation.compare import OURS, OURS_PLAIN, MethodResult, compare_run
 from hil.experiment.run import run_experiment

@@ -14,13 +14,17 @@ import argparse
 import gc
 import json
 import math
+import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
 
+from benchmarks.machine import machine
 from hil.config.schema import Config, load_config
 from hil.drivers.state import State
 from hil.experiment.stop_request import StopRequest
@@ -139,8 +143,6 @@ def _count(until: int) -> None:
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--rate", type=float, default=1000.0)

@@ -2,9 +2,9 @@
 
     python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 
-The distribution is described in benchmarks/population_arms.py, with --others in benchmarks/population_others.py. Each
-arm is identified by `hil identify` in a separate process, in virtual time, and judged by the true parameters of the
-fake arm. --quick: friction = "stribeck" instead of "auto", for tests.
+The distribution is described in benchmarks/drawn_arms/population_arms.py, with --others in population_others.py beside
+it. Each arm is identified by `hil identify` in a separate process, in virtual time, and judged by the true parameters
+of the fake arm. --quick: friction = "stribeck" instead of "auto", for tests.
 
 finished              share that ended with a result
 beyond_limit          arms that overshot a position limit by more than hil.dry_run.stopping_distance predicts
@@ -30,8 +30,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
 
+from benchmarks.drawn_arms.population_arms import DrawnArm, draw
+from benchmarks.drawn_arms.population_others import draw as draw_other
+from benchmarks.machine import machine
 from hil.config.schema import Config, parse_config
 from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.stopping_distance import beyond_when_passed
@@ -40,13 +45,6 @@ from hil.fakes.plants.arm import base_parameters
 from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, load_samples
 from hil.study.jobs import each
-
-try:
-    from benchmarks.population_arms import DrawnArm, draw
-    from benchmarks.population_others import draw as draw_other
-except ImportError:  # run as a script
-    from population_arms import DrawnArm, draw
-    from population_others import draw as draw_other
 
 FINISHED_WITHIN_S = 900.0
 JUDGED = ("inertia", "coupling", "armature", "gravity", "viscous", "coulomb")
@@ -243,14 +241,12 @@ def _seeds(text: str) -> list[int]:
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--arms", type=int, default=200)
     parser.add_argument("--seeds", type=_seeds, help="A..B, instead of --arms")
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--others", action="store_true", help="draw from benchmarks/population_others.py")
+    parser.add_argument("--others", action="store_true", help="draw from benchmarks/drawn_arms/population_others.py")
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
     parser.add_argument("--keep", type=Path, help="folder for files, run folders and messages")
     options = parser.parse_args()

@@ -12,12 +12,16 @@ skipped, because the motion is then not periodic.
 import argparse
 import json
 import math
+import sys
+from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import mujoco
 import numpy as np
-from machine import machine
 
+from benchmarks.machine import machine
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import RecordingError
 from hil.estimator.excitation.multisine import design_multisine, zippered_lines

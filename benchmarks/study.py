@@ -28,8 +28,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.machine import machine
 from hil.study.dataset import Dataset
 from hil.study.run import StudyProgress, run_study
 from hil.study.schema import load_study

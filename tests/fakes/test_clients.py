@@ -16,7 +16,7 @@ from typing import Any
 import dynamixel_sdk as sdk
 import pytest
 
-from benchmarks import clients
+from benchmarks.bus import clients
 from tests.support.paths import ROOT
 
 CONFIG = ROOT / "configs" / "fake_two_link.toml"

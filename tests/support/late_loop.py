@@ -1,4 +1,4 @@
-"""Experiments with a loop that wakes up late, with and without correction; shared with benchmarks/jitter.py."""
+"""Experiments with a loop that wakes up late, with and without correction; shared with benchmarks/effects/jitter.py."""
 
 import math
 import tempfile

@@ -1,4 +1,4 @@
-"""Run benchmarks/fake_noise.py with ten thousand pieces of noise; the benchmark itself sends a million."""
+"""Run benchmarks/bus/fake_noise.py with ten thousand pieces of noise; the benchmark itself sends a million."""
 
 import importlib
 

@@ -213,7 +213,7 @@ def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:
 
 
 def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
-    """benchmarks/guard.py measures the time; this test detects a slow check on a machine of any speed."""
+    """benchmarks/safety/guard.py measures the time; this test detects a slow check on a machine of any speed."""
     guard = Guard(arm())
     moving = STILL._replace(goal_current=(0.1, 0.1), current=(0.1, 0.1), velocity=(0.02, 0.02))
 

@@ -1,4 +1,7 @@
-"""SIGKILL during an experiment: only the servos' own watchdogs remain. benchmarks/kills.py repeats it fifty times."""
+"""SIGKILL during an experiment: only the servos' own watchdogs remain.
+
+benchmarks/safety/kills.py repeats it fifty times.
+"""
 
 from pathlib import Path
 

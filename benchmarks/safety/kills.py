@@ -1,6 +1,6 @@
 """SIGKILL at random moments of an experiment on a pty, with the fake servos in another process.
 
-    python benchmarks/kills.py [--kills N] [--json]
+    python benchmarks/safety/kills.py [--kills N] [--json]
 
 105 ms after each kill, the servos are read over the same terminal: each Bus Watchdog must have tripped and each Goal
 Current must be 0. The 5 ms allow for this computer's scheduling; an earlier read would restart the watchdog.
@@ -14,15 +14,17 @@ servos do not wait for this computer's other programs.
 
 import argparse
 import json
+import sys
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks.machine import machine
 from tests.support.kills import ANSWERED_BEFORE_S, kill_campaign
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--json", action="store_true")

@@ -1,7 +1,7 @@
 """Calls of one client against a fake arm, with their results as one JSON line; arguments: CLIENT DEVICE.
 
-This script runs in any environment that has the client and needs nothing of hil; `benchmarks/clients.py` calls it. A
-call is wrong if it raises or if its result differs from that of a real servo.
+This script runs in any environment that has the client and needs nothing of hil; `benchmarks/bus/clients.py` calls
+it. A call is wrong if it raises or if its result differs from that of a real servo.
 """
 
 import builtins

@@ -1,6 +1,6 @@
 """From nothing to the first green test of somebody else's driver: a fresh environment, hil's wheel, four lines.
 
-    python benchmarks/first_test.py [--from wheel|clone|git] [--json]
+    python benchmarks/bus/first_test.py [--from wheel|clone|git] [--json]
 
 The driver is ROBOTIS' own SDK, as a stand-in for one that nobody here wrote. The package index is asked as `pip` is
 configured. The test runs twice; after installation, the first run compiles Python's bytecode.
@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TEST = """from dynamixel_sdk import PacketHandler, PortHandler
 
 

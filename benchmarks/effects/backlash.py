@@ -1,6 +1,6 @@
 """Effect of gear backlash on an estimator that does not model it, on the realistic fake arm.
 
-    python benchmarks/backlash.py [--json] [--play 0 0.0005 0.0015 0.004] [--presliding]
+    python benchmarks/effects/backlash.py [--json] [--play 0 0.0005 0.0015 0.004] [--presliding]
 
 The play [rad] is measured from flank to flank and applies to both joints, between the rotor and the output shaft, which
 carries the encoder. --presliding adds presliding friction to the model, which might mimic play.
@@ -9,16 +9,20 @@ carries the encoder. --presliding adds presliding friction to the model, which m
 import argparse
 import json
 import math
+import sys
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks.machine import machine
 from hil.config.schema import load_config
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 
-CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
+CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
 GROUPS = {"inertia": ("inertia", "coupling", "armature"), "gravity": ("gravity",), "friction": ("viscous", "coulomb")}
 
 
@@ -50,8 +54,6 @@ def figures(result: SettledResult) -> dict[str, float]:
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--play", type=float, nargs="+", default=[0.0, 0.0005, 0.0015, 0.004])

@@ -1,9 +1,9 @@
 """Independent clients on the fake bus over a pseudo-terminal, with the result of every call.
 
-    python benchmarks/clients.py                                    runs those installed in this environment
-    python benchmarks/clients.py --python /path/to/venv/bin/python  and those there (LeRobot needs its own)
-    python benchmarks/clients.py --write                            updates the table in docs/fake-bus.md
-    python benchmarks/clients.py --json                             one JSON object, with every call
+    python benchmarks/bus/clients.py                                    runs those installed in this environment
+    python benchmarks/bus/clients.py --python /path/to/venv/bin/python  and those there (LeRobot needs its own)
+    python benchmarks/bus/clients.py --write                            updates the table in docs/fake-bus.md
+    python benchmarks/bus/clients.py --json                             one JSON object, with every call
 
 The clients' calls are in `client_calls.py`, which needs nothing of hil.
 """
@@ -21,13 +21,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks.client_calls import CLIENTS
+from benchmarks.bus.client_calls import CLIENTS
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "fake-bus.md"
-BEGIN, END = "<!-- clients: made by benchmarks/clients.py -->\n", "<!-- clients: end -->\n"
+BEGIN, END = "<!-- clients: made by benchmarks/bus/clients.py -->\n", "<!-- clients: end -->\n"
 PATIENCE_S = 180.0
 ARMS = {
     "dynamixel_sdk": "fake_two_link",

@@ -25,14 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.drawn_arms.population_arms import DEGREE, REFERENCE_STALL, SERVO_MASS, DrawnArm
 from hil.drivers.servo_model import Mode, ServoModel, servo_model
 from hil.fakes.servo.registers import load_model
 from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers, arm_toml
-
-try:
-    from benchmarks.population_arms import DEGREE, REFERENCE_STALL, SERVO_MASS, DrawnArm
-except ImportError:  # run as a script
-    from population_arms import DEGREE, REFERENCE_STALL, SERVO_MASS, DrawnArm
 
 MODELS = ("XM430-W350", "XM430-W210", "XM540-W270", "XL330-M288", "XC330-T288", "XL430-W250", "XH430-W350")
 MIXED = 0.3

@@ -1,6 +1,6 @@
 """Mutation testing of the safety code: which small changes its tests do not detect.
 
-    python benchmarks/mutations.py [MODULE ...] [--json] [--every N]
+    python benchmarks/safety/mutations.py [MODULE ...] [--json] [--every N]
 
 Each mutation changes one operator, comparison, number or boolean of a module (except in strings, annotations and zip's
 `strict`) and runs that module's tests in a child process. Mutations that no test detects survive. A mutation that makes
@@ -23,7 +23,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PATIENCE_S = 300
 
 _EXPERIMENT = "tests/hil/experiment"

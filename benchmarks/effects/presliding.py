@@ -1,23 +1,27 @@
 """Effect of presliding friction on models with and without it.
 
-    python benchmarks/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5] [--law slip]
+    python benchmarks/effects/presliding.py [--json] [--seeds N] [--stiffness 1000 200 50 15 5] [--law slip]
 
 The realistic fake arm without its bus. Its dry friction acts as a spring of this stiffness [N m/rad] before it slides,
 with a damping ratio of 0.7. Both models include Stribeck friction. With `--law slip`, the arm follows a law that the
-estimator does not have (benchmarks/elastic_slip.py). The figures are the worst of N seeds; `gained` is the smallest
-ratio of the held-out errors of the models without and with presliding.
+estimator does not have (benchmarks/effects/elastic_slip.py). The figures are the worst of N seeds; `gained` is the
+smallest ratio of the held-out errors of the models without and with presliding.
 """
 
 import argparse
 import json
 import math
+import sys
+from pathlib import Path
 from unittest.mock import patch
 
-import numpy as np
-from backlash import GROUPS
-from elastic_slip import SlippingMotor
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
+import numpy as np
+
+from benchmarks.effects.backlash import GROUPS
+from benchmarks.effects.elastic_slip import SlippingMotor
+from benchmarks.machine import machine
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.identify import identify, predict

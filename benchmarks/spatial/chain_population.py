@@ -1,6 +1,6 @@
 """Random spatial arms with three to six joints, identified on the fake bus from a description that is 30 % off.
 
-    python benchmarks/chain_population.py --arms 60 [--first 0] [--json]
+    python benchmarks/spatial/chain_population.py --arms 60 [--first 0] [--json]
 
 Axes, lengths, masses, servos, rest pose and limits are drawn; the real arm's masses differ from the URDF's by 30 %
 and its centres of mass by 5 mm. Counted: runs that finish with a result, collisions of the recorded motion with the arm
@@ -9,15 +9,18 @@ itself or the floor, and exceeded position limits. A run that is refused by its 
 
 import argparse
 import json
+import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
 import numpy as np
 
 import hil
-from benchmarks.chain_arms import measured
+from benchmarks.spatial.chain_arms import measured
 from hil.clearance.space import Space
 from hil.config.schema import load_config
 from hil.drivers.errors import DriverError

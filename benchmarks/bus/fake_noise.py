@@ -1,6 +1,6 @@
 """Random bytes and mutated packets on the fake bus: nothing may raise or hang, and the next valid packet is answered.
 
-    python benchmarks/fake_noise.py [--json] [--packets N] [--seed N]
+    python benchmarks/bus/fake_noise.py [--json] [--packets N] [--seed N]
 
 After every tenth piece of noise, and a pause that ends anything it started, a servo is pinged at whatever ID and baud
 rate the noise may have set.
@@ -8,11 +8,14 @@ rate the noise may have set.
 
 import argparse
 import json
+import sys
 import time
+from pathlib import Path
 from random import Random
 
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from benchmarks.machine import machine
 from hil.drivers.packet import BROADCAST_ID, Framer, Instruction, encode
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock

@@ -1,6 +1,6 @@
 """Figures of the report, the exports, the model in Python and the package.
 
-    python benchmarks/takeaway.py [--json]
+    python benchmarks/effects/takeaway.py [--json]
 
 Identifies the realistic fake arm once, then measures on its run folder. Some figures need mujoco, pin (pinocchio),
 hatchling or Chromium; if the tool is not installed, the output says so.
@@ -18,9 +18,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from machine import machine
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
+import numpy as np
+
+from benchmarks.machine import machine
 from hil import load_model
 from hil.arm_model import ArmModel
 from hil.config.schema import load_config
@@ -31,7 +33,7 @@ from hil.report.page import write_report
 from hil.report.run_data import RunData
 from hil.runs.run_folder import RunFolder
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SAMPLES = 1_000_000
 
 

@@ -1,6 +1,6 @@
 """Effect of timing jitter on the estimate, with and without correction for the actual times, on the ideal fake arm.
 
-    python benchmarks/jitter.py [--json] [--rms-us 0 200 500] [--config configs/fake_two_link_ideal.toml]
+    python benchmarks/effects/jitter.py [--json] [--rms-us 0 200 500] [--config configs/fake_two_link_ideal.toml]
 
 Each write happens at a random time after its deadline, drawn from a half-normal distribution with the given RMS. The
 same recording is estimated twice: as it is, and with its times replaced by the deadlines.
@@ -8,17 +8,19 @@ same recording is estimated twice: as it is, and with its times replaced by the 
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks.machine import machine
 from hil.config.schema import load_config
 from tests.support.late_loop import measure
 
-CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link_ideal.toml"
+CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link_ideal.toml"
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--rms-us", type=float, nargs="+", default=[0.0, 200.0, 500.0])

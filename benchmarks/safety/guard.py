@@ -1,6 +1,6 @@
 """Computing time of the guard per sample, for two joints: `clamp` before and `look` after the exchange.
 
-    python benchmarks/guard.py [--json]
+    python benchmarks/safety/guard.py [--json]
 
 The samples of a run of the fake arm are repeatedly passed to the guard, without bus and recorder. The figure is the
 median over rounds of the mean over a round's samples; the fastest round is printed too, because other programs can only
@@ -9,11 +9,15 @@ add to the time.
 
 import argparse
 import json
+import sys
 import tempfile
 import time
 from pathlib import Path
 from statistics import median
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks.machine import machine
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.experiment.guard import Guard
@@ -54,8 +58,6 @@ def recorded_states(config: Config) -> list[State]:
 
 
 def main() -> None:
-    from machine import machine
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()

@@ -1,6 +1,6 @@
 """`hil identify` on the bundled spatial arms, from URDF, limits and rest pose alone, including the pilot.
 
-    python benchmarks/chain_arms.py [--arm koch] [--json]
+    python benchmarks/spatial/chain_arms.py [--arm koch] [--json]
 
 For each: trust, residual in encoder steps, held-out error, coverage of the 95 % intervals, arm time and
 processor time, least clearance and largest overshoot of a position limit over all recordings, and the ratio of the
