@@ -1,8 +1,8 @@
 """The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-The sequence is: rest; for each multisine a ramp in, periods until two successive ones match, the remaining periods to
-be recorded, and a ramp out; then no current until the arm is at rest. If the cause of a stop allows it, the arm is
-braked before `run` raises; the caller that switched torque on switches it off.
+The sequence is: rest; for each multisine a ramp in, the warm-up (only before the first), periods until two successive
+ones match, the remaining periods to be recorded, and a ramp out; then no current until the arm is at rest. If the cause
+of a stop allows it, the arm is braked before `run` raises; the caller that switched torque on switches it off.
 """
 
 from collections.abc import Callable, Sequence
@@ -127,6 +127,8 @@ class Stream:
             self._segment = number
             self._note(f"{segment.role}: ramp in")
             self._play(self._ramps[number][0], Phase.RAMP_IN)
+            if number == 0:
+                self._warm_up(segment)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
             self._play(self._ramps[number][1], Phase.RAMP_OUT)
@@ -146,6 +148,12 @@ class Stream:
             raise ExperimentError(
                 f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
             )
+
+    def _warm_up(self, segment: Segment) -> None:
+        """Play periods that are recorded, but used for nothing."""
+        for number in range(self._plan.warm_up_periods):
+            self._note(f"{segment.role}: warm-up, period {number + 1} of {self._plan.warm_up_periods}")
+            self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
         """Play periods until one matches its predecessor; it is the first settled one. Then play the other periods to

@@ -12,15 +12,17 @@ from hil.pilot.chain_search import identify_chain_in_steps
 from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player, Say
 from hil.plan.plan import ROLES
-from hil.results.result import SettledResult
+from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
 
 
 def identify_in_steps(
-    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
+    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, earlier: Result | None = None
 ) -> tuple[str, SettledResult]:
-    """Identify an arm from link lengths only. Returns the sentence about the torque state and the result.
+    """Identify an arm from link lengths only, or from an `earlier` result for the same arm.
+
+    Returns the sentence about the torque state and the result.
 
     Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
     """
@@ -29,7 +31,7 @@ def identify_in_steps(
     # A stop request in one step also cancels all later ones. Servo settings are saved and restored once for all steps,
     # because EEPROM wears.
     with StopRequest(), servo_session(config, run.path, say):
-        search = Search.of(config, run, Player(shown_path, watch, say))
+        search = Search.of(config, run, Player(shown_path, watch, say), earlier=earlier)
         played = _full(search, *search.find())
         run.write_starts([search.belief.middle])
         result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))

@@ -15,12 +15,13 @@ from hil.dry_run.prediction import GUARDED, predict
 from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.models.parameters import Physics
-from hil.pilot.belief import MOVED_STEPS, Belief, prior_belief
+from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
 from hil.pilot.breakaway import broke_free, narrowed, raised
 from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.options import PilotOptions
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
+from hil.results.result import Result
 from hil.runs.run_folder import RunFolder
 
 Array = NDArray[np.float64]
@@ -47,11 +48,23 @@ class Search:
     springs: NDArray[np.bool_] | None = None
     """Joints that a stabiliser held (joints,)."""
     options: PilotOptions = DEFAULTS
+    from_earlier: bool = False
+    """Whether the belief comes from an earlier run that no run so far has contradicted."""
 
     @classmethod
-    def of(cls, config: Config, run: RunFolder, player: Player, options: PilotOptions = DEFAULTS) -> "Search":
-        """Start a search from the prior. Raises ConfigError."""
-        return cls(config, run, player, prior_belief(config, options.arms), options=options)
+    def of(
+        cls,
+        config: Config,
+        run: RunFolder,
+        player: Player,
+        options: PilotOptions = DEFAULTS,
+        earlier: Result | None = None,
+    ) -> "Search":
+        """Start a search from the prior, or from the result of an earlier run on the same arm. Raises ConfigError."""
+        if earlier is None:
+            return cls(config, run, player, prior_belief(config, options.arms), options=options)
+        belief = earlier_belief(config, earlier, options.arms)
+        return cls(config, run, player, belief, options=options, from_earlier=True)
 
     @property
     def held(self) -> Config:
@@ -73,6 +86,10 @@ class Search:
             self.springs = np.array(config.stabiliser.stiffness) > 0.0  # a joint that had one keeps it
         if played.passed_limit and not broke_free(self.config, config, played.step.seen).any():
             self.cap = self.options.torque_after_limit * played.step.peak_torque
+        if self.from_earlier and not (played.error is None and played.step.within):
+            self.from_earlier = False
+            self.belief = prior_belief(self.config, self.options.arms)
+            self.player.say("The arm does not move as the earlier run predicts: starting from the prior instead.")
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
@@ -148,6 +165,8 @@ class Search:
         """
         options = self.options
         share = options.pilot_shares[min(number, len(options.pilot_shares) - 1)]
+        if self.from_earlier:
+            share = max(share, options.pilot_share_known)
         most, falls = most_torque(config), falls_over(config, self.belief)
         try:
             found = self.amplitude(config, share)
@@ -264,7 +283,7 @@ def pilot_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
     state.
     """
     experiment = config.experiment
-    update: dict[str, Any] = {"held_out": False, "peak_torque": None, "periods": 1}
+    update: dict[str, Any] = {"held_out": False, "peak_torque": None, "periods": 1, "warm_up": 0.0}
     update["max_settling_periods"] = min(experiment.max_settling_periods, options.max_pilot_settling)
     if experiment.band is not None:
         samples = round(experiment.samples * options.pilot_period_share)
@@ -288,7 +307,9 @@ def _within_limits(config: Config, pose: Array, inside: float) -> Array:
 
 def only_first(found: Amplitude, options: PilotOptions = DEFAULTS) -> Amplitude:
     """The same amplitude with only the first multisine."""
-    plan = replace(found.plan.first_segment(), max_settling_periods=options.max_pilot_settling, periods=1)
+    plan = replace(
+        found.plan.first_segment(), max_settling_periods=options.max_pilot_settling, periods=1, warm_up_periods=0
+    )
     return Amplitude(plan, found.peak_torque, found.prediction)
 
 
@@ -301,7 +322,7 @@ def with_torque(config: Config, peak_torque: Array) -> Config:
 def step_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
     """The configuration without the second multisine and without waiting for a steady motion."""
     settling = min(config.experiment.max_settling_periods, options.max_pilot_settling)
-    update = {"held_out": False, "max_settling_periods": settling, "periods": 1}
+    update = {"held_out": False, "max_settling_periods": settling, "periods": 1, "warm_up": 0.0}
     return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
 
 

@@ -71,6 +71,8 @@ class Plan:
     periods: int
     settle_within: float
     drift_within: float
+    warm_up_periods: int = 0
+    """Number of periods of the first multisine that are played before those that may be used."""
     lower_samples: int = 0
     """Largest number of samples for lowering a spatial arm after a stop."""
 
@@ -83,13 +85,19 @@ class Plan:
         """Largest possible number of samples."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played + 2 * self.end_samples + self.brake_samples + self.lower_samples
+        still = self.rest_samples + 2 * self.end_samples
+        return still + self.warm_up_samples + played + self.brake_samples + self.lower_samples
+
+    @property
+    def warm_up_samples(self) -> int:
+        """Number of samples of the warm-up."""
+        return self.warm_up_periods * len(self.segments[0].period_current)
 
     @property
     def expected(self) -> int:
         """Number of samples if the second period is already settled, as on most arms."""
         played = sum((1 + self.periods) * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played
+        return self.rest_samples + self.warm_up_samples + played
 
 
 def scaled(config: Config, plan: Plan, peak_torque: NDArray[np.float64]) -> Plan:
@@ -132,6 +140,7 @@ def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) ->
         periods=experiment.periods,
         settle_within=experiment.settle_within,
         drift_within=experiment.drift_within,
+        warm_up_periods=experiment.warm_up_periods,
     )
 
 
