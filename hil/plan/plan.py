@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.drivers.bus import CHECK_S
 from hil.errors import ConfigError
 from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
 
@@ -67,6 +68,7 @@ class Plan:
     rest_samples: int
     end_samples: int
     brake_samples: int
+    """Largest number of exchanges during which a stop brakes."""
     max_settling_periods: int
     periods: int
     settle_within: float
@@ -127,7 +129,7 @@ def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) ->
         segments=tuple(segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
         rest_samples=max(1, round(experiment.rest * experiment.rate)),
         end_samples=_end_samples(config),
-        brake_samples=round(config.safety.damp_time * experiment.rate),
+        brake_samples=round(config.safety.damp_time / min(1 / experiment.rate, CHECK_S)),
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
         settle_within=experiment.settle_within,
