@@ -239,3 +239,23 @@ def test_arms_are_compared_with_those_of_their_own_type(tmp_path: Path) -> None:
     write_page(table, "fleet", tmp_path / "study.html")
     page = (tmp_path / "study.html").read_text(encoding="utf-8")
     assert "Fleet of XL330-M288, XL330-M288: 4 arms" in page and "arm_9" in page and "No arm is an outlier" in page
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ("5", "vary.fake.seed = 5: must be a list of values or a draw"),
+        ("[[1]]", r"vary.fake.seed\[1\] = \[1\]: must be a number"),
+        ("{ unifrom = [1, 2] }", "vary.fake.seed.unifrom is not a known key; did you mean uniform"),
+        ("{ log_uniform = [3, 1] }", "vary.fake.seed: log_uniform = .* the first must not be larger"),
+        ("{ choice = [] }", "vary.fake.seed.choice = .*: needs at least 1"),
+    ],
+)
+def test_what_is_wrong_in_vary_is_named_without_the_schema_s_own_words(
+    values: str, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(f'[study]\ntask = "empty"\nruns = 2\n[vary]\n"fake.seed" = {values}\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_study(path)
+    assert "union[" not in str(caught.value) and "~" not in str(caught.value)
