@@ -273,7 +273,7 @@ class ServoBus:
             taken = self.port.wire_time(goals + 14 + count + count * (11 + one_each(span, count)[0].size))
             taken += return_delay * count
             if whole:
-                least = max(CHECK_S, taken / share + self.port.latency + HOST_S)
+                least = max(CHECK_S, taken / share + HOST_S)
                 every = max(1, math.floor(self.config.interval / least + 1e-6))
                 interval /= every
             if taken < share * interval:

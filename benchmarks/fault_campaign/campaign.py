@@ -107,7 +107,7 @@ def prepare(setting: Setting, period: float = PERIOD_S) -> Ready:
     config = parse_config(path.read_text(encoding="utf-8"), path)
     ready = Ready(setting, path, config, Story(np.empty(0), None, 0.0, None, ""))  # type: ignore[arg-type]
     story, _, changed = _play(ready, Drawn((), ()), 0)
-    if story.code:
+    if story.code != 0:
         raise DoesNotRun(f"{setting.name} at {setting.rate} Hz does not run undisturbed: {story.text.strip()}")
     return Ready(setting, path, config, story, changed)
 

@@ -237,7 +237,6 @@ class Guard:
             self._seen_at[index] = now
         self._missing[index] += 1
         seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
-        self._consistency[index].lost()
         allowed, said = self._missing_limit
         # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
         # was damaged.

@@ -37,9 +37,8 @@ from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
-_PUNCTUAL = 0.2
-"""Delay of an exchange between two samples, in intervals, beyond which it is left out: the next sample must not wait.
-"""
+_FORGETS = 0.98
+"""Factor per exchange by which the memory of the longest one fades."""
 
 
 class Progress(NamedTuple):
@@ -105,6 +104,7 @@ class Stream:
         self._state: State | None = None
         self._sampled: State | None = None
         self._deadline: float | None = None
+        self._takes = 0.0
         self._sent_at: float | None = None
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
@@ -251,15 +251,21 @@ class Stream:
         return state
 
     def _between_samples(self) -> Iterator[State]:
-        """Exchange the same goals until the next sample is due; yield each state."""
+        """Exchange the same goals until the next sample is due; yield each state.
+
+        An exchange that might delay the next sample is left out: the adapter may be slow, or a servo silent.
+        """
         if self._deadline is None:
             return
+        following = self._deadline + self._interval
         for turn in range(1, self._turns):
             due = self._deadline + turn * self._apart
             self._clock.wait_until(due)
-            if self._clock.now() - due <= _PUNCTUAL * self._apart:
+            now = self._clock.now()
+            if now - due < self._apart and now + self._takes < following:
                 state = self._bus.exchange(self._goal, between=True)
                 self._sent_at = state.time_before_write
+                self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
                 yield state
 
     def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:

@@ -11,6 +11,7 @@ from hil.config.schema import Config
 from hil.drivers.bus import CHECK_S
 from hil.errors import ConfigError
 from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
+from hil.plan.stabiliser import check_rate
 
 IDENTIFY, HELD_OUT = "identify", "held_out"
 ROLES = (IDENTIFY, HELD_OUT)
@@ -122,6 +123,7 @@ def make_plan(config: Config) -> Plan:
 
 def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) -> Plan:
     """Make a plan whose segments are designed by `segment`, each for its role and with its own seed."""
+    check_rate(config)
     experiment = config.experiment
     roles = ROLES if experiment.held_out else (IDENTIFY,)
     return Plan(
