@@ -79,7 +79,7 @@ def work(spec: Spec) -> Row:
 
 
 def lost_row(spec: Spec, error: BaseException | None) -> Row:
-    """The row of a run that never came back, because it took its workers with it."""
+    """Return the row of a run that returned no result because every worker that tried it died."""
     why = RuntimeError("no worker brought it to an end") if error is None else error
     if type(error).__name__ == "KilledWorker":
         why = MemoryError("every worker that tried it died: it needs more than engine.worker_memory_gib, or crashes")

@@ -158,7 +158,9 @@ def _environment() -> dict[str, str]:
     return known | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
-def evening(person: Person, commands: Sequence[list[str]], tell: Callable[[Typed], None] = lambda _: None) -> list[Typed]:
+def evening(
+    person: Person, commands: Sequence[list[str]], tell: Callable[[Typed], None] = lambda _: None
+) -> list[Typed]:
     """Type the commands one after the other; ends after the first that fails."""
     done: list[Typed] = []
     for words in commands:
