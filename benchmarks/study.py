@@ -61,7 +61,7 @@ def study_file(folder: Path, text: str) -> Path:
 
 
 def timed(path: Path, out: Path, workers: int) -> tuple[float, Dataset]:
-    """Return the wall time per run [s] and the rows; each worker's first run, with start and compilation, does not count."""
+    """Return the wall time per run [s] and the rows; without each worker's first run, which compiles."""
     seen: list[float] = []
     dataset = run_study(load_study(path), out, worker_count=workers, watch=lambda _: seen.append(time.perf_counter()))
     first = min(2 * workers, len(seen) - 1) - 1
