@@ -21,8 +21,10 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
-from hil.estimator.selection.drift import Drift, drifting, friction_change
-from hil.estimator.selection.settled import Choice, choose, predict_period
+from hil.estimator.selection.drift import drifting, friction_change
+from hil.estimator.selection.other_period import predict_period
+from hil.estimator.selection.settled import Choice, choose
+from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
 from hil.estimator.simulation.back_emf import neglected
@@ -51,16 +53,21 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)
     other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
-    estimate, choice = _estimate(config, period, other, run.load_starts(), executor)
+    between = None if other is None else _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
+    recorded = period
+    estimate, choice = _estimate(config, period, other, between, run.load_starts(), executor)
+    period = recorded if choice is None else choice.period
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=_with_neglected(considered(period, estimate), estimate))
-    drift = None if other is None else _drift(facts, samples, other, estimate)
+    drift = None if other is None or between is None else friction_change(other, estimate, between)
     if drift is not None:
-        estimate = replace(estimate, covariance=drifting(period, estimate, drift))
-    played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+        left = drift if choice is None or choice.drift is None else drift.after_correction()
+        estimate = replace(estimate, covariance=drifting(period, estimate, left))
+    played = {IDENTIFY: PlayedPeriod(recorded.rate, recorded.torque, recorded.position, estimate.position)}
     if other is not None:
         later = estimate if drift is None or not drift.is_seen else drift.at_the_later(estimate)
-        predicted = predict_period(later, other)
+        changes = choice is not None and choice.drift is not None and drift is not None
+        predicted = predict_period(later, steadied(other, later, drift) if changes and drift is not None else other)
         played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
@@ -99,12 +106,6 @@ def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDAr
     return wider
 
 
-def _drift(facts: RunFacts, samples: NDArray[np.void], other: SettledPeriod, estimate: Estimate) -> Drift:
-    """Estimate how friction changed between the fitted and the held-out motion."""
-    between = _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
-    return friction_change(other, estimate, between)
-
-
 def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
     """Mean time of the last period of a multisine, on the port's clock [s]."""
     rows = samples[(samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))]
@@ -116,6 +117,7 @@ def _estimate(
     config: Config,
     period: SettledPeriod,
     other: SettledPeriod | None,
+    between: float | None,
     starts: list[dict[str, float]],
     executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
@@ -130,6 +132,7 @@ def _estimate(
             by_voltage=by_voltage,
             lever=lever,
             starts=starts,
+            seconds=between,
             executor=executor,
         )
         return choice.estimate, choice
