@@ -85,10 +85,9 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
         case Kind.STRANGE_GOAL:
             _write_goal(attack, servo)
         case Kind.MODE_TAKEN if servo.torque_enabled:
-            before = servo.operating_mode
+            # It is also the mode from before the run, so nothing has to be undone.
             for address, value in ((64, 0), (11, _POSITION_MODE), (64, 1)):
                 servo.write(address, bytes((value,)))
-            return _undo(servo, "Operating Mode", _POSITION_MODE, before)
         case Kind.TURNED_ROUND:
             undo = _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
             servo.reboot(now, _SHORT_BOOT_S)  # with torque on it could not be written
@@ -131,10 +130,7 @@ def _change(servo: EmulatedServo, register: str, value: int, before: int | None 
     before = servo.value(register) if before is None else before
     servo.memory.set(register, value)
     servo._derive()
-    return _undo(servo, register, value, before)
 
-
-def _undo(servo: EmulatedServo, register: str, value: int, before: int) -> Undo:
     def undo() -> None:
         if servo.value(register) == value:
             servo.memory.set(register, before)
