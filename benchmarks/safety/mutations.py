@@ -33,6 +33,7 @@ TESTS = {
     "hil/experiment/consistency.py": [f"{_EXPERIMENT}/test_consistency.py"],
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
+    "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
