@@ -129,7 +129,6 @@ UNHEARD = _INSTRUCTIONS | {
     Kind.KILLED,
     Kind.NEW_ID,
     Kind.NEW_BAUD,
-    Kind.TURNED_ROUND,  # with a reboot
     FaultKind.CABLE_PULLED,
     FaultKind.SILENT_SERVO,
     FaultKind.REBOOT,
