@@ -152,7 +152,7 @@ def identified(seed: int) -> dict[str, Any]:
         run = Path(folder) / "run"
         try:
             found = hil.identify(path, out=run)
-            row |= {"ended": "", "trust": found.verdict.trust, "steps": len(found.steps)}
+            row |= {"ended": "", "trust": found.verdict.trust, "steps": len(found.steps or ())}
             row["residual_ticks"] = round(max(found.fit.residual_rms_ticks), 3)
             row["held_out_percent"] = round(100 * max(found.validation.held_out_rms or (np.nan,)), 2)
         except (HilError, DriverError, EstimationError) as error:

@@ -225,8 +225,16 @@ class Guard:
                 index,
                 Cause.MISSING,
                 f"missed {self._missing[index]} replies in a row; its last reply was {1e3 * seconds:.0f} ms ago; "
-                f"{said} allows {1e3 * allowed:.0f} ms. Check its cable and its supply.",
+                f"{said} allows {1e3 * allowed:.0f} ms. {self._silence_remedy()}",
             )
+
+    def _silence_remedy(self) -> str:
+        if len(self._missing) > 1 and all(self._missing):
+            return (
+                "All servos fell silent together: check the adapter, its cable and the supply, and whether other programs "
+                "keep this computer busy."
+            )
+        return "Check its cable and its supply."
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
         self._stop(
