@@ -37,7 +37,7 @@ from hil.plan.plan import make_plan
 from hil.runs.recording import load_samples
 from hil.setup import bus_rate
 
-AFTER_S = 1.5
+AFTER_S = 0.5
 """Time for which the arm is observed after the program has ended [s]."""
 
 STATE = "XDG_STATE_HOME"

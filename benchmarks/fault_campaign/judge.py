@@ -71,8 +71,8 @@ class Verdict:
 
     owed: why the current had to end, "" if there was no reason. late_ms: how long it flowed after that. beyond:
     overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
-    stopped the run. misleading: the output names only wrong causes. unseen: late_ms counts from the moment at which the
-    fault became observable (`fault_campaign.visible`), later than it began.
+    stopped the run. misleading: the output names only wrong causes. unseen: it is unsafe, but counted from when a
+    detector that knows more than the program could see the fault (`fault_campaign.visible`), it would not be.
     """
 
     owed: str
@@ -96,9 +96,8 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     late_ms, unseen = _flowed_ms(time[driven], since), False
     if late_ms > bound:
         seen = visible_from(*_shown(config, story, undisturbed))
-        later = [(what, max(when, seen) if what.endswith(TO_BE_SEEN) else when) for what, when in reasons]
-        owed, since = min(later, key=lambda reason: reason[1])
-        late_ms, unseen = _flowed_ms(time[driven], since), late_ms > _flowed_ms(time[driven], since)
+        later = [max(when, seen) if what.endswith(TO_BE_SEEN) else when for what, when in reasons]
+        unseen = _flowed_ms(time[driven], min(later)) <= bound
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
@@ -310,6 +309,6 @@ def _astray(drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[An
 def describe(verdict: Verdict) -> str:
     """The verdict on one line."""
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
-    said += ["seen only later"] * verdict.unseen
-    said += ["UNSAFE"] * verdict.unsafe + ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
+    said += ["UNSAFE"] * verdict.unsafe + ["but hard to see"] * verdict.unseen
+    said += ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
     return ", ".join(said)

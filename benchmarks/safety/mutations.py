@@ -34,6 +34,7 @@ TESTS = {
     "hil/experiment/consistency.py": [f"{_EXPERIMENT}/test_consistency.py"],
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
+    "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
@@ -42,6 +43,12 @@ TESTS = {
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
 }
 """Modules, and the tests that should detect mutations."""
+
+_SLOW_IMPORTS = (
+    *("numpy", "scipy", "numba", "pydantic", "serial", "hil.estimator.identify"),
+    *("hil.estimation.settled_estimate", "hil.dry_run.ensemble", "hil.plan.chain_plan"),
+)
+"""Imported once, before the children are forked. Few of the modules under test are among what these import."""
 
 Change = Callable[[], None]
 
@@ -149,8 +156,8 @@ def _test_in_child(module: str, source: str) -> None:
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
         name = module.removesuffix(".py").replace("/", ".")
-        if name.startswith("hil.drivers."):
-            # The libraries imported beforehand hold the driver: what has taken names from it is imported again.
+        if name in sys.modules:
+            # Imported beforehand: what has taken names from it is imported again.
             for loaded in [each for each in sys.modules if each == "hil" or each.startswith("hil.")]:
                 del sys.modules[loaded]
         mutated = types.ModuleType(name)
@@ -172,8 +179,7 @@ def main() -> None:
     options = parser.parse_args()
     os.chdir(ROOT)
     sys.path.insert(0, str(ROOT))
-    # Import slow libraries that contain none of the modules under test.
-    for library in ("numpy", "scipy", "numba", "pydantic", "serial", "hil.config.schema", "hil.estimator.identify"):
+    for library in _SLOW_IMPORTS:
         importlib.import_module(library)
     hypothesis.settings.register_profile("mutations", database=None, derandomize=True)
     hypothesis.settings.load_profile("mutations")

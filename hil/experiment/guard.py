@@ -1,9 +1,9 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
 The checks take a few us per sample for two joints: plain floats, one pass over the joints, constants precomputed.
-Checks that need more than one sample are in separate modules: `following` (does the motor carry the commanded
-current), `consistency` (do position and velocity agree), `status_check` (slow status
-registers), `silence` (time without replies or commands).
+What needs more than one sample is in separate modules: `following` (does the motor carry the commanded current),
+`consistency` (do position and velocity agree), `work` (does the motor turn as commanded), `status_check` (status
+registers), `deadlines` and `silence` (time without commands or replies); `command_limits` clamps what is sent.
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,12 @@ from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment.apart import Apart
+from hil.experiment.command_limits import CommandLimits
 from hil.experiment.consistency import Consistency
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.following import Following, Unfollowed
 from hil.experiment.status_check import StatusCheck
+from hil.experiment.work import Work
 from hil.plan.silence import is_missing_too_long, missing_limit
 
 JUMP_FACTOR = 1.5
@@ -41,9 +43,6 @@ MOST_OUTSIDE_RAD = 0.15
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
-WORK_TOLERANCE_RAD = 0.03
-"""Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest torque."""
-
 
 class _Limits(NamedTuple):
     """One joint's limits, in order of use."""
@@ -52,9 +51,6 @@ class _Limits(NamedTuple):
     high: float
     velocity: float
     farthest: float
-    current: float
-    work_scale: float
-    work_least: float
 
 
 class Guard:
@@ -66,9 +62,6 @@ class Guard:
 
     left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
     have come to rest a little beyond it: a joint found there may move back in, and no farther out.
-
-    The work of the motors is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot
-    return more work than was put in, so a motor that continually takes work out of it turns the wrong way.
     """
 
     def __init__(
@@ -89,16 +82,13 @@ class Guard:
                 joint.position_limit[1],
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit,
-                joint.goal_limit,
-                joint.torque_per_goal,
-                -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
             for joint in config.joints
         ]
         count = len(config.joints)
         self._safety = safety
-        self._slew = safety.slew / rate
-        self._passive = config.stabiliser is None
+        self._commands = CommandLimits(config)
+        self._work = Work(config) if config.stabiliser is None else None
         self._interval = 1.0 / rate if interval is None else interval
         self._missing_limit = missing_limit(config)
         self._deadlines = Deadlines(config)
@@ -109,39 +99,22 @@ class Guard:
         self._apart = Apart()
         self._consistency = [Consistency() for _ in config.joints]
         self._status = StatusCheck(config)
-        self._former_goal = [0.0] * count
         self._position: list[float | None] = [None] * count
         self._seen_at = [0.0] * count
         self._missing = [0] * count
-        self._work = [0.0] * count
-        self._held_goal = [0.0] * count
         self._resting: tuple[float, ...] | None = None
         self._may_start_outside = left_by_a_run
         self._found_outside: dict[int, float] = {}
         self._shortest = float("inf")
         self._unsure = 0.0
 
-    def clamp(self, goal_current: Sequence[float]) -> list[float]:
-        """Clamp goals to each joint's current limit and slew rate [A or V]. Raises SafetyStop for a goal that is not
-        finite.
-        """
-        slew = self._slew
-        clamped = []
-        for index, (goal, former, limits) in enumerate(zip(goal_current, self._former_goal, self._limits, strict=True)):
-            if not abs(goal) < float("inf"):
-                self._stop(
-                    index, Cause.NOT_A_NUMBER, f"would have received a goal current of {goal}, which is not a number."
-                )
-            limit = limits.current
-            wanted = limit if goal > limit else -limit if goal < -limit else goal
-            change = wanted - former
-            clamped.append(former + slew if change > slew else former - slew if change < -slew else wanted)
-        self._former_goal = clamped
-        return clamped
+    def clamp(self, goals: Sequence[float]) -> list[float]:
+        """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
+        return self._commands.clamp(goals)
 
-    def holding(self, goal: Sequence[float]) -> None:
-        """The goals that the servos have now [A]: `clamp` goes on from there."""
-        self._former_goal = list(goal)
+    def holding(self, goals: Sequence[float]) -> None:
+        """The goals that the servos have now [A or V]: `clamp` goes on from there."""
+        self._commands.holding(goals)
 
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
@@ -182,7 +155,7 @@ class Guard:
         return self._status.is_in_doubt
 
     def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
-        low, high, fastest, farthest, _, work_scale, work_least = limits
+        low, high, fastest, farthest = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
         interval = self._interval
         elapsed = now - self._seen_at[index]
@@ -209,13 +182,12 @@ class Guard:
             consistency.lost()
         if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
-        held, self._held_goal[index] = self._held_goal[index], goal
-        # What the goal before has done until now; where it was another one meanwhile, nothing is known.
-        work = self._work[index]
-        if former is not None and elapsed < LONG_GAP * interval and not missed:
-            work = self._work[index] = work + work_scale * held * (position - former)
-        if work < work_least and self._passive:
-            self._judge_work(index)
+        if self._work is not None:
+            # Where a goal before was another one meanwhile, nothing is known about its work.
+            is_known = former is not None and elapsed < LONG_GAP * interval and not missed
+            taken = self._work.look(index, goal, position - former if is_known and former is not None else None)
+            if taken is not None:
+                self._turns_the_wrong_way(index, taken)
 
     def look_at_rest(self, state: State) -> None:
         """Raise SafetyStop when a joint moves before anything has been commanded."""
@@ -338,16 +310,13 @@ class Guard:
             if wrong is not None:
                 self._stop(index, *wrong)
 
-    def _judge_work(self, index: int) -> None:
-        """Stop a joint whose motor has taken out more energy than friction allows: it moves against its command."""
-        others = sum(work for other, work in enumerate(self._work) if other != index and work > 0)
-        if self._work[index] < self._limits[index].work_least - 0.5 * others:
-            self._stop(
-                index,
-                Cause.WRONG_SIGN,
-                f"moves against its command: its motor has taken {-self._work[index]:.2f} J out of the arm, more than "
-                "friction can account for. Is its direction reversed, or does something else drive the arm?",
-            )
+    def _turns_the_wrong_way(self, index: int, taken: float) -> NoReturn:
+        self._stop(
+            index,
+            Cause.WRONG_SIGN,
+            f"moves against its command: its motor has taken {taken:.2f} J out of the arm, more than friction can "
+            "account for. Is its direction reversed, or does something else drive the arm?",
+        )
 
     def _look_slow(self, slow: Slow) -> None:
         safety = self._safety
