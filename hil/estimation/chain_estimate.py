@@ -81,9 +81,14 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 
 
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
-    """The model requested by the configuration."""
+    """The model requested by the configuration.
+
+    Links turned by several joints tie these joints' torques together, so torque constants that are not exact cannot
+    all be right: their ratios are parameters wherever the configuration gives an uncertainty.
+    """
     wanted = config.model
-    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale)
+    scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
+    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, scales)
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:
