@@ -11,6 +11,7 @@ from hil.config.schema import Config
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.simulation.prediction import predict
@@ -37,7 +38,9 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     known = known_chain(config)
     model = wanted_chain_model(config, known)
     period = settled_period(config, facts, samples, IDENTIFY)
-    estimate = identify_chain(period, model, known.prior)
+    fit = choose_chain if config.model.friction == "auto" else identify_chain
+    estimate = fit(period, model, known.prior)
+    model = estimate.model
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if HELD_OUT in facts.segments:
         other = settled_period(config, facts, samples, HELD_OUT)
