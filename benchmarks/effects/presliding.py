@@ -41,7 +41,7 @@ def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding
     """Errors of one identification; all infinite if the fit or the prediction does not converge."""
     keys = (*(f"{group}_error" for group in GROUPS), "held_out_rms", "residual_ticks")
     try:
-        found = identify(period, Model(2, "stribeck", "lag", ("presliding",) if presliding else ()))
+        found = identify(period, Model(2, "stribeck", "lag", ["presliding"] if presliding else []))
         predicted = predict(found, held_out.torque, held_out.rate, held_out.command_to_sample)
     except (ConvergenceError, PeriodicityError):
         return dict.fromkeys(keys, math.inf)

@@ -88,7 +88,7 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     """Judge the run of `story`, into which `drawn` was injected."""
     reasons = _reasons(config, drawn, story, undisturbed)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
-    driven = story.record["driven"].any(axis=1)
+    driven = np.asarray(story.record["driven"].any(axis=1))
     time = story.record["time"][:, 0]
     bound = BOUND_MS
     if set(drawn.kinds) & UNHEARD:
@@ -271,7 +271,7 @@ class _Told:
             return np.zeros(time.size, bool)
         latest = heard[np.clip(np.searchsorted(heard, time, "right") - 1, 0, None)]
         running = (time > max(self._begun, heard[0])) & (time < ended)
-        return running & (time - latest > interval + 2e-3)
+        return np.asarray(running & (time - latest > interval + 2e-3))
 
     def disobeys(self, joint: int, time: NDArray[Any], own: NDArray[Any], interval: float) -> NDArray[np.bool_]:
         if not self.sent[joint]:
@@ -287,7 +287,7 @@ class _Told:
             index = np.clip(latest - back, 0, None)
             off = np.minimum(off, np.abs(done - goals[index]))
         current = (latest >= 0) & (time - when[np.clip(latest, 0, None)] < 2 * interval + 2e-3)
-        return current & (off > tolerance)
+        return np.asarray(current & (off > tolerance))
 
 
 def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:

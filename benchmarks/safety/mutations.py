@@ -18,6 +18,7 @@ import sys
 import time
 import types
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import hypothesis
@@ -75,14 +76,14 @@ def _spots(tree: ast.AST) -> Iterator[tuple[ast.expr, Change]]:
                 if type(operator) in _COMPARE:
                     yield node, _set(node.ops, index, _COMPARE[type(operator)]())
         elif isinstance(node, ast.BinOp) and type(node.op) in _OPERATE:
-            yield node, lambda node=node: setattr(node, "op", _OPERATE[type(node.op)]())
+            yield node, partial(setattr, node, "op", _OPERATE[type(node.op)]())
         elif isinstance(node, ast.BoolOp):
-            other = ast.Or if isinstance(node.op, ast.And) else ast.And
-            yield node, lambda node=node, other=other: setattr(node, "op", other())
+            other = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+            yield node, partial(setattr, node, "op", other)
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            yield node, lambda node=node: setattr(node, "op", ast.UAdd())
-        elif isinstance(node, ast.Constant) and type(node.value) in (int, float, bool):
-            yield node, lambda node=node: setattr(node, "value", _other(node.value))
+            yield node, partial(setattr, node, "op", ast.UAdd())
+        elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+            yield node, partial(setattr, node, "value", _other(node.value))
 
 
 def _set(ops: list[ast.cmpop], index: int, operator: ast.cmpop) -> Change:
@@ -99,9 +100,7 @@ def _of_messages(tree: ast.AST) -> Iterator[ast.AST]:
     """Yield nodes in formatted strings and annotations, which are not mutated."""
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr | ast.AnnAssign):
-            parts = [node] if isinstance(node, ast.JoinedStr) else [node.annotation]
-            for part in parts:
-                yield from ast.walk(part)
+            yield from ast.walk(node if isinstance(node, ast.JoinedStr) else node.annotation)
         elif isinstance(node, ast.keyword) and node.arg == "strict":
             yield node.value
         elif isinstance(node, ast.FunctionDef):

@@ -264,7 +264,7 @@ def identified(seed: int, plain: bool = False) -> dict[str, Any]:
         run = Path(folder) / "run"
         try:
             found = hil.identify(path, out=run)
-            row |= {"ended": "", "trust": found.verdict.trust, "steps": len(found.steps)}
+            row |= {"ended": "", "trust": found.verdict.trust, "steps": len(found.steps or ())}
             row["residual_ticks"] = round(max(found.fit.residual_rms_ticks), 3)
             row["held_out_percent"] = round(100 * max(found.validation.held_out_rms or (np.nan,)), 2)
             row |= judged(config, found)

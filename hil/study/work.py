@@ -236,4 +236,6 @@ def _estimated(spec: Spec, folder: Path) -> Any:
     for path in source.iterdir():
         if path.is_file() and path.name not in ("result.json", "report.html", "period.npz"):
             shutil.copy2(path, copy / path.name)
-    return {"recording": str(source), **estimate_run(RunFolder.open(copy)).to_json()}
+    run = RunFolder.open(copy)
+    kind = ", ".join(each.model for each in run.load_config().joints)
+    return {"recording": str(source), "arm_type": kind, **estimate_run(run).to_json()}
