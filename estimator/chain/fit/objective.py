@@ -246,4 +246,10 @@ class ChainProblem:
         away = (x[shapes] - likely) / spread
         normal[shapes, shapes] += 1.0 / spread**2
         gradient[shapes] += away / spread
-        return float(miss @ miss) + float(away @ away)
+        cost = float(miss @ miss) + float(away @ away)
+        precision, scales = self.prior.scale_precision, self.coordinates.torque_scales
+        if precision is not None and scales.size:
+            normal[np.ix_(scales, scales)] += precision
+            gradient[scales] += precision @ x[scales]  # the coordinates are logarithms
+            cost += float(x[scales] @ precision @ x[scales])
+        return cost
