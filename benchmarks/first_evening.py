@@ -1,12 +1,14 @@
-"""docs/first_evening.md typed word by word, in real time, against a fake arm behind a pseudo-terminal.
+"""docs/first_evening.md typed word by word against a fake arm behind a pseudo-terminal, in real time, or in virtual time.
 
     python -m benchmarks.first_evening --out /tmp/evening
 
-Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`. It fails
+Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`; in virtual
+time nobody moves them, and init accepts that. It fails
 if a step fails, shows a traceback, or does not name the next command, or if the arm moved for more than twelve minutes.
 """
 
 import argparse
+import contextlib
 import shlex
 import tempfile
 import tomllib
@@ -24,14 +26,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arm", type=Path, default=CONFIGS / "first_time.toml", help="the fake arm's file")
     parser.add_argument("--out", type=Path, help="folder to type in, which must be new")
+    parser.add_argument("--virtual", action="store_true", help="in virtual time, whatever else the computer does")
     parser.add_argument(
         "--patient", action="store_true", help="after init, let servos be silent for 90 ms: for a computer that is busy"
     )
     chosen = parser.parse_args()
     folder = chosen.out or Path(tempfile.mkdtemp(prefix="evening-"))
     folder.mkdir(parents=True, exist_ok=chosen.out is None)
-    commands, person = commands_of(), Person(folder, folder / "port")
-    with fake_arm(chosen.arm, person.port):
+    commands = commands_of()
+    link = folder / "port"
+    with contextlib.nullcontext() if chosen.virtual else fake_arm(chosen.arm, link):
+        person = Person(folder, f"fake://{chosen.arm.resolve()}" if chosen.virtual else str(link))
         done = evening(person, commands, _edited(folder) if chosen.patient else _tell)
     faults = faults_of(done, commands)
     if (folder / "first_run").is_dir():

@@ -28,7 +28,7 @@ def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
     # Servos without Fast Sync Read are read without it anyway, so the file need not say so.
     fast = mode.fast or not any(each.fast for each in modes)
     found = MeasuredBus(float(rate), mode.rate, mode.one_write, fast)
-    said = f"This bus can sustain {mode.rate:.0f} Hz with {mode.name}: the file says rate = {rate:g}."
+    said = f"This bus can sustain {mode.rate:.0f} Hz with {mode.name}: the file gets rate = {rate:g}."
     if mode.lost:
         said += (
             f" But {mode.lost} of {CYCLES} replies were lost: check cables, supply and termination, and whether other "

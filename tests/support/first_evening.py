@@ -55,14 +55,16 @@ class Typed:
 
 @dataclass
 class Person:
-    """Types in `folder`, and moves the joints of the fake arm at `port`.
+    """Types in `folder`, and moves the joints of the fake arm at `port`: a device, or a fake:// URL.
+
+    Behind a URL the arm lives in virtual time and only while a command runs, so no hand can move it.
 
     rest: joint angles at which the arm hangs [rad]. lengths_mm: what a ruler says, by joint. swings_deg: how far each
     joint may swing.
     """
 
     folder: Path
-    port: Path
+    port: str
     rest: Sequence[float] = (-np.pi / 2, 0.0)
     lengths_mm: Sequence[str] = ("147", "180")
     swings_deg: Sequence[str] = ("120", "150")
@@ -70,7 +72,7 @@ class Person:
 
     def type(self, words: Sequence[str], patience_s: float = 900.0) -> Typed:
         """Type one command and answer its questions until it ends. Raises TimeoutError."""
-        typed = [str(self.port) if word == PORT_ON_THE_PAGE else word for word in words]
+        typed = [self.port if word == PORT_ON_THE_PAGE else word for word in words]
         began = time.monotonic()
         with _terminal(typed, self.folder) as (process, terminal):
             text = self._attend(process, terminal, began + patience_s)
@@ -101,11 +103,12 @@ class Person:
         """What a person would do and type; an empty answer accepts the default."""
         if "change Return Delay Time" in question:
             return "y"
+        by_hand = "://" not in self.port
         joint = 1 if "elbow" in question.split(" to ")[0] else 0
-        if "counter-clockwise" in question:
+        if "counter-clockwise" in question and by_hand:
             self._hand(f"{joint + 1}:to={self.rest[joint] + 0.4:.3f},duration=0.5")
             time.sleep(1.0)
-        elif "Let the arm hang" in question:
+        elif "Let the arm hang" in question and by_hand:
             self._hand("--release", "1", "--release", "2")
             time.sleep(4.0)
         elif question.startswith("Length from"):
@@ -115,7 +118,7 @@ class Person:
         return ""
 
     def _hand(self, *words: str) -> None:
-        command = [sys.executable, "-m", "hil", "hand", str(self.port), *words]
+        command = [sys.executable, "-m", "hil", "hand", self.port, *words]
         subprocess.run(command, check=True, cwd=self.folder, env=_environment())
 
 
@@ -202,7 +205,7 @@ def _dead_end(done: Sequence[Typed]) -> list[str]:
 def _same(named: Sequence[str], on_page: Sequence[str]) -> bool:
     """Whether a named command is one of the page's, which may have more options."""
     rest = iter(word for word in on_page if word != PORT_ON_THE_PAGE)
-    return all(word in rest for word in named if not word.startswith("/"))
+    return all(word in rest for word in named if not word.startswith(("/", "fake:")))
 
 
 def arm_seconds(run: Path, rate: float) -> float:
