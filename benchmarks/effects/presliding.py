@@ -26,7 +26,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.identify import identify, predict
 from hil.estimator.models.model import Model
-from hil.estimator.selection.settled import relative_error
+from hil.estimator.selection.other_period import relative_error
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.motor import Motor
 from tests.support.recorded_arm import record, servo_arm, wave
