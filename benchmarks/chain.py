@@ -156,8 +156,8 @@ def set_up(bench: Bench, seed: int) -> Setup:
 
 
 def path_of(bench: Bench, setup: Setup, seed: int) -> Motion:
-    limits = (np.array(each, dtype=float) for each in (bench.centre, bench.swing, bench.speed))
-    return design_path(setup.base, setup.prior, RATE, PERIOD, HIGHEST, *limits, seed)
+    centre, swing, speed = (np.array(each, dtype=float) for each in (bench.centre, bench.swing, bench.speed))
+    return design_path(setup.base, setup.prior, RATE, PERIOD, HIGHEST, centre, swing, speed, seed)
 
 
 def record(bench: Bench, setup: Setup, path: Motion) -> SettledPeriod:
@@ -209,7 +209,7 @@ def classic(setup: Setup, period: SettledPeriod, held_out: SettledPeriod, path: 
     at = np.arange(period.samples) / period.rate
     recording = Recording(at, period.torque, period.position, period.position_step, between="held")
     count = setup.base.count
-    tried = []
+    tried: list[dict[str, Any]] = []
     for cutoff in CUTOFFS:
         started = time.perf_counter()
         value, std = fit_filtered([recording], model, setup.prior, cutoff, 1e-3)

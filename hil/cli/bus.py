@@ -143,4 +143,4 @@ def setup(
         )
     finally:
         opened.close()
-    print(json.dumps(changed(changes))) if json_only else print_changes(changes)
+    print(json.dumps(changed(changes))) if json_only else print_changes(changes, port)

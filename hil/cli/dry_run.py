@@ -25,6 +25,7 @@ def dry_run(
 ) -> None:
     """Simulate the experiment on arms like yours; exit code 1 if it might exceed a limit."""
     from hil.api.dry_run import dry_run as simulate
+    from hil.cli.next_step import next_step
     from hil.cli.printing import result_console
     from hil.cli.terminal import Terminal
     from hil.dry_run.chain_summary import ChainDryRun, print_chain_dry_run
@@ -41,5 +42,7 @@ def dry_run(
         print_chain_dry_run(rehearsal.found, result_console())
     else:
         print_dry_run(rehearsal.config, rehearsal.found, result_console())
+    if rehearsal.is_safe and not json_only:
+        print(next_step("identify", config))
     if not rehearsal.is_safe:
         raise typer.Exit(1)

@@ -57,6 +57,7 @@ def identify(
 def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
     """Play the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
+    from hil.cli.next_step import next_step
     from hil.cli.terminal import Terminal
     from hil.results.json_form import to_json
 
@@ -66,7 +67,7 @@ def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False,
         recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
         print(strict_json.dumps(recorded))
         return
-    print(f"Run folder: {run.path}, {len(run.samples)} samples.\nTo estimate from it: hil estimate {run.path}")
+    print(f"Run folder: {run.path}, {len(run.samples)} samples.\n{next_step('estimate', run.path)}")
 
 
 def estimate(

@@ -1,5 +1,6 @@
 """`hil init`: create a TOML file for the servos found on a bus."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +17,8 @@ def init(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; accept every default.")] = False,
 ) -> None:
-    """Scan the bus, ask for the rest, and write a commented TOML file. Nothing is written to the servos."""
+    """Scan the bus, ask for the rest, and write a commented TOML file. Torque stays off and no setting is changed."""
+    from hil.cli.next_step import next_step
     from hil.cli.terminal import Terminal
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port
@@ -25,23 +27,31 @@ def init(
     from hil.export.source import write_text
     from hil.setup.config_template import arm_toml
     from hil.setup.interview import interview
+    from hil.setup.measured_bus import measured_bus
     from hil.setup.scan import scan
 
     if out.exists():
         raise ConfigError(f"{out} already exists: choose another file with --out, or remove it.")
+    if not out.absolute().parent.is_dir():
+        raise ConfigError(f"--out {out}: the folder {out.parent} does not exist. Create it first.")
     url = port_url(port)
     bauds = tuple(baud or BAUD_RATES)
+    terminal = Terminal(quiet=False)
     opened = open_port(url, bauds[0])
     try:
-        with Terminal(quiet=False).scanning() as watch:
+        with terminal.scanning() as watch:
             heard = list(scan(opened, bauds, watch))
         answers = interview(opened, url, heard, _default if yes else _prompt, _say)
     finally:
         opened.close()
-    text = arm_toml(answers)
-    parse_config(text, out)  # raises if the file would not be valid
+    parse_config(arm_toml(answers), out)  # raises if the file would not be valid
+    with terminal.busy("Measuring the rate of the bus"):
+        found, said = measured_bus(answers, out)
+    terminal.say(said)
+    text = arm_toml(replace(answers, measured=found))
+    parse_config(text, out)
     write_text(out, text)
-    print(f"Wrote {out}. Read it, then:\n  hil check {out}\n  hil identify {out}")
+    print(f"Wrote {out}. Read it, then type the next command.\n{next_step('check', out)}")
 
 
 def _prompt(question: str, usual: str) -> str:

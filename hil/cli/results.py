@@ -24,16 +24,16 @@ def report(
     ] = None,
 ) -> None:
     """Write a run as one self-contained HTML page: verdict, parameters, figures."""
+    from hil.cli.next_step import next_step
     from hil.report.pictures import save_pictures
     from hil.report.run_data import RunData
 
     print(write_report(run, out))
-    if png is None and svg is None:
-        return
-    data = RunData.load(run)
+    data = None if png is None and svg is None else RunData.load(run)
     for kind, folder in (("png", png), ("svg", svg)):
-        if folder is not None:
+        if folder is not None and data is not None:
             print(f"{len(save_pictures(data, folder, kind))} figures in {folder}")
+    print(next_step("export", run, "--format", "mjcf"))
 
 
 def export(

@@ -118,5 +118,8 @@ def _print_difference(difference: "Difference") -> None:
     for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):
         if names:
             say(console, f"Not in the model {lacking}: {', '.join(names)}.")
+    if difference.detectable:
+        least = ", ".join(f"{name} {percent:.2g} %" for name, percent in difference.detectable.items())
+        say(console, f"Changes that two runs like these show with 95 % probability, at least: {least}.")
     found = ", ".join(change.name for change in difference.changed)
     say(console, f"Significant changes: {found}." if found else "No significant changes.")

@@ -89,8 +89,6 @@ def chain_slips(config: "Config") -> Iterator[str]:
     told = [option for option in _OPTIONS if getattr(config.model, option)]
     if told:
         yield f"model.{told[0]} = true: only planar arms support this term so far; remove it"
-    if config.model.friction == "auto":
-        yield 'model.friction = "auto": only for planar arms so far; choose "coulomb", "stribeck" or "stribeck_load"'
     yield from _path_slips(config)
 
 

@@ -1,25 +1,29 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), and Holm's step-down correction
+Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), the friction of each joint also as a
+whole (hil.estimation.friction_change), and Holm's step-down correction
 keeps the probability of any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of
 Statistics 6 (1979) 65). A change must also be larger than `least_share` of the parameter's scale: standard errors cover
 noise only, and two runs of an arm with some unmodelled friction differ by a little more.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 from hil.arm_model import ArmModel
 from hil.errors import ResultError
-from hil.estimation.friction_rows import FrictionRow, friction_rows
+from hil.estimation.friction_change import FrictionChange, friction_changes
 from hil.model_file import read_model, read_result
 from hil.results.parts import Covariance
 
 FALSE_ALARMS = 0.05
 LEAST_SHARE = 0.01
+_POWER_Z = 1.645
+"""Standard deviations by which a change must exceed the threshold to be found with a probability of 95 %."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,8 @@ class Change:
 class Difference:
     """The changes from one run to another.
 
-    only_before, only_after: terms that only one of the two models has.
+    only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction term
+    alone that two runs like these show with a probability of 95 % [% of its value before].
     """
 
     before: str
@@ -56,6 +61,7 @@ class Difference:
     changes: tuple[Change, ...]
     only_before: tuple[str, ...]
     only_after: tuple[str, ...]
+    detectable: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def changed(self) -> tuple[Change, ...]:
@@ -75,7 +81,7 @@ def diff_runs(
     counts = [len(model.joints) for model in models]
     if counts[0] != counts[1]:
         raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
-    rows = friction_rows(models, (_covariance(before), _covariance(after)))
+    rows = friction_changes(models, (_covariance(before), _covariance(after)))
     return diff_models(*models, str(before), str(after), false_alarms, least_share, rows)
 
 
@@ -94,13 +100,12 @@ def diff_models(
     name_after: str = "after",
     false_alarms: float = FALSE_ALARMS,
     least_share: float = LEAST_SHARE,
-    friction: Sequence[FrictionRow] = (),
+    friction: Sequence[FrictionChange] = (),
 ) -> Difference:
     """Compare two models of one arm parameter by parameter, in the order of the first."""
     common = [name for name in before.values if name in after.values and not name.startswith("ripple_cycles")]
     z = {name: _z(before, after, name) for name in common}
-    z |= {row.name: _deviation(row.value, row.std) for row in friction}
-    p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()}
+    p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()} | {row.name: row.p for row in friction}
     significant = _holm(p, false_alarms)
     changes = [
         Change(
@@ -116,10 +121,10 @@ def diff_models(
     changes += [
         Change(
             row.name,
-            *(row.value[0], row.std[0], row.value[1], row.std[1]),
-            z[row.name],
-            p[row.name],
-            row.name in significant and abs(row.value[1] - row.value[0]) > least_share * max(map(abs, row.value)),
+            *(row.before, row.std / math.sqrt(2), row.after, row.std / math.sqrt(2)),
+            row.z,
+            row.p,
+            row.name in significant and abs(row.after - row.before) > least_share * max(abs(row.before), abs(row.after)),
         )
         for row in friction
     ]
@@ -129,7 +134,19 @@ def diff_models(
         tuple(changes),
         tuple(name for name in before.values if name not in after.values),
         tuple(name for name in after.values if name not in before.values),
+        _detectable(before, friction, false_alarms / max(len(p), 1)),
     )
+
+
+def _detectable(before: ArmModel, friction: Sequence[FrictionChange], level: float) -> dict[str, float]:
+    """Smallest detectable change of each friction term [%], where a difference needs a p-value below `level`."""
+    found = {}
+    for row in friction:
+        threshold = NormalDist().inv_cdf(1 - level / (len(row.stds) + 1) / 2)
+        for name, std in row.stds.items():
+            if before.values.get(name):
+                found[name] = 100 * (threshold + _POWER_Z) * std / abs(before.values[name])
+    return found
 
 
 def _z(before: ArmModel, after: ArmModel, name: str) -> float:

@@ -35,7 +35,7 @@ class PilotOptions:
     """Minimum of that way [encoder steps]."""
 
     at_limit: float = 0.99
-    """Fraction of a torque limit from which on it counts as reached."""
+    """Fraction of a torque limit above which the limit counts as reached."""
     torque_after_limit: float = 0.85
     """Cap on further torque, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.drivers.bus import CHECK_S
 from hil.errors import ConfigError
 from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
+from hil.plan.stabiliser import check_rate
 
 IDENTIFY, HELD_OUT = "identify", "held_out"
 ROLES = (IDENTIFY, HELD_OUT)
@@ -67,6 +69,7 @@ class Plan:
     rest_samples: int
     end_samples: int
     brake_samples: int
+    """Largest number of exchanges during which a stop brakes."""
     max_settling_periods: int
     periods: int
     settle_within: float
@@ -128,6 +131,7 @@ def make_plan(config: Config) -> Plan:
 
 def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) -> Plan:
     """Make a plan whose segments are designed by `segment`, each for its role and with its own seed."""
+    check_rate(config)
     experiment = config.experiment
     roles = ROLES if experiment.held_out else (IDENTIFY,)
     return Plan(
@@ -135,7 +139,7 @@ def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) ->
         segments=tuple(segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
         rest_samples=max(1, round(experiment.rest * experiment.rate)),
         end_samples=_end_samples(config),
-        brake_samples=round(config.safety.damp_time * experiment.rate),
+        brake_samples=round(config.safety.damp_time / min(1 / experiment.rate, CHECK_S)),
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
         settle_within=experiment.settle_within,

@@ -14,6 +14,8 @@ CYCLES = 200
 SLOW_EVERY = 10
 SHARE = 0.9
 """Fraction of a period that the exchange may take; the rest is for the computer."""
+RATE_MARGIN = 1.2
+"""How much faster than a newly chosen rate a bus must be, so that the next measurement confirms it."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +62,41 @@ class RateReport:
 
 
 def check_rate(bus: ServoBus, wanted: float) -> RateReport:
+    """Measure every exchange mode and compare the configured one with the wanted rate [Hz]; see `measure_modes`."""
+    modes = measure_modes(bus)
+    used = _configured(bus, modes)
+    return RateReport(tuple(modes), f"{used.rate:.0f} Hz possible with {used.name}", _fix(used, modes, wanted))
+
+
+def measure_modes(bus: ServoBus) -> list[ExchangeMode]:
     """Measure every exchange mode on servos whose torque is off, without changing their goals. Raises DriverError.
 
     Every tenth exchange includes the slow reads, so that their duration counts.
     """
     goals = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     reads = (True, False) if bus.knows_fast_sync_read() else (False,)
-    modes = [_measure(bus, goals, fast=fast, one_write=one_write) for fast in reads for one_write in (True, False)]
-    configured = bus.config.one_write, bus.config.fast_sync_read and reads[0]
-    used = next(mode for mode in modes if (mode.one_write, mode.fast) == configured)
-    return RateReport(tuple(modes), f"{used.rate:.0f} Hz possible with {used.name}", _fix(used, modes, wanted))
+    return [_measure(bus, goals, fast=fast, one_write=one_write) for fast in reads for one_write in (True, False)]
+
+
+def choose_mode(bus: ServoBus, modes: Sequence[ExchangeMode], rates: Sequence[float]) -> tuple[ExchangeMode, float]:
+    """The exchange mode to configure, and the highest of `rates` [Hz] that it sustains with a margin.
+
+    The configured mode is kept unless another one loses fewer replies or sustains a higher one of the rates. If even
+    the lowest rate is too high, it is returned.
+    """
+
+    def highest(mode: ExchangeMode) -> float:
+        return max((rate for rate in rates if RATE_MARGIN * rate <= mode.rate), default=min(rates))
+
+    configured = _configured(bus, modes)
+    best = max(modes, key=lambda mode: (-mode.lost, highest(mode), mode is configured))
+    return best, highest(best)
+
+
+def _configured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> ExchangeMode:
+    """The mode that a run would use: servos without Fast Sync Read are read without it."""
+    fast = bus.config.fast_sync_read and any(mode.fast for mode in modes)
+    return next(mode for mode in modes if (mode.one_write, mode.fast) == (bus.config.one_write, fast))
 
 
 def goal_register(joint: Joint) -> str:

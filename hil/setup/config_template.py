@@ -12,7 +12,8 @@ STANDARD_GRAVITY = 9.81
 _OF_STALL = 0.3  # of the stall current or the supply voltage; initial limit
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
-_RATES = (400, 200, 100, 50, 20)
+RATES = (400, 200, 100, 50, 20)
+"""Sample rates [Hz] that a new file may have."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,33 @@ class JointAnswers:
 
 
 @dataclass(frozen=True)
+class MeasuredBus:
+    """What was measured on the bus.
+
+    rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: how data are exchanged
+    at that rate.
+    """
+
+    rate: float
+    sustained: float
+    one_write: bool
+    fast: bool
+
+
+@dataclass(frozen=True)
 class ArmAnswers:
-    """Answers about one arm; gravity: in the plane of the arm [m/s^2]; head: comment at the top of the file."""
+    """Answers about one arm.
+
+    gravity: in the plane of the arm [m/s^2]. head: comment at the top of the file. measured: None if the bus was not
+    measured; the rate then follows from its baud rate.
+    """
 
     url: str
     baud: int
     joints: tuple[JointAnswers, ...]
     gravity: float
     head: str
+    measured: MeasuredBus | None = None
 
 
 def usual_length(model: str) -> float:
@@ -57,9 +77,9 @@ def usual_length(model: str) -> float:
 
 def arm_toml(arm: ArmAnswers) -> str:
     """The text of the TOML file."""
-    rate = _rate(arm)
+    rate = _rate(arm) if arm.measured is None else arm.measured.rate
     head = [f"# {line}" for line in arm.head.splitlines()]
-    port = ["[port]", f"url = {json.dumps(arm.url)}", f"baud = {arm.baud}"]
+    port = ["[port]", f"url = {json.dumps(arm.url)}", f"baud = {arm.baud}", *_exchange(arm)]
     mechanism = [
         "[arm]",
         _line(f"gravity = {arm.gravity:g}", "m/s^2; 0 if the arm moves in a horizontal plane"),
@@ -70,7 +90,7 @@ def arm_toml(arm: ArmAnswers) -> str:
     ]
     experiment = [
         "[experiment]",
-        _line(f"rate = {rate:.1f}", "samples per second; hil check measures what this bus can sustain"),
+        _line(f"rate = {rate:.1f}", _rate_meaning(arm)),
         _line("period = 10.0", "s"),
         _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: its lines are assigned to the joints in turn"),
         _line("pilot = true", "find the torque: start small, then raise it to the limits"),
@@ -143,7 +163,22 @@ def _rest_meaning(arm: ArmAnswers) -> str:
 def _rate(arm: ArmAnswers) -> float:
     """The highest common rate whose cycle leaves the bus at least half idle."""
     cycle = _CYCLE_BYTES * len(arm.joints) * 10 / arm.baud + 0.4e-3
-    return float(next((rate for rate in _RATES if 2 * cycle < 1 / rate), _RATES[-1]))
+    return float(next((rate for rate in RATES if 2 * cycle < 1 / rate), RATES[-1]))
+
+
+def _rate_meaning(arm: ArmAnswers) -> str:
+    if arm.measured is None:
+        return "samples per second, not measured; hil check measures what this bus can sustain"
+    return f"samples per second; this bus was measured to sustain {arm.measured.sustained:.0f}"
+
+
+def _exchange(arm: ArmAnswers) -> list[str]:
+    """The settings of [port] with which the measured rate was reached, where they are not the defaults."""
+    if arm.measured is None:
+        return []
+    one_write = [] if arm.measured.one_write else [_line("one_write = false", "this bus is faster with two writes")]
+    fast = [] if arm.measured.fast else [_line("fast_sync_read = false", "this bus is faster with Sync Read")]
+    return one_write + fast
 
 
 def _list(values: list[float], decimals: int) -> str:

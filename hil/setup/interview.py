@@ -1,4 +1,4 @@
-"""`hil init`: reads what it can from the bus and asks for the rest. Nothing is written to a servo."""
+"""The questions of `hil init`: it reads what it can from the bus and asks for the rest. Nothing is written to a servo."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -113,12 +113,17 @@ def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     The arm is viewed so that it hangs down and points to the right when it is lifted.
     """
     before = servo.read("Present Position")
-    ask(f"Turn {name} slightly counter-clockwise by hand, at most a quarter turn, hold it there and press Enter", "")
-    moved = servo.read("Present Position") - before
-    if abs(moved) < _MOVED_TICKS:
-        say(f"{name} did not move: assuming direction = 1. Correct it in the file if the servo turns the other way.")
-        return 1
-    return 1 if moved > 0 else -1
+    turn = f"Turn {name} slightly counter-clockwise by hand, at most a quarter turn, hold it there and press Enter"
+    again = f"{name} did not move. {turn}; or type its direction, 1 or -1, if you know it"
+    for question, usual in ((turn, ""), (again, "1")):
+        answer = ask(question, usual)
+        moved = servo.read("Present Position") - before
+        if abs(moved) >= _MOVED_TICKS:
+            return 1 if moved > 0 else -1
+    if answer == "-1":
+        return -1
+    say(f"{name} did not move: direction = 1. Correct it in the file if the servo turns the other way.")
+    return 1
 
 
 def _stance(ask: Ask, say: Say) -> str:

@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.cli.next_step import command, next_step
 from hil.cli.printing import print_table, say
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
@@ -53,8 +54,8 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         print(f"Trust this model: {result.verdict.trust}. " + " ".join(result.verdict.sentences))
     if run is not None:
         print(f"Run folder: {run}, report: {run / 'report.html'}")
-        if result.recordings:
-            print(f"To use it elsewhere: hil export {run} --format mjcf")
+        if result.arm is not None:
+            print(next_step("export", run, "--format", _usual_format(result)))
 
 
 def _parameters(result: SettledResult) -> Table:
@@ -146,5 +147,14 @@ def _torque_constants(result: SettledResult, config: Config) -> list[str]:
 
 
 def _next(result: SettledResult, run: Path) -> list[str]:
-    lines = [f"Run folder: {run}, report: {run / 'report.html'}"]
-    return [*lines, f"To estimate again from the recording: hil estimate {run}"]
+    return [
+        f"Run folder: {run}, report: {run / 'report.html'}",
+        f"To estimate again from the recording: {command('estimate', run)}",
+        next_step("export", run, "--format", _usual_format(result)),
+    ]
+
+
+def _usual_format(result: SettledResult | ShootingResult) -> str:
+    """A format that can hold this arm: MJCF needs the length of link 1, which only gravity determines."""
+    flat = result.chain is None and result.arm is not None and not result.arm.gravity
+    return "toml" if flat else "mjcf"

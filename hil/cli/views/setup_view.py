@@ -9,8 +9,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.cli.next_step import next_step
 from hil.setup.preflight import Finding, Level
-from hil.setup.scan import Heard
+from hil.setup.scan import Found, Heard
 from hil.setup.servo_settings import Change
 
 _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.STOP: "red"}
@@ -26,7 +27,7 @@ def print_ports(ports: Sequence[tuple[str, str]], json_only: bool) -> None:
         return
     for device, text in ports:
         print(f"{device}  {text}")
-    print(f"\nNext: hil scan {ports[0][0]}")
+    print(f"\n{next_step('scan', ports[0][0])}")
 
 
 def scanned(heard: Sequence[Heard]) -> dict[str, Any]:
@@ -59,6 +60,19 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
             console.print(f"At {each.baud} baud: {escape(each.trouble)}")
     if len({servo.baud for servo in servos}) > 1:
         console.print("All servos of an arm must use the same baud rate: see hil setup --help.")
+    if servos:
+        console.print(_after_scan(servos, port), markup=False, soft_wrap=True)
+
+
+def _after_scan(servos: Sequence[Found], port: str) -> str:
+    """The next command: separate servos that share a baud rate's factory setting, else describe or check the arm."""
+    if Path(port).is_file() or not ("/" in port or ":" in port or port.upper().startswith("COM")):
+        return next_step("check", port)
+    if len({servo.baud for servo in servos}) > 1:
+        other = min(servos, key=lambda servo: servo.baud)
+        common = max(servo.baud for servo in servos)
+        return next_step("setup", port, "--baud", other.baud, "--id", other.id, "--new-baud", common)
+    return next_step("init", port, "--out", "my_arm.toml")
 
 
 def print_findings(findings: Sequence[Finding], config: Path) -> None:
@@ -77,9 +91,14 @@ def print_findings(findings: Sequence[Finding], config: Path) -> None:
     stops = sum(finding.level is Level.STOP for finding in findings)
     warnings = sum(finding.level is Level.WARNING for finding in findings)
     if stops:
-        console.print(f"\n{stops} blocking problems, {warnings} warnings.")
+        again = escape(next_step("check", config))
+        console.print(f"\n{_counted(stops, 'blocking problem')}, {_counted(warnings, 'warning')}. Fix them.\n{again}")
     else:
-        console.print(f"\nReady, {warnings} warnings. Next: hil identify {escape(str(config))}")
+        console.print(f"\nReady, {_counted(warnings, 'warning')}.\n{escape(next_step('dry-run', config))}")
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def changed(changes: Sequence[Change]) -> dict[str, Any]:
@@ -87,7 +106,8 @@ def changed(changes: Sequence[Change]) -> dict[str, Any]:
     return {"changes": [change._asdict() for change in changes]}
 
 
-def print_changes(changes: Sequence[Change]) -> None:
+def print_changes(changes: Sequence[Change], port: str) -> None:
+    """Print what setup wrote, and the next command."""
     if not changes:
         print("Nothing to change: give --new-id, --new-baud, --return-delay-us or --secondary-id.")
     for change in changes:
@@ -97,3 +117,4 @@ def print_changes(changes: Sequence[Change]) -> None:
             print(f"{change.register}: is already {change.after}.")
         else:
             print(f"{change.register}: left at {change.before}.")
+    print(next_step("scan", port))

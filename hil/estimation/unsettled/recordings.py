@@ -71,7 +71,7 @@ def _read(paths: Sequence[Path], columns: Columns) -> _Read:
 
 
 def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
-    """One encoder has one step: of what several recordings show, the smallest."""
+    """Use one encoder step for all recordings of an arm: the smallest that any of them shows."""
     if len(found) == 1:
         return recordings
     step = np.min([each.position_step for each in recordings], axis=0)

@@ -50,8 +50,8 @@ def test_a_changed_parameter_is_named_and_drawn(
     worn = tmp_path / "worn.json"
     worn.write_text(json.dumps(result), encoding="utf-8")
     assert hil("diff", identified, worn, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["changed"] == ["coulomb_1"]
+    assert json.loads(capsys.readouterr().out)["changed"] == ["friction_1: coulomb_1", "coulomb_1"]
     pytest.importorskip("matplotlib")
     assert hil("diff", identified, worn, "--png", tmp_path / "wear.png") == 0
-    assert "Significant changes: coulomb_1." in capsys.readouterr().out
+    assert "Significant changes: friction_1: coulomb_1, coulomb_1." in capsys.readouterr().out
     assert (tmp_path / "wear.png").read_bytes().startswith(b"\x89PNG")

@@ -9,7 +9,7 @@ import pytest
 from hil.arm_model import ArmModel, JointFacts
 from hil.errors import ResultError
 from hil.estimation.diff import diff_models, diff_runs
-from hil.estimation.friction_rows import friction_rows
+from hil.estimation.friction_change import REPEATABILITY, friction_changes
 from hil.results.parts import Covariance
 
 FACTS = JointFacts("shoulder", "XM430-W350", "current", 1.8, 0.1, 1.2, (-3.0, 0.5), 10.0)
@@ -84,29 +84,62 @@ def confounded() -> np.ndarray:
     return np.asarray(np.linalg.inv(np.array(slopes) @ np.array(slopes).T) * 2.5e-4**2)
 
 
-def test_a_rise_that_no_parameter_shows_alone_is_found_in_the_curve() -> None:
+def curves(rng: np.random.Generator, factor: float, kept: Covariance, spread: float = 0.0) -> tuple[ArmModel, ArmModel]:
+    """Two identifications of one joint's friction, whose rise is `factor` times as large in the second.
+
+    spread: how much friction differs from run to run, relative to its value.
+    """
+    root = np.linalg.cholesky(kept.array())
+    stds = {**dict.fromkeys(VALUES, 1e-6), **dict(zip(kept.names, np.sqrt(np.diag(kept.array())).tolist(), strict=True))}
+    found = []
+    for rise in (0.4, 0.4 * factor):
+        values = np.array([0.055, rise, 0.3]) * (1.0 + spread * rng.standard_normal(3)) + root @ rng.standard_normal(3)
+        own = dict(zip(kept.names, values.tolist(), strict=True))
+        found.append(replace(MODEL, values={**VALUES, **own}, stds=stds))
+    return found[0], found[1]
+
+
+def test_a_rise_that_no_parameter_shows_alone_is_found_with_the_others() -> None:
     names = ("coulomb_1", "stribeck_rise_1", "stribeck_velocity_1")
     covariance = confounded()
-    std = np.sqrt(np.diag(covariance))
-    assert std[1] > 0.03, "a rise of 10 % is hardly a standard error"
+    assert math.sqrt(covariance[1, 1]) > 0.03, "a rise of 10 % is hardly a standard error"
     kept = Covariance(names, tuple(map(tuple, covariance.tolist())))
-    stds = {**dict.fromkeys(VALUES, 1e-6), **dict(zip(names, std.tolist(), strict=True))}
-    root = np.linalg.cholesky(covariance)
     rng = np.random.default_rng(3)
 
-    def changed(factor: float) -> tuple[bool, bool]:
-        """Whether the curve, and whether a parameter, shows a change."""
-        drawn_models = []
-        for rise in (0.4, 0.4 * factor):
-            values = np.array([0.055, rise, 0.3]) + root @ rng.standard_normal(3)
-            own = dict(zip(names, values.tolist(), strict=True))
-            drawn_models.append(replace(MODEL, values={**VALUES, **own}, stds=stds))
-        pair = (drawn_models[0], drawn_models[1])
-        found = {change.name for change in diff_models(*pair, friction=friction_rows(pair, (kept, kept))).changed}
-        in_curve = any(name.startswith("friction_1 at") for name in found)
-        return in_curve, bool(found & set(names))
+    def changed(factor: float, spread: float = 0.0) -> set[str]:
+        pair = curves(rng, factor, kept, spread)
+        return {change.name for change in diff_models(*pair, friction=friction_changes(pair, (kept, kept))).changed}
 
-    rises = [changed(1.1) for _ in range(100)]
-    assert sum(curve for curve, _ in rises) >= 95
-    assert sum(parameter for _, parameter in rises) <= 20
-    assert sum(any(changed(1.0)) for _ in range(100)) <= 5
+    rises = [changed(1.1) for _ in range(200)]
+    assert sum(any(name.startswith("friction_1") for name in found) for found in rises) >= 190
+    assert sum("friction_1: stribeck_rise_1" in found for found in rises) >= 180, "and the right term is named"
+    assert sum(bool(found & set(names)) for found in rises) <= 40
+    assert sum(bool(changed(1.0, REPEATABILITY)) for _ in range(200)) <= 10 + 9, "5 % and three standard deviations"
+
+
+def test_what_two_runs_would_show_is_said() -> None:
+    names = ("coulomb_1", "stribeck_rise_1", "stribeck_velocity_1")
+    kept = Covariance(names, tuple(map(tuple, confounded().tolist())))
+    rng = np.random.default_rng(4)
+    pair = curves(rng, 1.0, kept)
+    least = diff_models(*pair, friction=friction_changes(pair, (kept, kept))).detectable
+    assert set(least) == set(names)
+    factor = 1 + least["stribeck_rise_1"] / 100
+    found = 0
+    for _ in range(400):
+        pair = curves(rng, factor, kept)
+        found += any(row.p < 0.05 / 13 for row in friction_changes(pair, (kept, kept)))
+    assert 0.91 * 400 <= found <= 400
+
+
+def test_a_term_that_one_model_lacks_is_a_zero() -> None:
+    kept = Covariance(("viscous_1", "load_1"), ((1e-8, 0.0), (0.0, 1e-6)))
+    without = Covariance(("viscous_1",), ((1e-8,),))
+    richer = replace(MODEL, values={**VALUES, "load_1": 0.05}, stds={**MODEL.stds, "load_1": 0.001})
+    (found,) = friction_changes((MODEL, richer), (without, kept))[:1]
+    assert found.term == "load_1" and found.before == 0.0
+    assert found.after == pytest.approx(0.05) and found.p < 1e-6
+
+
+def test_without_covariances_nothing_is_said_of_friction() -> None:
+    assert friction_changes((MODEL, MODEL), (None, None)) == []

@@ -80,3 +80,17 @@ def test_replies_that_are_held_up_are_seen_in_two_readings(arm: Arm) -> None:
 def test_a_reboot_is_seen_by_the_servos_clock(arm: Arm) -> None:
     found = readings(StatusCheck(arm()), lambda now: now + 7.0 if now < 1.0 else now - 1.0, 3.0)
     assert found is not None and found[0] < 1.1 and "rebooted" in found[1]
+
+
+def test_another_servos_clock_is_told_from_a_late_reply(arm: Arm) -> None:
+    check = StatusCheck(arm())
+    clocks = (5.0, 5.3)
+    for index in range(20):
+        swapped = index >= 10
+        now = 0.035 * index
+        for joint in (0, 1):
+            tick = now + clocks[1 - joint if swapped else joint]
+            if (wrong := check.look_at_clock(joint, tick, now)) is not None:
+                assert wrong[0] is Cause.STALE and "another servo's data" in wrong[1] and index == 11
+                return
+    raise AssertionError("swapped replies were not seen")

@@ -1,0 +1,72 @@
+"""docs/first_evening.md typed word by word against a fake arm behind a pseudo-terminal, in real time, or in virtual time.
+
+    python -m benchmarks.first_evening --out /tmp/evening
+
+Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`; in virtual
+time nobody moves them, and init accepts that. It fails
+if a step fails, shows a traceback, or does not name the next command, or if the arm moved for more than twelve minutes.
+"""
+
+import argparse
+import contextlib
+import shlex
+import tempfile
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.support.first_evening import Person, Typed, arm_seconds, commands_of, evening, fake_arm, faults_of
+from tests.support.paths import CONFIGS
+
+MOST_ARM_S = 720.0
+
+
+def main() -> None:
+    """Type the page and print what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arm", type=Path, default=CONFIGS / "first_time.toml", help="the fake arm's file")
+    parser.add_argument("--out", type=Path, help="folder to type in, which must be new")
+    parser.add_argument("--virtual", action="store_true", help="in virtual time, whatever else the computer does")
+    parser.add_argument(
+        "--patient", action="store_true", help="after init, let servos be silent for 90 ms: for a computer that is busy"
+    )
+    chosen = parser.parse_args()
+    folder = chosen.out or Path(tempfile.mkdtemp(prefix="evening-"))
+    folder.mkdir(parents=True, exist_ok=chosen.out is None)
+    commands = commands_of()
+    link = folder / "port"
+    with contextlib.nullcontext() if chosen.virtual else fake_arm(chosen.arm, link):
+        person = Person(folder, f"fake://{chosen.arm.resolve()}" if chosen.virtual else str(link))
+        done = evening(person, commands, _edited(folder) if chosen.patient else _tell)
+    faults = faults_of(done, commands)
+    if (folder / "first_run").is_dir():
+        rate = tomllib.loads((folder / "my_arm.toml").read_text(encoding="utf-8"))["experiment"]["rate"]
+        moved = arm_seconds(folder / "first_run", rate)
+        print(f"arm time {moved:.0f} s at {rate:g} Hz")
+        if moved > MOST_ARM_S:
+            faults.append(f"the arm moved for {moved:.0f} s, at most {MOST_ARM_S:.0f} s are asked")
+    print("\n".join(faults) or f"All {len(done)} commands worked, each named the next.")
+    raise SystemExit(bool(faults))
+
+
+def _edited(folder: Path) -> Callable[[Typed], None]:
+    """Reports each command and, once `hil init` has written the file, edits it as a person would."""
+
+    def tell(typed: Typed) -> None:
+        _tell(typed)
+        if typed.words[1] == "init" and not typed.code:
+            file = folder / "my_arm.toml"
+            file.write_text(file.read_text(encoding="utf-8") + "missing_time = 0.09\n", encoding="utf-8")
+
+    return tell
+
+
+def _tell(typed: Typed) -> None:
+    named = "-" if typed.next is None else shlex.join(typed.next)
+    print(f"{typed.seconds:6.0f} s  exit {typed.code}  {shlex.join(typed.words)}  -> {named}", flush=True)
+    if typed.code:
+        print(typed.text[-3000:])
+
+
+if __name__ == "__main__":
+    main()

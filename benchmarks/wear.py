@@ -1,0 +1,101 @@
+"""`hil diff` on pairs of runs of one fake arm: changes found, and false alarms.
+
+    python -m benchmarks.wear --runs 6
+
+The arm is identified `--runs` times unchanged, and twice after each friction term of each joint has changed by 10 %, every time
+with other noise and, with --other-motion, another excitation. Every changed run is compared with every unchanged one, and the
+unchanged runs with each other.
+"""
+
+import argparse
+import itertools
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import hil
+from hil.config.schema import Config, load_config
+from hil.estimation.diff import Difference, diff_runs
+from tests.support.paths import CONFIGS
+
+TERMS = ("viscous", "coulomb", "stribeck_rise")
+FACTOR = 1.1
+
+
+@dataclass(frozen=True)
+class Identified:
+    """One run. changed: the term that was changed, such as "viscous_1"; empty for the unchanged arm."""
+
+    changed: str
+    path: Path
+
+
+def main() -> None:
+    """Identify, compare all pairs, and print shares."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arm", type=Path, default=CONFIGS / "fake_two_link.toml")
+    parser.add_argument("--runs", type=int, default=6, help="runs of the unchanged arm")
+    parser.add_argument("--other-motion", action="store_true", help="another excitation in every run")
+    parser.add_argument("--out", type=Path, help="folder for the runs; existing ones are used again")
+    chosen = parser.parse_args()
+    folder = chosen.out or Path(tempfile.mkdtemp(prefix="wear-"))
+    found = list(identify_all(load_config(chosen.arm), chosen.runs, chosen.other_motion, folder))
+    unchanged = [run for run in found if not run.changed]
+    alarms = [diff_runs(a.path, b.path) for a, b in itertools.permutations(unchanged, 2)]
+    false = [each for each in alarms if each.changed]
+    print(f"unchanged: {len(false)} of {len(alarms)} pairs show a change")
+    for each in false:
+        print("   ", ", ".join(f"{change.name} {change.z:+.1f}" for change in each.changed))
+    for name in sorted({run.changed for run in found} - {""}):
+        pairs = [diff_runs(a.path, b.path) for a in unchanged for b in found if b.changed == name]
+        seen = sum(in_its_joint(each, name) for each in pairs)
+        least = sorted(each.detectable.get(name, float("nan")) for each in pairs)[len(pairs) // 2]
+        print(f"{name:16s} {seen} of {len(pairs)} found; detectable from {least:.2g} %")
+
+
+def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) -> Iterator[Identified]:
+    """Identify the unchanged arm `runs` times, and every changed one twice. config: with a [fake] arm of two joints."""
+    seed = 0
+    wanted = [""] * runs + [f"{term}_{joint}" for term in TERMS for joint in (1, 2) for _ in range(2)]
+    for changed in wanted:
+        seed += 1
+        path = folder / f"{seed:02d}-{changed or 'same'}"
+        if not (path / "result.json").is_file():
+            hil.identify(arm_after(config, changed, seed, other_motion, folder), out=path)
+        yield Identified(changed, path)
+
+
+def arm_after(config: Config, changed: str, seed: int, other_motion: bool, folder: Path) -> Path:
+    """Write the file of the arm with one term changed. Returns its path."""
+    lines = config.path.read_text(encoding="utf-8").splitlines()
+    term, _, joint = changed.rpartition("_")
+    drive, table = 0, ""
+    for number, line in enumerate(lines):
+        if line.startswith("["):
+            table = line.strip()
+            drive += table == "[[fake.arm.drives]]"
+        key = line.split("=")[0].strip()
+        if table == "[[fake.arm.drives]]" and key == term and str(drive) == joint:
+            value = float(line.split("=")[1].split("#")[0])
+            lines[number] = f"{key} = {FACTOR * value!r}"
+        if key == "seed" and (table == "[fake]" or (table == "[experiment]" and other_motion)):
+            lines[number] = f"seed = {seed}"
+    path = folder / f"{seed:02d}.toml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def in_its_joint(found: Difference, changed: str) -> bool:
+    """Whether a significant change concerns friction of the joint that was changed."""
+    joint = changed[-1]
+    terms = ("viscous", "coulomb", "stribeck", "friction", "load")
+    return any(
+        change.name.startswith(terms) and change.name.split(":")[0].rpartition("_")[2] == joint
+        for change in found.changed
+    )
+
+
+if __name__ == "__main__":
+    main()

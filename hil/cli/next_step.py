@@ -1,0 +1,13 @@
+"""The command to type next: from `hil scan` to `hil export`, each command names its successor in its last line."""
+
+import shlex
+
+
+def next_step(*words: object) -> str:
+    """The line that names the next command, quoted for a shell."""
+    return f"Next: {command(*words)}"
+
+
+def command(*words: object) -> str:
+    """A `hil` command as it is typed, with every word quoted that a shell would split or expand."""
+    return shlex.join(["hil", *map(str, words)])

@@ -1,0 +1,116 @@
+"""Whether one joint's friction changed between two runs, tested with what the parameters' covariances say together.
+
+Coulomb friction, its rise at low speed and the speed at which it falls are known together far better than each alone: a
+change of one of them by 10 % may be less than its own standard error and still be plain. With d, the difference of the
+joint's friction parameters, and S, the sum of both runs' covariances of them, two kinds of question are asked.
+
+one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
+                  (S^-1 d)_i / (S^-1)_ii is the change that it would have to be (generalised least squares).
+several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
+
+The covariances are marginal ones: changes of inertia, gravity or another joint do not count. Friction itself does not repeat
+exactly from run to run, which no covariance of a single run contains: `repeatability` is added to S.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from hil.arm_model import ArmModel
+from hil.estimator.models.terms import TERMS
+from hil.results.parts import Covariance
+
+Array = NDArray[np.float64]
+
+KINDS = ("viscous", "coulomb", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
+"""Terms of friction in motion. What shapes it near standstill is not tested, only allowed to vary."""
+REPEATABILITY = 0.005
+"""Standard deviation of a friction parameter from run to run of an unchanged arm, relative to its value."""
+
+
+@dataclass(frozen=True)
+class FrictionChange:
+    """The friction of one joint in two runs.
+
+    term: the one whose change alone explains the difference best. before, after: its values if nothing else in the joint's
+    friction changed; std: standard error of that change [unit of the term]. z: change in standard errors. p: probability of a
+    difference like this in an unchanged joint, whatever term it shows in. stds: standard error of the change of each term
+    alone [unit of the term].
+    """
+
+    joint: int
+    term: str
+    before: float
+    after: float
+    std: float
+    z: float
+    p: float
+    stds: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        """Name of the row in a table of changes."""
+        return f"friction_{self.joint}: {self.term}"
+
+
+def friction_changes(
+    models: tuple[ArmModel, ArmModel],
+    covariances: tuple[Covariance | None, Covariance | None],
+    repeatability: float = REPEATABILITY,
+) -> list[FrictionChange]:
+    """Test the friction of every joint; joints without usable covariances in both runs are left out."""
+    if covariances[0] is None or covariances[1] is None:
+        return []
+    kept = covariances[0], covariances[1]
+    found = (_of_joint(models, kept, joint, repeatability) for joint in range(1, len(models[0].joints) + 1))
+    return [change for change in found if change is not None]
+
+
+def _of_joint(
+    models: tuple[ArmModel, ArmModel], covariances: tuple[Covariance, Covariance], joint: int, repeatability: float
+) -> FrictionChange | None:
+    names = [name for kind in KINDS if _comparable(models, name := f"{kind}_{joint}")]
+    values = [np.array([model.values.get(name, 0.0) for name in names]) for model in models]
+    scale = np.maximum(*np.abs(values))
+    spread = sum(_block(kept, model, names) for kept, model in zip(covariances, models, strict=True))
+    spread = spread + np.diag(2 * (repeatability * scale) ** 2)
+    usable = np.isfinite(np.diag(spread)) & (scale > 0)
+    if not usable.any():
+        return None
+    names = [name for name, each in zip(names, usable, strict=True) if each]
+    before, after, scale = (each[usable] for each in (*values, scale))
+    difference = (after - before) / scale
+    precision = np.linalg.pinv(spread[np.ix_(usable, usable)] / np.outer(scale, scale), hermitian=True)
+    pushed, sharp = precision @ difference, np.diag(precision)
+    z = pushed / np.sqrt(sharp)
+    best = int(np.argmax(np.abs(z)))
+    alone = math.erfc(abs(z[best]) / math.sqrt(2))
+    together = float(chi2.sf(difference @ pushed, len(names)))
+    change = float(pushed[best] / sharp[best] * scale[best])
+    stds = dict(zip(names, (scale / np.sqrt(sharp)).tolist(), strict=True))
+    # As many questions were asked as there are terms, and one more (Bonferroni).
+    p = min(1.0, (len(names) + 1) * min(alone, together))
+    level = float(before[best])
+    return FrictionChange(joint, names[best], level, level + change, stds[names[best]], float(z[best]), p, stds)
+
+
+def _comparable(models: Sequence[ArmModel], name: str) -> bool:
+    """Whether both models have the term, or one does and the other is the same model with a zero in its place."""
+    having = [name in model.values for model in models]
+    return all(having) or (any(having) and TERMS[name.rpartition("_")[0]].absent == 0.0 and "velocity" not in name)
+
+
+def _block(kept: Covariance, model: ArmModel, names: Sequence[str]) -> Array:
+    """Covariance of these parameters: zero for those that the model does not have, infinite where it is unknown."""
+    found = np.zeros((len(names), len(names)))
+    rows = [row for row, name in enumerate(names) if name in kept.names]
+    index = [kept.names.index(names[row]) for row in rows]
+    found[np.ix_(rows, rows)] = kept.array()[np.ix_(index, index)]
+    for row, name in enumerate(names):
+        if name in model.values and name not in kept.names:
+            found[row, row] = math.inf
+    return found

@@ -1,0 +1,37 @@
+"""The sample rate of a new arm's file, measured on its bus with torque off."""
+
+from pathlib import Path
+
+from hil import fakes
+from hil.config.schema import parse_config
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError
+from hil.setup.bus_rate import CYCLES, choose_mode, measure_modes
+from hil.setup.config_template import RATES, ArmAnswers, MeasuredBus, arm_toml
+
+
+def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
+    """Measure the bus of an arm that has been described; path: of the file to be written, for messages.
+
+    Returns:
+        What was measured, or None if it could not be; and a sentence that says so.
+    """
+    config = parse_config(arm_toml(arm), path)
+    fakes.register_for(config.url)
+    try:
+        with ServoBus.connect(config.bus) as bus:
+            bus.port.lower_latency()
+            modes = measure_modes(bus)
+            mode, rate = choose_mode(bus, modes, RATES)
+    except DriverError as error:
+        return None, f"The rate of this bus was not measured: {error}"
+    # Servos without Fast Sync Read are read without it anyway, so the file need not say so.
+    fast = mode.fast or not any(each.fast for each in modes)
+    found = MeasuredBus(float(rate), mode.rate, mode.one_write, fast)
+    said = f"This bus can sustain {mode.rate:.0f} Hz with {mode.name}: the file gets rate = {rate:g}."
+    if mode.lost:
+        said += (
+            f" But {mode.lost} of {CYCLES} replies were lost: check cables, supply and termination, and whether other "
+            "programs keep this computer busy."
+        )
+    return found, said
