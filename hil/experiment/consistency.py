@@ -21,6 +21,9 @@ observed by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SC
 SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
+LONG_EVERY_S = 0.0099
+"""Shortest interval added to the long memory [s]: that of 100 Hz, whatever its rounding."""
+
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
 """Tolerances [rad] for rounding, encoder noise, and a velocity that is rounded towards zero during each memory."""
 
@@ -51,6 +54,7 @@ class Consistency:
         self._velocity = 0.0
         self._short = _Memory(SHORT_S, UNSURE_RAD)
         self._long = _Memory(LONG_S, LONG_UNSURE_RAD)
+        self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
         self._learnt_for = 0.0
         # Sums of squares and products of the signals per lag and per scale error, and of them with `apart`.
         self._lag_squared = self._scale_squared = self._crossed = 0.0
@@ -64,22 +68,45 @@ class Consistency:
         """
         former, self._position = self._position, position
         before, self._velocity = self._velocity, velocity
-        short, long = self._short, self._long
+        short = self._short
         if former is None:
             short.restart(velocity)
-            long.restart(velocity)
+            self._long.restart(velocity)
+            self._forget_sums()
             return False
         moved = position - former
         difference = moved - 0.5 * (before + velocity) * seconds
         curved = CURVED * seconds * abs(velocity - before)
         unknown = unsure * abs(velocity)
-        for memory in (short, long):
-            memory.add(moved, difference, velocity, seconds, curved, unknown)
-            if memory.is_wrong(velocity, self._lag, self._scale):
-                return True
+        short.add(moved, difference, velocity, seconds, curved, unknown)
+        if short.is_wrong(velocity, self._lag, self._scale) or self._looks_long(
+            moved, difference, velocity, seconds, curved, unknown
+        ):
+            return True
         if self._learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
             self._learn(velocity, seconds)
         return False
+
+    def _looks_long(
+        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
+    ) -> bool:
+        """Add an interval to the long memory, which takes several at once: it is slow anyway, and time is scarce."""
+        self._sum_seconds += seconds
+        self._sum_moved += moved
+        self._sum_difference += difference
+        self._sum_unknown += unknown
+        self._most_curved = max(self._most_curved, curved)
+        if self._sum_seconds < LONG_EVERY_S:
+            return False
+        long = self._long
+        long.add(
+            self._sum_moved, self._sum_difference, velocity, self._sum_seconds, self._most_curved, self._sum_unknown
+        )
+        self._forget_sums()
+        return long.is_wrong(velocity, self._lag, self._scale)
+
+    def _forget_sums(self) -> None:
+        self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
 
     def _learn(self, velocity: float, seconds: float) -> None:
         apart, per_scale = self._short.apart, self._short.far
