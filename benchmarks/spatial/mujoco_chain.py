@@ -90,9 +90,7 @@ def _links_of(model: Any, joints: int) -> Array:
     return rows.reshape(-1)
 
 
-def _sequences(
-    sysid: Any, spec: Any, model: Any, period: SettledPeriod, base: BaseParameters, prior: Prior
-) -> Any:
+def _sequences(sysid: Any, spec: Any, model: Any, period: SettledPeriod, base: BaseParameters, prior: Prior) -> Any:
     """Return commands and positions of the period as MuJoCo time series."""
     stabilised = period.stabiliser
     assert stabilised is not None  # the recordings of benchmarks/chain.py have one
