@@ -63,6 +63,8 @@ class Evidence:
     """Change of friction while the arm moved."""
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
+    notes: tuple[str, ...] = field(default=())
+    """What else was found, as sentences that cast no doubt on the values."""
     tried_all: bool = False
     """Whether the model was selected from all available terms."""
 
@@ -76,6 +78,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *_drifted(evidence.drift),
         *_predicted(evidence.held_out),
         *evidence.doubts,
+        *evidence.notes,
         *_weak(validation),
         *_alike(validation),
         *_outliers(estimate, explained),

@@ -105,7 +105,9 @@ def diff_models(
     """Compare two models of one arm parameter by parameter, in the order of the first."""
     common = [name for name in before.values if name in after.values and not name.startswith("ripple_cycles")]
     z = {name: _z(before, after, name) for name in common}
-    p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()} | {row.name: row.p for row in friction}
+    p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()} | {
+        row.name: row.p for row in friction
+    }
     significant = _holm(p, false_alarms)
     changes = [
         Change(
@@ -124,7 +126,8 @@ def diff_models(
             *(row.before, row.std / math.sqrt(2), row.after, row.std / math.sqrt(2)),
             row.z,
             row.p,
-            row.name in significant and abs(row.after - row.before) > least_share * max(abs(row.before), abs(row.after)),
+            row.name in significant
+            and abs(row.after - row.before) > least_share * max(abs(row.before), abs(row.after)),
         )
         for row in friction
     ]

@@ -17,6 +17,7 @@ from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimation.supply import supply_notes, supply_sag
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.parameters import Physics
@@ -72,7 +73,8 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
-    evidence = Evidence(held_out, left_out, drift, wrong, tried_all=choice is not None)
+    notes = supply_notes(config, supply_sag(config, samples))
+    evidence = Evidence(held_out, left_out, drift, wrong, notes, tried_all=choice is not None)
     checks = Checks(
         describe_validation(validation, held_out),
         describe_verdict(judge(estimate, validation, evidence)),

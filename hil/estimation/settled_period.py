@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
+from hil.estimation.supply import supply_sag, torque_factor
 from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.simulation.closed_loop import Stabilised
@@ -44,6 +45,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     begin, end = first * count, (first + experiment.periods) * count
     # Includes the row before, whose goal is in effect until the first write.
     goals = rows["goal_current"][begin - 1 : end].T * _torque_constants(config)[:, None]
+    goals = goals * torque_factor(config, supply_sag(config, samples), rows[begin - 1 : end]).T
     late = lateness(rows[begin:end])
     torque = acting_torque(goals, late, experiment.rate)
     angle = position[first : first + experiment.periods]

@@ -19,6 +19,8 @@ class PilotOptions:
     """Maximum number of pilots; a still joint reaches its current limit in far fewer."""
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
+    certain_share_known: float = 0.72
+    """The same if the belief comes from an earlier result: another run would hardly narrow it."""
 
     pilot_period_share: float = 0.5
     """Period of a pilot, relative to experiment.period."""

@@ -21,7 +21,7 @@ from hil.pilot.gains import falls_over, with_stabiliser
 from hil.pilot.options import PilotOptions
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
-from hil.results.result import Result
+from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 
 Array = NDArray[np.float64]
@@ -50,6 +50,8 @@ class Search:
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
     """Whether the belief comes from an earlier run that no run so far has contradicted."""
+    earlier_swing: Array | None = None
+    """Range of motion of each joint in that run (joints,) [rad], if known."""
 
     @classmethod
     def of(
@@ -64,7 +66,11 @@ class Search:
         if earlier is None:
             return cls(config, run, player, prior_belief(config, options.arms), options=options)
         belief = earlier_belief(config, earlier, options.arms)
-        return cls(config, run, player, belief, options=options, from_earlier=True)
+        swing = None
+        if isinstance(earlier, SettledResult) and earlier.steps:
+            low, high = np.array(earlier.steps[-1].seen)[:2]
+            swing = high - low
+        return cls(config, run, player, belief, options=options, from_earlier=True, earlier_swing=swing)
 
     @property
     def held(self) -> Config:
@@ -87,7 +93,7 @@ class Search:
         if played.passed_limit and not broke_free(self.config, config, played.step.seen).any():
             self.cap = self.options.torque_after_limit * played.step.peak_torque
         if self.from_earlier and not (played.error is None and played.step.within):
-            self.from_earlier = False
+            self.from_earlier, self.earlier_swing = False, None
             self.belief = prior_belief(self.config, self.options.arms)
             self.player.say("The arm does not move as the earlier run predicts: starting from the prior instead.")
         if played.seen is None:
@@ -136,7 +142,8 @@ class Search:
     def _farther(self) -> float:
         """Ratio of the allowed to the observed range of motion, for the joint with the most room."""
         allowed = np.ptp(np.array([joint.position_limit for joint in self.config.joints]), axis=1)
-        swing = np.zeros(len(allowed)) if self.swing is None else self.swing
+        swings = [each for each in (self.swing, self.earlier_swing) if each is not None]
+        swing = np.max(swings, axis=0) if swings else np.zeros(len(allowed))
         return float((allowed / np.maximum(swing, 0.02)).max())
 
     def _pilot(self) -> None:
@@ -250,7 +257,8 @@ class Search:
         shares, options = self._shares(found), self.options
         full = found.peak_torque >= options.at_limit * most_torque(config)
         capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= options.at_limit * self.cap
-        enough = options.certain_share * (options.falling_share if falls_over(config, self.belief) else 1.0)
+        certain = options.certain_share_known if self.from_earlier else options.certain_share
+        enough = certain * (options.falling_share if falls_over(config, self.belief) else 1.0)
         return bool(((shares >= enough) | full | capped).all())
 
     @staticmethod
