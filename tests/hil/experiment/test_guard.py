@@ -72,6 +72,31 @@ def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
     assert look(guard, MISSING) is Cause.MISSING
 
 
+@pytest.mark.parametrize(
+    ("missing", "late", "said"),
+    [
+        ((False, True), False, "Check its cable and its supply."),
+        ((True, True), False, "No servo was heard: check the adapter, the cables and the supply."),
+        (
+            (True, True),
+            True,
+            "check the adapter, the cables and the supply. Other programs may keep this computer busy.",
+        ),
+    ],
+)
+def test_silence_of_all_servos_points_to_what_they_share(
+    arm: Arm, missing: tuple[bool, bool], late: bool, said: str
+) -> None:
+    guard = Guard(arm())
+    for _ in range(2 * late):
+        guard.late()
+    silent = MISSING._replace(missing=missing)
+    with pytest.raises(SafetyStop) as stop:
+        for number in range(10):
+            guard.look(at(number, silent))
+    assert str(stop.value).endswith(said)
+
+
 def test_a_current_that_does_not_follow(arm: Arm) -> None:
     off = STILL._replace(goal_current=(0.5, 0.0))
     guard = Guard(arm())
