@@ -57,11 +57,6 @@ class Deadlines:
                 Cause.LATE,
             )
 
-    @property
-    def missed_lately(self) -> bool:
-        """Whether one of the last few deadlines was missed."""
-        return self._often > 0.0
-
     def check_gap(self, seconds: float) -> None:
         """Check the time between two exchanges: the servos' watchdogs must not have acted."""
         if seconds >= self._watchdog:

@@ -232,10 +232,7 @@ class Guard:
         if len(self._missing) == 1 or not all(self._missing):
             return "Check its cable and its supply."
         # With Fast Sync Read a servo that is silent also hides those that would answer after it.
-        remedy = "No servo was heard: check the adapter, the cables and the supply."
-        if self._deadlines.missed_lately:
-            remedy += " Other programs may keep this computer busy."
-        return remedy
+        return "No servo was heard: check the adapter, the cables and the supply."
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
         self._stop(

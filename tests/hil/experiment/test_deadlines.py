@@ -95,19 +95,6 @@ def test_at_slow_rates_five_count_as_too_many(arm: Arm) -> None:
         slow.met()
 
 
-def test_missed_lately(arm: Arm) -> None:
-    deadlines = Deadlines(arm())
-    deadlines.met()
-    assert not deadlines.missed_lately
-    deadlines.missed()
-    for _ in range(4):
-        deadlines.met()
-    assert deadlines.missed_lately
-    deadlines.met()
-    deadlines.met()  # the fifth leaves a rounding error
-    assert not deadlines.missed_lately
-
-
 @pytest.mark.parametrize(
     ("lines", "missing", "late"),
     [
