@@ -48,7 +48,7 @@ class BusConfig:
     url: device or pyserial URL.
     one_write: send Sync Write and group read in one write; False where `hil check` finds that an arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
-    slow_every: number of cycles between two slow reads, which alternate between the servo clock (Realtime Tick) and
+    slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage with temperature.
     watchdog_required: reject firmware without Bus Watchdog.
     take_over: if torque is already on, let the arm sink slowly, then cut torque; otherwise refuse to start.

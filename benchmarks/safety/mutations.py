@@ -30,13 +30,15 @@ PATIENCE_S = 300
 _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
     "hil/experiment/guard.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/work.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/following.py": [f"{_EXPERIMENT}/test_following.py"],
     "hil/experiment/consistency.py": [f"{_EXPERIMENT}/test_consistency.py"],
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
-    "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
-    "hil/plan/silence.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
     "hil/experiment/stream.py": [f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"],
     "hil/drivers/torque_off.py": ["tests/drivers/test_torque.py"],

@@ -229,12 +229,10 @@ class Guard:
             )
 
     def _silence_remedy(self) -> str:
-        if len(self._missing) > 1 and all(self._missing):
-            return (
-                "All servos fell silent together: check the adapter, its cable and the supply, and whether other "
-                "programs keep this computer busy."
-            )
-        return "Check its cable and its supply."
+        if len(self._missing) == 1 or not all(self._missing):
+            return "Check its cable and its supply."
+        # With Fast Sync Read a servo that is silent also hides those that would answer after it.
+        return "No servo was heard: check the adapter, the cables and the supply."
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
         self._stop(

@@ -100,9 +100,12 @@ class StatusCheck:
         ahead = _wrapped(offset - behind)
         drifted = _CLOCK_DRIFT * (now - seen_at)
         if ahead < -_CLOCK_TOLERANCE_S - drifted or ahead > _REBOOTED_S:
+            if readings < _LEARNT_READINGS:
+                self._clock[joint] = offset, now, 1, 0  # the first requests were late, so this one counts
+                return None
             stale += 1
             self._clock[joint] = behind, seen_at, readings, stale
-            if stale < _STALE_READINGS or readings < _LEARNT_READINGS:
+            if stale < _STALE_READINGS:
                 return None
             if self._is_anothers(joint, offset, now):
                 return Cause.STALE, (
