@@ -1,10 +1,11 @@
 """mujoco.sysid on the recordings of benchmarks/chain.py: the peer behind the extra `peers`.
 
 The arm is a MuJoCo model with the described geometry and masses. The unknowns are the pseudo-inertia of every link (10
-each, a Cholesky factor relative to the description's), and armature, damping, friction loss and a constant torque of every joint,
-about as many as stage 2's. The arm would fall in an open-loop simulation, so the software spring and damper are part of
-the model, as an affine bias. The method gets every advantage: the true lag, the initial state of the period's Fourier
-lines, an initial guess as good as ours, its own optimiser with rollouts on all cores, and two integration steps per sample.
+each, a Cholesky factor relative to the description's), and armature, damping, friction loss and a constant torque of
+every joint, about as many as stage 2's. The arm would fall in an open-loop simulation, so the software spring and
+damper are part of the model, as an affine bias. The method gets every advantage: the true lag, the initial state of the
+period's Fourier lines, an initial guess as good as ours, its own optimiser with rollouts on all cores, and two
+integration steps per sample.
 """
 
 import importlib

@@ -22,6 +22,7 @@ from hil.estimator.data.fourier import PeriodicMotion
 from hil.estimator.data.recording import Recording
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ModelError, RecordingError
+from hil.estimator.fit.covariance import autocorrelation
 
 CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the regression: the first that the recordings' rate and length allow
 LAG = 1e-3  # s: typical lag of a current loop, assumed by the regression
@@ -115,7 +116,7 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
             model.linear_names,
             model.units[: len(value)],
             value,
-            np.diag(std**2),
+            np.diag(std**2) * _repeated(recordings, model, value, cutoff),
             False,
             nothing,
             nothing,
@@ -160,6 +161,22 @@ def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior
         except RecordingError:
             continue
     return (*fit_filtered(recordings, model, prior, CUTOFFS[-1], LAG), CUTOFFS[-1])
+
+
+def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> float:
+    """Return the factor by which correlation of the torque residual widens the variance of the parameters.
+
+    The sum of the autocorrelation up to its first negative value, of the worst joint. Errors of the regressor itself
+    are not in it.
+    """
+    most = 1.0
+    for recording in recordings:
+        Y, torque = filtered_torque(recording, model, cutoff, LAG)
+        for row in torque - Y @ value:
+            rho = autocorrelation(row, row.size // 4)
+            negative = np.flatnonzero(rho <= 0.0)
+            most = max(most, 1.0 + 2.0 * float(rho[1 : negative[0] if negative.size else rho.size].sum()))
+    return most
 
 
 def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> Array:

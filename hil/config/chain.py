@@ -48,7 +48,7 @@ def only_planar(config: "Config", what: str) -> None:
     if config.is_chain:
         raise ConfigError(
             f"{config.path}: {what} supports only planar arms so far; this one has arm.urdf. For spatial arms, use "
-            "`hil identify` on a fake arm, and `hil estimate`, `hil report` and `hil export` on its runs."
+            "`hil identify`, `hil dry-run`, `hil estimate`, `hil report` and `hil export`."
         )
 
 
