@@ -31,7 +31,21 @@ TICKS = "ticks"
 PLANAR = 2
 POSITION_UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295, "turns": 6.283185307179586, TICKS: 1.0}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "kgf cm": 0.0980665}
+TORQUE_UNITS = {
+    "N m": 1.0,
+    "mN m": 1e-3,
+    "N cm": 1e-2,
+    "kgf cm": 0.0980665,
+    "ozf in": 7.0615518e-3,
+    "lbf in": 0.11298483,
+}
+    "N m": 1.0,
+    "mN m": 1e-3,
+    "N cm": 1e-2,
+    "kgf cm": 0.0980665,
+    "ozf in": 7.0615518e-3,
+    "lbf in": 0.11298483,
+}
 CURRENT_UNITS = {"A": 1.0, "mA": 1e-3}
 VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3}
 PWM_UNITS = {"1": 1.0, "%": 1e-2}
@@ -59,7 +73,7 @@ class Columns(_Table):
         None, description="rad per encoder step; detected from the data if absent"
     )
     torque: list[Column] | None = Field(None, description="one column per joint")
-    torque_unit: Literal["N m", "mN m", "N cm", "kgf cm"] | None = None
+    torque_unit: Literal["N m", "mN m", "N cm", "kgf cm", "ozf in", "lbf in"] | None = None
     current: list[Column] | None = Field(None, description="one column per joint, in place of torque")
     current_unit: Literal["A", "mA"] | None = None
     torque_constant: list[PositiveFloat] | None = Field(

@@ -2,12 +2,12 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from hil.config.csv_columns import Columns
+from hil.config.csv_columns import TORQUE_UNITS, Columns
 from hil.errors import CsvError
 from hil.recordings.table import Table
-from hil.recordings.units import split_head, unit_of
+from hil.recordings.units import UNITS, split_head, unit_of
 
 _TIME = re.compile(r"(time|t|timestamp|stamp|time_?stamp|seconds|secs|elapsed|clock)(_?s|_?sec|_?ms|_?us|_?ns)?", re.I)
 _KINDS = {
@@ -19,7 +19,7 @@ _KINDS = {
 }
 _OF_UNIT = {
     "position": {"rad", "mrad", "deg", "turns", "ticks"},
-    "torque": {"N m", "mN m", "N cm", "kgf cm"},
+    "torque": set(TORQUE_UNITS),
     "current": {"A", "mA"},
     "voltage": {"V", "mV"},
     "pwm": {"%"},
@@ -59,9 +59,20 @@ def guessed(table: Table, columns: Columns) -> Columns:
 def said(columns: Columns, table: Table) -> str:
     """One sentence on how the columns were interpreted."""
     drive = columns.drive or "torque"
-    names = (columns.time or f"{columns.rate:g} samples a second", columns.position or [], getattr(columns, drive))
-    listed = [name if isinstance(name, str) else ", ".join(name) for name in names]
-    return f"{table.source}: taken as time {listed[0]}; position {listed[1]}; {drive} {listed[2]}."
+    time = _described("time", [columns.time], columns, table) if columns.time else f"{columns.rate:g} samples a second"
+    position = _described("position", columns.position or [], columns, table)
+    driven = _described(drive, getattr(columns, drive), columns, table)
+    return f"{table.source}: read as time {time}; position {position}; {drive} {driven}."
+
+
+def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
+    """The columns' names, and their unit where the header does not state it."""
+    given = getattr(columns, f"{kind}_unit", None)
+    if given is not None:
+        return f"{', '.join(names)} [{given}]"
+    if any(unit_of(table.find(name)[2] or "") in UNITS[kind] for name in names):
+        return ", ".join(names)
+    return f"{', '.join(names)} [no unit stated: {next(iter(UNITS[kind]))} assumed]"
 
 
 def _time(table: Table) -> str:

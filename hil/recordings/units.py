@@ -28,6 +28,8 @@ _SPELLINGS = {
     "mN m": "mnm mn·m mn.m mn*m",
     "N cm": "ncm n·cm n.cm n*cm",
     "kgf cm": "kgcm kg·cm kg.cm kg*cm kgfcm kgf·cm kgf.cm kgf*cm",
+    "ozf in": "ozin oz·in oz.in oz*in oz-in ozfin ozf·in ozf.in ozf*in ozf-in",
+    "lbf in": "lbin lb·in lb.in lb*in lb-in lbfin lbf·in lbf.in lbf*in lbf-in inlb in·lb in.lb in-lb",
     "A": "a amp amps ampere amperes",
     "mA": "ma milliamp milliamps milliampere",
     "V": "v volt volts",
@@ -39,7 +41,9 @@ _KNOWN = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling 
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]([^\])]*)[\])]\s*$")
 _SLASH = re.compile(r"^(.*?)\s*/\s*(\S+)$")
 # Only units that cannot be the name of a joint: `q_a` is not a current.
-_SUFFIX = re.compile(r"^(.+)_(deg|rad|mrad|ms|us|ns|sec|nm|mnm|ma|mv|ticks|turns|percent|pct)$", re.IGNORECASE)
+_NAMES_OF_JOINTS = {"step", "pulse", "turn", "second", "fraction", "count"}
+_AS_SUFFIX = sorted(each for each in _KNOWN if len(each) > 1 and each.isalnum() and each not in _NAMES_OF_JOINTS)
+_SUFFIX = re.compile(rf"^(.+)_({'|'.join(_AS_SUFFIX)})$", re.IGNORECASE)
 
 
 def unit_of(text: str) -> str | None:

@@ -8,7 +8,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.models.terms import kind_of, term_of
 
-TORQUE = (2e-3, 300.0)  # N m at the most, of servos from the smallest to the largest
+TORQUE = (2e-3, 60.0)  # N m: the largest torque of the smallest and of the largest servos (PH54: 45 N m continuous)
 PENDULUM = (3e-3, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
 SURE = 4.0  # standard errors
 UNKNOWN = 0.5  # standard error over value
@@ -40,7 +40,9 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
     for joint in range(recordings[0].joints):
         most = max(float(np.abs(each.torque[joint]).max()) for each in recordings)
         if most > TORQUE[1]:
-            found.append(f"Joint {joint + 1}: its torque reaches {most:.3g} N m; no servo has that: check its unit.")
+            found.append(
+                f"Joint {joint + 1}: its torque reaches {most:.3g} N m; hardly any servo has that: check its unit."
+            )
         elif 0.0 < most < TORQUE[0]:
             found.append(f"Joint {joint + 1}: its torque is at most {most:.2g} N m: check its unit.")
     return found

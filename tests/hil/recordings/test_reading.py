@@ -13,6 +13,7 @@ from hil.recordings.convert import Converted, convert
 from hil.recordings.encoder import encoder_step
 from hil.recordings.files import read_tables
 from hil.recordings.periodic import mean_period
+from hil.recordings.units import split_head, unit_of
 
 STEP = 2.0 * np.pi / 4096
 TIME = 0.005 * np.arange(800)
@@ -115,12 +116,12 @@ def spoilt(change: Callable[[list[str]], list[str]]) -> Converted:
     ("change", "said", "recordings"),
     [
         (lambda rows: [each for row in rows for each in (row, row)], "800 repeated rows were left out", 1),
-        (lambda rows: [*rows[:300], *rows[340:]], "taken as time time", 1),
+        (lambda rows: [*rows[:300], *rows[340:]], "read as time time", 1),
         (lambda rows: [*rows[:300], "nan,,,,", *rows[300:]], "1 rows without a time", 1),
         (lambda rows: [*rows[:300], rows[301], rows[300], *rows[302:]], "1 rows out of order were sorted", 1),
         (lambda rows: [*rows[:300], rows[300].rpartition(",")[0] + ",", *rows[301:]], "torque was filled in for 1", 1),
         (lambda rows: [*rows, *rows], "taken as 2 recordings", 2),
-        (lambda rows: [*rows[:300], rows[300].replace("1.5,", "1.5001,"), *rows[300:]], "taken as", 1),
+        (lambda rows: [*rows[:300], rows[300].replace("1.5,", "1.5001,"), *rows[300:]], "read as", 1),
     ],
 )
 def test_rows_that_can_be_put_right_are_and_it_is_said(
@@ -240,3 +241,21 @@ def test_a_periodic_recording_is_averaged() -> None:
     found = mean_period(recording)
     assert found is not None and found.seconds == pytest.approx(2.0) and 3 <= found.periods <= 5
     assert found.recording.position[0] == pytest.approx(np.sin(np.pi * (found.recording.time + 1.0)), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "unit"),
+    [
+        ("effort_1_Ncm", "effort_1", "N cm"),
+        ("tau_2_kgcm", "tau_2", "kgf cm"),
+        ("torque1_ozin", "torque1", "ozf in"),
+        ("i_1_amps", "i_1", "A"),
+        ("pos_1_degrees", "pos_1", "deg"),
+        ("torque 1 [in·lb]", "torque 1", "lbf in"),
+        ("q_a", "q_a", None),
+        ("motor_step", "motor_step", None),
+    ],
+)
+def test_units_are_read_from_headers(header: str, name: str, unit: str | None) -> None:
+    bare, stated = split_head(header)
+    assert bare == name and (None if stated is None else unit_of(stated)) == unit
