@@ -39,13 +39,6 @@ TORQUE_UNITS = {
     "ozf in": 7.0615518e-3,
     "lbf in": 0.11298483,
 }
-    "N m": 1.0,
-    "mN m": 1e-3,
-    "N cm": 1e-2,
-    "kgf cm": 0.0980665,
-    "ozf in": 7.0615518e-3,
-    "lbf in": 0.11298483,
-}
 CURRENT_UNITS = {"A": 1.0, "mA": 1e-3}
 VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3}
 PWM_UNITS = {"1": 1.0, "%": 1e-2}

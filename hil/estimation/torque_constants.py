@@ -25,11 +25,18 @@ class Driven(Protocol):
 
 
 def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity]) -> str:
-    """A sentence on how the values depend on the torque constants and how well these are known; empty if exactly.
+    """Sentences on how the values depend on the torque constants and how well these are known.
 
     extra: the result's terms besides the base parameters. If they include the ratios of the torque constants, only the
     first constant remains uncertain.
     """
+    exact = [joint.name for joint in joints if not joint.torque_per_goal_std]
+    silent = (
+        ""
+        if not exact
+        else f"For {', '.join(exact)}, no uncertainty of the torque constant is given (torque_constant_std, or "
+        "torque_per_volt_std in PWM mode): servos of a model differ by about 10 %, and every value with them."
+    )
     unsure = [
         f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.2g} %"
         for joint in joints
@@ -41,7 +48,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
             "Every value also scales with its joint's torque constant, whose relative uncertainty is: "
             f"{', '.join(unsure)}."
         )
-        return known if unsure else ""
+        return " ".join(sentence for sentence in (known if unsure else "", silent) if sentence)
     first = joints[0]
     given = ", ".join(f"{joint.name} gives {ratio.value:.5g} +- {ratio.std:.1g}" for joint, ratio in ratios)
     its = "its torque constant implies" if len(ratios) == 1 else "their torque constants imply"
@@ -50,7 +57,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         f"constant of {first.name}"
     )
     if not first.torque_per_goal_std:
-        return f"{found}."
+        return f"{found}, of which no uncertainty is given."
     return f"{found}, known to {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
 
 

@@ -16,6 +16,9 @@ from hil.estimator.models.terms import TERMS, joint_of, kind_of, term_of
 from hil.results.parts import Quantity
 from hil.results.result import SettledResult, ShootingResult
 
+_NOTHING = 1e-9
+"""Fraction of a value below which a truth is rounding error, so that a relative error means nothing."""
+
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
     """Print the parameter table, the quality of the fit, the verdict and the next commands."""
@@ -99,7 +102,8 @@ def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
         error = value - truth
-        percent = f"{100 * error / truth:+.3f}" if truth else "-"
+        is_nothing = abs(truth) < _NOTHING * max(abs(value), std)
+        percent = "-" if is_nothing else f"{100 * error / truth:+.3f}"
         cells += [f"{truth:.5g}", percent, f"{error / counted:+.1f}" if counted > 0 else "-"]
     return cells
 
@@ -113,7 +117,9 @@ def _fit(result: SettledResult) -> list[str]:
     held_out = result.validation.held_out_rms
     if held_out:
         errors = ", ".join(f"{100 * value:.2f} %" for value in held_out)
-        lines.append(f"Open-loop prediction of a held-out multisine: error {errors} of the motion's RMS.")
+        what = "path" if result.chain is not None else "multisine"
+        how = "Closed-loop" if result.stabiliser is not None or result.chain is not None else "Open-loop"
+        lines.append(f"{how} prediction of a held-out {what}: error {errors} of the motion's RMS.")
     return lines
 
 
@@ -121,6 +127,8 @@ def _choice(result: SettledResult) -> list[str]:
     choice = result.model_choice
     if not choice:
         return []
+    if len(choice.tried) == 1:
+        return [f"Model chosen: {choice.chosen}. The motion gives no reason to add a term."]
     tried = ", ".join(trial.model for trial in choice.tried)
     gained, cost = choice.error_divided_by, choice.standard_errors_times
     return [
