@@ -69,10 +69,13 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
-    """Return the rise of twice the log likelihood, beyond what chance explains; each joint's noise is unknown."""
+    """Return the rise of twice the log likelihood, beyond what chance explains; each joint's noise is unknown.
+
+    The residual's correlation is that of the richer model: what the simpler one leaves out is no noise.
+    """
     before, after = (np.nansum(np.square(each.residual), axis=1) for each in (simple, rich))
     samples = np.isfinite(simple.residual).sum(axis=1)
     ratio = samples * np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
     added = len(rich.names) - len(simple.names)
     level = float(chi2.isf(options.significance, added))
-    return float(ratio.sum()) / max(simple.correlation_time, 1.0) - level
+    return float(ratio.sum()) / max(rich.correlation_time, 1.0) - level

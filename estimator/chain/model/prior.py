@@ -47,10 +47,13 @@ class Prior:
         spread = np.column_stack((np.maximum(SPREAD * np.abs(links), least), np.maximum(rotor, ARMATURE)))
         std = np.sqrt(base.grouping**2 @ spread.reshape(-1) ** 2)
         assert spread.shape == (joints, TERMS)
-        return cls(base.of_all(every), std, None if scale_std is None else _scale_precision(scale_std))
+        return cls(base.of_all(every), std, None if scale_std is None else scale_precision(scale_std))
 
 
-def _scale_precision(std: Array) -> Array:
-    """Return the precision of the ratios of the joints' torque constants to the first one's."""
+def scale_precision(std: Array) -> Array:
+    """Return the precision of the logarithms of the ratios of the joints' torque constants to the first one's.
+
+    std: relative standard deviations of the torque constants (joints,).
+    """
     variance = np.square(np.maximum(std, LEAST_SCALE))
     return np.asarray(np.linalg.inv(np.diag(variance[1:]) + variance[0]))

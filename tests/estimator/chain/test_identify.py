@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks import chain as bench
+from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.fit.regression import fit_filtered
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import scale_precision
 from hil.estimator.chain.simulation.prediction import predict, relative_error
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS
@@ -134,3 +136,26 @@ def test_filtered_least_squares_takes_any_recording(setup: bench.Setup, period: 
     value, std = fit_filtered([recording], ChainModel(setup.base), setup.prior, 8.0)
     assert value.shape == std.shape == (setup.base.count + 12,)
     assert np.all(std > 0)
+
+
+def test_wrong_torque_constants_are_found(setup: bench.Setup, period: SettledPeriod) -> None:
+    """Joints share links, so constants that are off by different factors fit no arm unless their ratios are free."""
+    wrong = np.array([1.0, 1.03, 0.97, 1.02])
+    assumed = replace(period, torque=period.torque * wrong[:, None])
+    prior = replace(setup.prior, scale_precision=scale_precision(np.full(4, 0.05)))
+    found = identify_chain(assumed, ChainModel(setup.base, torque_scale=True), prior)
+    assert found.residual_steps.max() < 0.31
+    ratios = np.array([found.parameters[f"torque_scale_{joint}"] for joint in (2, 3, 4)])
+    np.testing.assert_allclose(ratios, 1.0 / wrong[1:], rtol=3e-3)
+    plain = identify_chain(assumed, ChainModel(setup.base), setup.prior)
+    assert plain.residual_steps.max() > 0.4
+
+
+def test_auto_adds_what_the_recording_shows(setup: bench.Setup, period: SettledPeriod) -> None:
+    """An encoder whose zero is off is found; a recording that is explained keeps the plain model."""
+    assert choose_chain(period, ChainModel(setup.base), setup.prior).model == ChainModel(setup.base)
+    shifted = period.position.copy()
+    shifted[1] -= 0.06
+    found = choose_chain(replace(period, position=shifted), ChainModel(setup.base), setup.prior)
+    assert found.model.zeros
+    assert found.parameters["zero_2"] == pytest.approx(0.06, abs=0.01)
