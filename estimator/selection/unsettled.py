@@ -82,7 +82,7 @@ def choose_by_shooting(
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(
             f"no recording has two segments of {length:g} s, one to fit and one to check: set model.friction to a "
-            "specific model, record longer, or choose shorter segments"
+            "specific model, record longer, or choose shorter segments (columns.segment)"
         )
     joints = recordings[0].joints
     unknown: tuple[Option, ...] = ("torque_scale",) if joints == 2 else ()

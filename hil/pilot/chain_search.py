@@ -144,7 +144,7 @@ class ChainSearch:
         torque = found.plan.segments[0].peak_goal * np.array([joint.torque_per_goal for joint in config.joints])
         step = Step(name, torque, foreseen.median, foreseen.quantile, peaks, str(error or ""))
         self.steps.append(step)
-        self.say(f"{name}: {100 * found.share:.0f} % of the path. {step} Predicted clearance: {found.foreseen}.")
+        self.say(f"{step}\n  {100 * found.share:.0f} % of the path; predicted clearance: {found.foreseen}.")
         if error is not None:
             self.say(f"{name} ended early: {error} {self.torque}")
         elif not step.within:

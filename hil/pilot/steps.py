@@ -51,12 +51,18 @@ class Step:
 
     def __str__(self) -> str:
         torque = ", ".join(f"{value:.3g}" for value in self.peak_torque)
-        each = "; ".join(
-            f"{QUANTITIES[row]} {_list(self.median[row])} predicted, at most {_list(self.quantile[row])}, "
-            f"{_list(self.seen[row])} {UNITS[row]} seen"
+        rows = [("", "predicted", "99 % within", "seen")] + [
+            (
+                f"{QUANTITIES[row]} [{UNITS[row]}]",
+                *(_list(each[row]) for each in (self.median, self.quantile, self.seen)),
+            )
             for row in range(GUARDED)
-        )
-        return f"{self.name}, peak torque {torque} N m: {each}."
+        ]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [
+            "   ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+        ]
+        return "\n  ".join((f"{self.name}, peak torque {torque} N m:", *lines))
 
     def played(self) -> PlayedStep:
         """The step in the form stored in a result."""

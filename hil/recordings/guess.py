@@ -1,5 +1,6 @@
 """Guesses the meaning of columns from their names, if [columns] does not specify it."""
 
+import json
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -31,6 +32,7 @@ _NOT_MEASURED = re.compile(
 _NOT_POSITION = re.compile(
     r"(?<![a-z])(vel|velocity|speed|acc|accel|dq|qd|qdd|ddq|temp|temperature|err|error)(?![a-z])", re.I
 )
+_EXAMPLE = 5  # columns of a recording of two joints
 _SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
 
 
@@ -132,8 +134,15 @@ def _stem(name: str) -> str:
 
 def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
     some = list(found)
-    seen = f"several may be meant ({', '.join(some[:12])})" if some else "none is called so"
+    seen = f"several may be meant ({', '.join(some[:12])})" if some else "none has a name that says so"
+    example = '[columns]\ntime = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
+    names = list(table.columns)
+    if len(names) >= _EXAMPLE:  # with this file's own names, in the usual order
+        shown = [json.dumps(split_head(name)[0], ensure_ascii=False) for name in names[:_EXAMPLE]]
+        example = (
+            f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}, {shown[2]}]\ntorque = [{shown[3]}, {shown[4]}]"
+        )
     return CsvError(
-        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Say it in --config ARM.toml:\n"
-        '[columns]\ntime = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
+        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Say it in --config ARM.toml, for "
+        f"example, if this is their order:\n{example}"
     )

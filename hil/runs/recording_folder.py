@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hil import __version__
 from hil.errors import RunFolderError
 from hil.results.json_form import FormError, from_json, to_json
-from hil.runs.run_folder import SCHEMA, write_json
+from hil.runs.run_folder import SCHEMA, taken, write_json
 
 KIND = "recordings"
 ARRAYS = "recordings.npz"
@@ -87,7 +87,7 @@ def create(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
         if any(path.iterdir()):
-            raise RunFolderError(f"Run folder {path} is not empty; choose another with --out, or remove it.")
+            raise taken(path)
     except OSError as error:
         raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
 

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,6 +39,14 @@ log = logging.getLogger(__name__)
 
 SCHEMA = 1
 _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
+
+
+def taken(path: Path) -> RunFolderError:
+    """Return the error for a folder that is not empty; it names a folder that is free."""
+    free = next(found for number in count(2) if not (found := path.with_name(f"{path.name}-{number}")).exists())
+    return RunFolderError(
+        f"Run folder {path} is not empty; choose another with --out, for example --out {free}, or remove it."
+    )
 
 
 @dataclass(frozen=True)
@@ -106,7 +115,7 @@ class RunFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
             if any(path.iterdir()):
-                raise RunFolderError(f"Run folder {path} is not empty; choose another with --out, or remove it.")
+                raise taken(path)
             run.config_path.write_bytes(config.path.read_bytes())
             for urdf in _urdfs(config):
                 (path / urdf.name).write_bytes(urdf.read_bytes())

@@ -113,6 +113,7 @@ def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     The arm is viewed so that it hangs down and points to the right when it is lifted.
     """
     before = servo.read("Present Position")
+    given = {"1": 1, "+1": 1, "-1": -1}
     turn = f"Turn {name} slightly counter-clockwise by hand, at most a quarter turn, hold it there and press Enter"
     again = f"{name} did not move. {turn}; or type its direction, 1 or -1, if you know it"
     for question, usual in ((turn, ""), (again, "1")):
@@ -120,10 +121,10 @@ def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
         moved = servo.read("Present Position") - before
         if abs(moved) >= _MOVED_TICKS:
             return 1 if moved > 0 else -1
-    if answer == "-1":
-        return -1
-    say(f"{name} did not move: direction = 1. Correct it in the file if the servo turns the other way.")
-    return 1
+    while answer not in given:
+        answer = ask(f"{answer!r}: {name} did not move; type its direction, 1 or -1 (1 if you do not know it)", "1")
+    say(f"{name} did not move: direction = {answer}. Correct it in the file if the servo turns the other way.")
+    return given[answer]
 
 
 def _stance(ask: Ask, say: Say) -> str:
