@@ -1,5 +1,6 @@
 """Configurations that are installed with hil: `hil identify fake_two_link` works without a checkout."""
 
+from difflib import get_close_matches
 from pathlib import Path
 
 from hil.fakes.names import configs_folder
@@ -12,7 +13,21 @@ def bundled_configs() -> dict[str, Path]:
 
 def find_config(path: Path) -> Path:
     """Return `path`, or the bundled file of that name if `path` is a bare name and no such file exists."""
-    is_name = path.name == str(path) and path.suffix == ""
-    if not is_name or path.exists():
+    if not _is_name(path) or path.exists():
         return path
     return bundled_configs().get(path.name, path)
+
+
+def meant(path: Path) -> str:
+    """What to say about a bare name that is no bundled configuration; empty for paths and files that exist."""
+    if not _is_name(path) or path.exists():
+        return ""
+    names = list(bundled_configs())
+    close = get_close_matches(path.name, names, n=1)
+    if close:
+        return f" Did you mean the bundled configuration {close[0]}?"
+    return f" Bundled configurations: {', '.join(names)}."
+
+
+def _is_name(path: Path) -> bool:
+    return path.name == str(path) and path.suffix == ""

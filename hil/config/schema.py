@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from hil import fakes
-from hil.config.bundled import find_config
+from hil.config.bundled import find_config, meant
 from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.clearance import ClearanceConfig
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
@@ -270,7 +270,7 @@ def load_config(path: Path) -> Config:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise ConfigError(f"{path}: cannot be read: {reason}.") from error
+        raise ConfigError(f"{path}: cannot be read: {reason}.{meant(path)}") from error
     return parse_config(text, path)
 
 
