@@ -5,6 +5,7 @@ and widened covariance initialise `hil.estimator.models.momentum_observer`. With
 too, only the planned torque is known: the first motion then trains the model, and only later motion is judged.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,6 +32,11 @@ _TILT_SHARE = 0.2  # standard deviation of gravity out of the assumed direction,
 _FRICTION_SPREAD = 3.0
 """Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
 _STILL_RAD_S = 0.06
+_STEP_S = 0.06
+"""Time for which a joint must seem to stand under a torque that is held over several exchanges [s]."""
+
+_LAG_S = 0.012
+"""Time constant with which a step of the torque shows in the velocity [s]: current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 
@@ -57,6 +63,11 @@ class ModelWatch:
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
         self._shortest = float("inf")
+        # Goals held over several exchanges are steps, which motors and velocities follow only after a moment.
+        held = interval < 0.99 / config.experiment.rate
+        self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
+        self._felt = [0.0] * len(largest)
+        self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
 
     def look(self, state: State) -> None:
@@ -71,9 +82,18 @@ class ModelWatch:
         if goal is None or took - self._shortest > self._long:
             goal, seconds = state.goal_current, float("inf")
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
+        follows = self._follows
+        torque = self._felt = [felt + follows * (now - felt) for felt, now in zip(self._felt, torque, strict=True)]
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
-        if joint >= 0:
-            self._raise(joint, state)
+        if joint < 0:
+            self._stands_for = 0.0
+            return
+        # After a step, a heavy joint takes a while to reach the smallest velocity that the register shows.
+        if self._follows < 1.0 and abs(state.velocity[joint]) < _STILL_RAD_S:
+            self._stands_for += min(seconds, self._long)
+            if self._stands_for < _STEP_S:
+                return
+        self._raise(joint, state)
 
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
