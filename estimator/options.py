@@ -231,6 +231,8 @@ class SelectionOptions:
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
     """RMS residual in units of the noise below which a richer model's minimum is searched near the simpler one's."""
+    steady_residual: float = 5.0
+    """RMS residual in units of the noise below which a change of friction is looked for: worse models may feign one."""
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which presliding is tried, which is slow to fit."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)

@@ -207,6 +207,7 @@ class Selection:
     ) -> None:
         self._periods = [without_spikes(period) for period in periods]
         self._held_out = held_out
+        self._raw = self._periods, held_out
         self._fitting = Fitting(self._periods, held_out, starts)
         self._options = options
         self._fixed = fixed
@@ -246,10 +247,10 @@ class Selection:
         self._begin(model.having(*unknown), coarse=True)
         self._begin(smooth)
         self._begin(smooth.having("presliding"), coarse=True)
-        plain = self._steadied(self._try_or_none(model.having(*unknown), coarse=True))
+        plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
-            return plain
+            return self._steadied(plain) or plain
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
             best = self._steadied(self._better(self._try_or_none(smooth, plain), plain))
@@ -259,35 +260,59 @@ class Selection:
             raise ConvergenceError("no friction model could be fitted: check the recording, or lower the torque")
         if self._left(best) > self._options.presliding_residual**2:
             best = self._better(self._try_or_none(smooth.having("presliding"), coarse=True), best) or best
-        if not self._is_explained(best):
-            best = self._with_ripple(best)
+        for near in self._closest():
+            if not self._is_explained(best):
+                best = self._better(self._with_ripple(near), best) or best
+        best = self._steadied(best) or best
         return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
 
-    def _steadied(self, trial: Trial | None) -> Trial | None:
-        """Correct the periods for a change of friction, if one is seen and explains part of the residual.
+    def _closest(self) -> list[Trial]:
+        """Return the trials that explain most, with and without presliding, the best first.
 
-        Returns the fit of the corrected periods, or else `trial`.
+        Ripple shows where other terms explain most, whether or not they are worth their number yet; but bristles may
+        have taken part of it over.
         """
-        other, seconds = self._held_out, self._seconds
-        if trial is None or trial.estimate is None or other is None or seconds is None or self.drift is not None:
+        fitted = sorted((each for each in self.trials if each.estimate is not None), key=self._left)
+        kinds = {"presliding" in each.model.options: each for each in reversed(fitted)}
+        return sorted(kinds.values(), key=self._left)
+
+    def _steadied(self, trial: Trial | None) -> Trial | None:
+        """Correct the periods for a change of friction, if one is seen and the motion is explained as well then.
+
+        The change is sought with the recordings as they are, so that a later call, with a better model, replaces or
+        withdraws an earlier correction. Returns the fit of the periods as they are then, or else `trial`.
+        """
+        periods, other = self._raw
+        if trial is None or trial.estimate is None or other is None or self._seconds is None or len(periods) > 1:
             return trial
-        if len(self._periods) > 1 or self._is_explained(trial):
+        if self.drift is None and self._left(trial) > self._options.steady_residual**2:
             return trial
-        drift = friction_change(other, trial.estimate, seconds)
-        if not drift.is_seen:
-            return trial
+        drift = friction_change(other, trial.estimate, self._seconds)
         former = self._periods, self._fitting, self.trials
-        self._periods = [steadied(self.period, trial.estimate, drift)]
-        corrected = steadied(other, drift.at_the_later(trial.estimate), drift)
-        self._fitting = replace(self._fitting, periods=self._periods, held_out=corrected, drift=drift)
+        if drift.is_seen:
+            later = drift.at_the_later(trial.estimate)
+            corrected = [steadied(periods[0], trial.estimate, drift)], steadied(other, later, drift)
+            self._use(*corrected, drift)
+        elif self.drift is None:
+            return trial
+        else:
+            self._use(periods, other, None)
+        again = self._try_or_none(trial.model, trial)
+        if again is not None:
+            # Where other terms have passed for the change, the residual need not fall: they are removed by pruning.
+            as_good = self._is_explained(again) or self._left(again) < self._left(trial)
+            if self.drift is None or as_good:
+                return again
+        self._periods, self._fitting, self.trials = former
+        return trial
+
+    def _use(self, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drift: Drift | None) -> None:
+        """Fit these periods from now on; earlier trials and fits already begun belong to others."""
+        self._periods = list(periods)
+        self._fitting = replace(self._fitting, periods=self._periods, held_out=held_out, drift=drift)
         self.trials = []
         self.end()
         self._begun.clear()
-        again = self._try_or_none(trial.model, trial)
-        if again is not None and self._left(again) < self._left(trial):
-            return again
-        self._periods, self._fitting, self.trials = former
-        return trial
 
     def _seen(self, trial: Trial) -> list[Candidate]:
         assert trial.estimate is not None

@@ -24,7 +24,7 @@ ArmFile = Callable[..., Path]
 
 BY_CURRENT = (
     ("torque_constant = 1.80         # N m/A at the output shaft", ""),
-    ("torque_constant_std = 0.15     # how well that is known; every parameter of the joint scales with it", ""),
+    ("torque_constant_std = 0.15     # its uncertainty; every parameter of the joint scales with it", ""),
     ("current_limit = 1.2            # A", ""),
     ("torque_constant = 1.80\n", ""),
     ("torque_constant_std = 0.15\n", ""),

@@ -5,18 +5,24 @@ from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+import hil
 from hil.cli.views.result_table import print_result
 from hil.config.schema import load_config
+from hil.errors import ConfigError
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.fakes.servo.registers import Register
 from hil.fakes.servo.servo import EmulatedServo
 from hil.pilot import identify_in_steps
+from hil.pilot.belief import prior_belief
+from hil.pilot.search import Search
+from hil.pilot.steps import Played, Step
 from hil.report.page import make_page
 from hil.report.run_data import RunData
 from hil.results.result import SettledResult
@@ -119,3 +125,37 @@ def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None
     for said in (console.export_text(), page):
         assert "Share of torque from the stabiliser" in said and shoulder in said
     assert "uses the total commanded torque" in page
+
+
+def test_a_second_run_starts_from_the_first_and_needs_fewer_steps(in_steps: Any, tmp_path: Path) -> None:
+    first, _, _ = in_steps
+    config = load_config(CONFIGS / "first_time.toml")
+    said: list[str] = []
+    run = RunFolder.create(tmp_path / "run", config)
+    _, second = identify_in_steps(config, run, config.path, lambda _: None, said.append, first)
+    assert [step.name for step in second.steps] == ["Pilot", "Full run"] and len(first.steps) > 2
+    assert not any("starting from the prior" in line for line in said)
+    for name, entry in second.parameters.items():
+        assert abs(entry.value - second.truth[name]) <= 0.01 * abs(second.truth[name]), name
+
+
+def test_an_earlier_result_narrows_the_belief_and_is_dropped_when_the_arm_moves_otherwise(in_steps: Any) -> None:
+    first, _, _ = in_steps
+    config = load_config(CONFIGS / "first_time.toml")
+    said: list[str] = []
+    search = Search.of(config, Mock(), Mock(say=said.append), earlier=first)
+    prior = prior_belief(config, 96)
+    for name in ("inertia_1", "gravity_1", "coupling", "coulomb_1", "viscous_2"):
+        assert search.belief.spread(name) < 0.5 * prior.spread(name), name
+        assert search.belief.middle[name] == pytest.approx(first.values[name], rel=0.05), name
+    peaks = np.zeros((4, 2))
+    beyond = Step("Pilot", np.array([0.3, 0.2]), peaks, peaks, peaks + 1.0)
+    search.learn(config, Played(beyond, None, "", None))
+    assert search.belief.spread("gravity_1") == prior.spread("gravity_1") and not search.from_earlier
+    assert any("starting from the prior" in line for line in said)
+
+
+def test_an_earlier_run_needs_a_pilot_to_start_from(in_steps: Any) -> None:
+    _, path, _ = in_steps
+    with pytest.raises(ConfigError, match=r"needs experiment\.pilot = true"):
+        hil.identify("fake_two_link", start_from=path)
