@@ -47,7 +47,7 @@ def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = Fals
 def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
     """Play the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
-    from hil.cli.next_step import next_step
+    from hil.next_step import next_step
     from hil.cli.terminal import Terminal
     from hil.results.json_form import to_json
 

@@ -18,7 +18,7 @@ def init(
     yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; accept every default.")] = False,
 ) -> None:
     """Scan the bus, ask for the rest, and write a commented TOML file. Torque stays off and no setting is changed."""
-    from hil.cli.next_step import next_step
+    from hil.next_step import next_step
     from hil.cli.terminal import Terminal
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port

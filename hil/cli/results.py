@@ -24,7 +24,7 @@ def report(
     ] = None,
 ) -> None:
     """Write a run as one self-contained HTML page: verdict, parameters, figures."""
-    from hil.cli.next_step import next_step
+    from hil.next_step import next_step
     from hil.report.pictures import save_pictures
     from hil.report.run_data import RunData
 

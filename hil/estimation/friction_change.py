@@ -26,8 +26,8 @@ from hil.results.parts import Covariance
 
 Array = NDArray[np.float64]
 
-KINDS = ("viscous", "coulomb", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
-"""Terms of friction in motion. What shapes it near standstill is not tested, only allowed to vary."""
+KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
+"""Terms of friction in motion, and the width of its step, which is known together with the rise."""
 REPEATABILITY = 0.005
 """Standard deviation of a friction parameter from run to run of an unchanged arm, relative to its value."""
 

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.cli.next_step import command, next_step
+from hil.next_step import command, next_step
 from hil.cli.printing import print_table, say
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
