@@ -2,9 +2,9 @@
 
     python -m benchmarks.wear --runs 6
 
-The arm is identified `--runs` times unchanged, and twice after each friction term of each joint has changed by 10 %, every time
-with other noise and, with --other-motion, another excitation. Every changed run is compared with every unchanged one, and the
-unchanged runs with each other.
+The arm is identified `--runs` times unchanged, and twice after each friction term of each joint has changed by 10 %.
+With --other-motion every run plays another excitation; without it, runs of the noiseless fake arms are identical.
+Every changed run is compared with every unchanged one, and the unchanged runs with each other.
 """
 
 import argparse
@@ -73,9 +73,10 @@ def _identify(config: Config, changed: str, seed: int, other_motion: bool, folde
     for tried in range(seed, seed + 20):
         try:
             hil.identify(arm_after(config, changed, tried, other_motion, folder), out=path)
-            return tried
         except SafetyStop:
             shutil.rmtree(path)
+        else:
+            return tried
     raise SystemExit(f"no motion within the limits from seed {seed} on")
 
 

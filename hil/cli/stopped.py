@@ -1,4 +1,5 @@
-"""Ctrl-C, SIGTERM and SIGHUP while no arm moves: a message, the next command, and 128 plus the signal's number as exit code.
+"""Ctrl-C, SIGTERM and SIGHUP while no arm moves: a message, the next command, and exit code 128 plus the signal's
+number.
 
 While an arm may move, hil.experiment.stop_request handles them; the exit codes are the same.
 """
@@ -9,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 import typer
 
@@ -45,7 +47,7 @@ def how_to_go_on(stopped: BaseException) -> list[str]:
     return notes if any("hil " in note for note in notes) else [*notes, next_step(*sys.argv[1:])]
 
 
-def _catch() -> dict[signal.Signals, object]:
+def _catch() -> dict[signal.Signals, Any]:
     """Catch signals that would end the program without a word; leaves those that are handled or ignored (nohup)."""
     caught = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
     return {each: signal.signal(each, _raise) for each in caught}

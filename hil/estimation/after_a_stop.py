@@ -11,7 +11,10 @@ from hil.runs.run_folder import RunFolder
 
 
 def after_a_stop(run: RunFolder, shown: Path) -> list[str]:
-    """Sentences about what is kept, the last one the next command. shown: the configuration's path as the user wrote it."""
+    """Sentences about what is kept; the last one is the next command.
+
+    shown: the configuration's path as the user wrote it.
+    """
     if run.result_path.is_file():
         return ["The result is kept; the report is missing.", next_step("report", run.path)]
     if can_be_estimated(run.path):

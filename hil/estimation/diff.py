@@ -1,7 +1,7 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), the friction of each joint also as a
-whole (hil.estimation.friction_change), and Holm's step-down correction
+Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), the friction of each joint
+also as a whole (hil.estimation.friction_change), and Holm's step-down correction
 keeps the probability of any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of
 Statistics 6 (1979) 65). A change must also be larger than `least_share` of the parameter's scale: standard errors cover
 noise only, and two runs of an arm with some unmodelled friction differ by a little more.
@@ -52,8 +52,8 @@ class Change:
 class Difference:
     """The changes from one run to another.
 
-    only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction term
-    alone that two runs like these show with a probability of 95 % [% of its value before].
+    only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction
+    term alone that two runs like these show with a probability of 95 % [% of its value before].
     """
 
     before: str
@@ -105,7 +105,9 @@ def diff_models(
     """Compare two models of one arm parameter by parameter, in the order of the first."""
     common = [name for name in before.values if name in after.values and not name.startswith("ripple_cycles")]
     z = {name: _z(before, after, name) for name in common}
-    p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()} | {row.name: row.p for row in friction}
+    p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()} | {
+        row.name: row.p for row in friction
+    }
     significant = _holm(p, false_alarms)
     changes = [
         Change(
@@ -124,7 +126,8 @@ def diff_models(
             *(row.before, row.std / math.sqrt(2), row.after, row.std / math.sqrt(2)),
             row.z,
             row.p,
-            row.name in significant and abs(row.after - row.before) > least_share * max(abs(row.before), abs(row.after)),
+            row.name in significant
+            and abs(row.after - row.before) > least_share * max(abs(row.before), abs(row.after)),
         )
         for row in friction
     ]

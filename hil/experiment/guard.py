@@ -293,8 +293,8 @@ class Guard:
     def _silence_remedy(self) -> str:
         if len(self._missing) > 1 and all(self._missing):
             return (
-                "All servos fell silent together: check the adapter, its cable and the supply, and whether other programs "
-                "keep this computer busy."
+                "All servos fell silent together: check the adapter, its cable and the supply, and whether other "
+                "programs keep this computer busy."
             )
         return "Check its cable and its supply."
 

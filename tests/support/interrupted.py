@@ -2,8 +2,8 @@
 
     python -m tests.support.interrupted ramp SIGINT identify arm.toml --out run
 
-The stage is reached when a function is called, or when a sample of some phase is recorded, so that the moment is exact and no
-time is lost; the signal is a real one, and everything after it is the program's own doing.
+The stage is reached when a function is called, or when a sample of some phase is recorded, so that the moment is exact
+and no time is lost; the signal is a real one, and everything after it is the program's own doing.
 """
 
 import atexit
@@ -29,9 +29,9 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "O
 class Stage:
     """Where a command is interrupted.
 
-    command: the subcommand. target: "module:name" or "module:Class.name" of the function whose call begins the stage; `after`
-    that many calls. sampled: instead, whether a sample belongs to the stage, given phase, segment, period and the number of
-    samples of that phase so far.
+    command: the subcommand. target: "module:name" or "module:Class.name" of the function whose call begins the stage,
+    after `after` other calls. sampled: instead, whether a sample belongs to the stage, given phase, segment, period and
+    the number of samples of that phase so far. pilot: whether it exists only with experiment.pilot = true.
     """
 
     command: str
@@ -54,7 +54,9 @@ STAGES: dict[str, Stage] = {
     "between pilots": Stage("identify", "hil.pilot.belief:Belief.after", pilot=True),
     "ramp": Stage("identify", sampled=_in(Phase.RAMP_IN)),
     "settling": Stage("identify", sampled=_in(Phase.PERIODIC)),
-    "recorded period": Stage("identify", sampled=lambda now, played, period, _: (now, played, period) == (Phase.PERIODIC, 0, 1)),
+    "recorded period": Stage(
+        "identify", sampled=lambda now, played, period, _: (now, played, period) == (Phase.PERIODIC, 0, 1)
+    ),
     "held-out part": Stage("identify", sampled=_in(Phase.PERIODIC, 1)),
     "ramp out": Stage("identify", sampled=_in(Phase.RAMP_OUT, 1)),
     "first stage of the estimation": Stage("identify", "hil.estimation.settled_estimate:settled_period"),
@@ -168,6 +170,7 @@ def interrupt(stage: str, number: signal.Signals, words: list[str], folder: Path
 def main() -> None:
     """Run `hil` with the words that follow the stage and the signal."""
     name, number, *words = sys.argv[1:]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start with it ignored
     _report_servos()
     interrupt_at(STAGES[name], signal.Signals[number])
     sys.argv = ["hil", *words]

@@ -24,7 +24,9 @@ WORDS = {
 def _cases() -> list[object]:
     """Every stage with both signals; all but a few are slow."""
     return [
-        pytest.param(name, number, marks=() if OFTEN.get(name) is number else pytest.mark.slow, id=f"{name}-{number.name}")
+        pytest.param(
+            name, number, marks=() if OFTEN.get(name) is number else pytest.mark.slow, id=f"{name}-{number.name}"
+        )
         for name in STAGES
         for number in (signal.SIGINT, signal.SIGTERM)
     ]

@@ -90,7 +90,10 @@ def curves(rng: np.random.Generator, factor: float, kept: Covariance, spread: fl
     spread: how much friction differs from run to run, relative to its value.
     """
     root = np.linalg.cholesky(kept.array())
-    stds = {**dict.fromkeys(VALUES, 1e-6), **dict(zip(kept.names, np.sqrt(np.diag(kept.array())).tolist(), strict=True))}
+    stds = {
+        **dict.fromkeys(VALUES, 1e-6),
+        **dict(zip(kept.names, np.sqrt(np.diag(kept.array())).tolist(), strict=True)),
+    }
     found = []
     for rise in (0.4, 0.4 * factor):
         values = np.array([0.055, rise, 0.3]) * (1.0 + spread * rng.standard_normal(3)) + root @ rng.standard_normal(3)
