@@ -187,7 +187,7 @@ def play(cycle: Cycle, count: int) -> Round:
 
 def play_c(binary: Path, name: str, servos: int, count: int, writes: int) -> Round:
     """Run one round of the client written in C."""
-    words = [binary, "client", name, str(servos), str(count), str(writes)]
+    words: list[str | Path] = [binary, "client", name, str(servos), str(count), str(writes)]
     text = subprocess.run(words, check=True, capture_output=True, text=True).stdout
     cpu, p50, each = map(int, text.split())
     return Round(cpu / 1e3, p50 / 1e3, 1e9 / each)

@@ -1,6 +1,6 @@
 """Spatial arms with four and six joints: accuracy of the estimator and of filtered least squares on the same data.
 
-    python benchmarks/chain.py [--json] [--seeds N] [--joints 4 6]
+    python benchmarks/chain.py [--json] [--seeds N] [--joints 4 6] [--peers]
 
 The arms are configs/open_manipulator_x_like.urdf and configs/viperx_300_like.urdf. The true arms have masses 20 %
 above or below these (at random for each link), centres of mass shifted by up to 1 cm, and randomly drawn drives: static
@@ -21,6 +21,9 @@ share_of_classic       ratio of the torque error to that of the classic method, 
 classic                the same figures for filtered inverse-dynamics least squares: the best of three cut-offs, chosen
                        with the truth known; it has no one-step-ahead residual
 
+mujoco_sysid           with --peers: torque and base parameter errors of mujoco.sysid on the first seed's recording,
+                       its parameters and processor time on all cores, and the ratio of the latter to ours
+
 `--json` prints {"arms": {"4": {...}, "6": {...}}} and nothing else.
 """
 
@@ -38,6 +41,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 
 from benchmarks.machine import machine
+from benchmarks.spatial.mujoco_chain import fit_chain_with_mujoco
 from hil.description.urdf import read_urdf
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.fourier_path import design_path
@@ -156,8 +160,8 @@ def set_up(bench: Bench, seed: int) -> Setup:
 
 
 def path_of(bench: Bench, setup: Setup, seed: int) -> Motion:
-    limits = (np.array(each, dtype=float) for each in (bench.centre, bench.swing, bench.speed))
-    return design_path(setup.base, setup.prior, RATE, PERIOD, HIGHEST, *limits, seed)
+    centre, swing, speed = (np.array(each, dtype=float) for each in (bench.centre, bench.swing, bench.speed))
+    return design_path(setup.base, setup.prior, RATE, PERIOD, HIGHEST, centre, swing, speed, seed)
 
 
 def record(bench: Bench, setup: Setup, path: Motion) -> SettledPeriod:
@@ -209,7 +213,7 @@ def classic(setup: Setup, period: SettledPeriod, held_out: SettledPeriod, path: 
     at = np.arange(period.samples) / period.rate
     recording = Recording(at, period.torque, period.position, period.position_step, between="held")
     count = setup.base.count
-    tried = []
+    tried: list[dict[str, Any]] = []
     for cutoff in CUTOFFS:
         started = time.perf_counter()
         value, std = fit_filtered([recording], model, setup.prior, cutoff, 1e-3)
@@ -259,6 +263,19 @@ def measure(joints: int, seed: int) -> dict[str, Any]:
     }
 
 
+def peer(joints: int) -> dict[str, Any]:
+    """The figures of mujoco.sysid on the first seed's recording; raises MissingExtra without it."""
+    bench, setup = BENCHES[joints], set_up(BENCHES[joints], 1)
+    period = record(bench, setup, path_of(bench, setup, 101))
+    model = ChainModel(setup.base)
+    worked = time.process_time()
+    identify_chain(period, model, setup.prior)
+    ours = time.process_time() - worked
+    value, seconds, count = fit_chain_with_mujoco(period, setup.base, setup.prior, setup.described)
+    found = errors(setup, value, path_of(bench, setup, 201))
+    return {**found, "parameters": count, "processor_seconds": seconds, "times_ours": seconds / ours}
+
+
 _COMPILED: set[int] = set()
 
 
@@ -294,12 +311,15 @@ def main() -> None:
     parser.add_argument(
         "--jobs", type=int, default=1, help="number of workers; with more than one, times are disturbed"
     )
+    parser.add_argument("--peers", action="store_true", help="also mujoco.sysid (hil[peers]), some minutes")
     parser.add_argument("--joints", type=int, nargs="+", default=[4, 6], choices=sorted(BENCHES))
     given = parser.parse_args()
     result: dict[str, Any] = {"arms": {}}
     for joints in given.joints:
         seeds = range(1, given.seeds + 1)
         result["arms"][str(joints)] = worst(each(partial(_compiled, joints), seeds, count=given.jobs))
+        if given.peers:
+            result["arms"][str(joints)]["mujoco_sysid"] = peer(joints)
     if given.json:
         print(json.dumps(result))
         return

@@ -108,8 +108,13 @@ def zeros_of(recording: Recording, parameters: dict[str, float]) -> np.ndarray:
         return both(prediction_rms([recording], parameters, HORIZON, 2, zeros[None]))
 
     simplex = np.array([[0.0, 0.0], [0.03, 0.0], [0.0, 0.03]])
-    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4, "maxiter": 60}
-    return np.asarray(minimize(error, simplex[0], method="Nelder-Mead", options=options).x)[None]
+    found = minimize(
+        error,
+        simplex[0],
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4, "maxiter": 60},
+    )
+    return np.asarray(found.x)[None]
 
 
 def predictions(parameters: dict[str, float], sines: list[Recording], swings: list[Recording]) -> dict[str, float]:

@@ -68,6 +68,7 @@ def _pilot(config: Config) -> tuple[float, float, float, float] | None:
         except SafetyStop:
             return None
         pilot = first_estimate(folder / "run")
+    assert result.steps is not None
     seen, median = map(np.array, (result.steps[-1].seen, result.steps[-1].predicted_median))
     allowed = np.ptp(np.array([joint.position_limit for joint in config.joints]), axis=1)
     rest = np.array(config.arm.rest_pose)

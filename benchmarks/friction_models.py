@@ -16,10 +16,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from identify import figures, identify
-
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.identify import figures, identify
 from benchmarks.machine import machine
 from hil.config.schema import parse_config
 from hil.errors import SafetyStop

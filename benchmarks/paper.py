@@ -11,17 +11,22 @@ corrected plant (second order with friction), and 10 samples per second. The fig
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.machine import machine
 from hil.estimator.baselines.paper import (
     AMPLITUDES,
     FUNDAMENTAL,
     NOISE,
+    Excitation,
+    Order,
     PaperArm,
     coefficients,
     fit_as_printed,
@@ -31,15 +36,19 @@ from hil.estimator.baselines.paper import (
     response,
 )
 
+Array = NDArray[np.float64]
+
 PUBLISHED = (1.0568, 1.5420)
 ARM = PaperArm()
 DAMPED = PaperArm(viscous=4.0)
 GUESS = PaperArm(mass_1=3.5, mass_2=1.0, viscous=2.0)
 
 
-def rmse(rate, seeds, order):
+def rmse(rate: float, seeds: int, order: Order) -> tuple[Array | None, Array | None]:
+    """Root mean square errors of the masses (2,) [kg]: as printed (first order only), and of the likelihood."""
     excitation = own_lines()
-    literal, likely = [], []
+    literal: list[tuple[float, float]] = []
+    likely: list[tuple[float, float]] = []
     for seed in range(seeds):
         position = record(ARM if order == 1 else DAMPED, excitation, order, rate, seed)
         lines = coefficients(position, excitation)
@@ -47,24 +56,27 @@ def rmse(rate, seeds, order):
             literal.append(fit_as_printed(lines, excitation, ARM))
         found = fit_likelihood(lines, excitation, GUESS, order)
         likely.append((found.mass_1, found.mass_2))
+    return _rms(literal), _rms(likely)
+
+
+def _rms(masses: list[tuple[float, float]]) -> Array | None:
     true = np.array((ARM.mass_1, ARM.mass_2))
-    return [np.sqrt(np.mean((np.array(each) - true) ** 2, axis=0)) if each else None for each in (literal, likely)]
+    return np.sqrt(np.mean((np.array(masses) - true) ** 2, axis=0)) if masses else None
 
 
-def bound(rate):
+def bound(rate: float) -> Array:
     """Cramer-Rao bound of m1 and m2 [kg] for the plant as printed and noise of the paper's variance."""
     excitation = own_lines()
     columns = []
-    for step in ({"mass_1": 1e-5}, {"mass_2": 1e-5}):
-        moved = PaperArm(**{name: getattr(ARM, name) + value for name, value in step.items()})
+    for moved in (replace(ARM, mass_1=ARM.mass_1 + 1e-5), replace(ARM, mass_2=ARM.mass_2 + 1e-5)):
         slope = (response(moved, excitation, 1) - response(ARM, excitation, 1)) / 1e-5
         columns.append(np.concatenate((slope.real.ravel(), slope.imag.ravel())))
     J = np.stack(columns, axis=1)
     variance = NOISE**2 / 12.0 * 2.0 * FUNDAMENTAL / rate
-    return np.sqrt(variance * np.diag(np.linalg.inv(J.T @ J)))
+    return np.asarray(np.sqrt(variance * np.diag(np.linalg.inv(J.T @ J))))
 
 
-def figures(folder):
+def figures(folder: Path) -> None:
     """Draw figures 2 to 5: torques, angles while settling, steady state, and mass estimates by seed."""
     import matplotlib as mpl
 
@@ -75,15 +87,9 @@ def figures(folder):
     excitation, rate = own_lines(), 100.0
     time = np.arange(round(rate / FUNDAMENTAL)) / rate
     torque = excitation.torque @ np.cos(np.outer(excitation.frequency, time))
-    draw(
-        plt,
-        folder / "figure_2.png",
-        time,
-        torque,
-        "torque [N m]",
-        "Figure 2: torques, on separate lines",
-    )
-    draw(plt, folder / "figure_3.png", *transient(excitation), "angle [rad]", "Figure 3: angles of the corrected arm")
+    draw(plt, folder / "figure_2.png", time, torque, "torque [N m]", "Figure 2: torques, on separate lines")
+    settling, angles = transient(excitation)
+    draw(plt, folder / "figure_3.png", settling, angles, "angle [rad]", "Figure 3: angles of the corrected arm")
     noisy = record(ARM, excitation, 1, rate, 0)
     draw(plt, folder / "figure_4.png", time, noisy, "angle [rad]", "Figure 4: steady state with the paper's noise")
     masses = []
@@ -104,7 +110,7 @@ def figures(folder):
     plt.close(figure)
 
 
-def transient(excitation):
+def transient(excitation: Excitation) -> tuple[Array, Array]:
     """Angles of the corrected arm starting from rest (2, samples) [rad], computed with the matrix exponential."""
     from scipy.linalg import expm
 
@@ -126,7 +132,8 @@ def transient(excitation):
     return time, position
 
 
-def draw(plt, path, time, curves, label, title):
+def draw(plt: Any, path: Path, time: Array, curves: Array, label: str, title: str) -> None:
+    """Draw one curve per joint over time."""
     figure, axes = plt.subplots(2, 1, sharex=True, figsize=(7, 5))
     for joint, (axis, curve) in enumerate(zip(axes, curves, strict=True), start=1):
         axis.plot(time, curve, linewidth=0.8)
@@ -137,13 +144,15 @@ def draw(plt, path, time, curves, label, title):
     plt.close(figure)
 
 
-def main():
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--figures", type=Path)
     options = parser.parse_args()
     literal, ours = rmse(100.0, options.seeds, 1)
+    assert literal is not None
+    assert ours is not None
     if options.figures:
         figures(options.figures)
     if options.json:
@@ -152,6 +161,9 @@ def main():
         return
     slow_literal, slow = rmse(10.0, options.seeds, 1)
     _, damped = rmse(100.0, options.seeds, 2)
+    assert slow_literal is not None
+    assert slow is not None
+    assert damped is not None
     print(f"{machine()}; {options.seeds} seeds, amplitudes {AMPLITUDES} N m; RMSE in kg")
     rows = (
         ("published", PUBLISHED),

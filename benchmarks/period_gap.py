@@ -95,7 +95,7 @@ def measure(rate: float, period: float) -> dict[str, Any]:
         stream = Stream(bus, plan, config, recorder, StopRequest(), lambda _: None, lambda _: None)  # type: ignore[arg-type]
         # The substitute does not obey mechanics: the model checks every sample, but its verdict is ignored.
         assert stream._model is not None
-        stream._model._raise = lambda *_: None  # type: ignore[method-assign,assignment]
+        stream._model._raise = lambda *_: None  # type: ignore[method-assign]
         gc.collect()
         gc.disable()
         try:

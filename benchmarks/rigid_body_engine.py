@@ -103,7 +103,7 @@ def figures(choice: Choice, truth: dict[str, float]) -> dict[str, Any]:
         "worst_in_std": max(in_std.values()),
         "outside_99": outside,
         "residual_ticks": float(estimate.residual_steps.max()),
-        "held_out_rms": float(np.max(choice.chosen.held_out)),
+        "held_out_rms": float(np.max(choice.chosen.held_out)) if choice.chosen.held_out is not None else math.nan,
         "seconds": sum(trial.seconds for trial in choice.trials),
     }
 
@@ -116,7 +116,8 @@ def main() -> None:
     drives = [{**SERVO, **drive} for drive in DRIVES]
     arm = Arm.model_validate({"start": (-math.pi / 2, 0.0), "links": LINKS, "drives": drives})
     truth = base_parameters(arm)
-    runs, chosen = [], []
+    runs: list[dict[str, Any]] = []
+    chosen = []
     turned_over = 0
     while len(runs) < options.seeds:
         seed = 1 + len(runs) + turned_over

@@ -61,7 +61,7 @@ def study_file(folder: Path, text: str) -> Path:
 
 
 def timed(path: Path, out: Path, workers: int) -> tuple[float, Dataset]:
-    """Wall time a run [s] once every worker has ended its first, which leaves start and compilation out; the rows."""
+    """Return the wall time per run [s] and the rows; without each worker's first run, which compiles."""
     seen: list[float] = []
     dataset = run_study(load_study(path), out, worker_count=workers, watch=lambda _: seen.append(time.perf_counter()))
     first = min(2 * workers, len(seen) - 1) - 1

@@ -1,5 +1,6 @@
 """The servos of one arm on one port: preparation, the control cycle, and torque off afterwards."""
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from hil.drivers.errors import (
     TorqueNotOff,
     WrongModel,
 )
-from hil.drivers.exchange import Exchange
+from hil.drivers.exchange import HOST_S, Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
@@ -26,6 +27,9 @@ from hil.drivers.torque_off import TorqueOff, cut_torque, disarm_watchdogs, sign
 
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
+
+CHECK_S = 0.01
+"""Longest time between two exchanges [s], if the bus allows: faults must not go unseen because samples are rare."""
 
 STATUS_S = 0.035
 """Time between two status reads [s]."""
@@ -44,11 +48,11 @@ class BusConfig:
     url: device or pyserial URL.
     one_write: send Sync Write and group read in one write; False where `hil check` finds that an arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
-    slow_every: number of cycles between two slow reads, which alternate between the servo clock (Realtime Tick) and
+    slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage with temperature.
     watchdog_required: reject firmware without Bus Watchdog.
     take_over: if torque is already on, let the arm sink slowly, then cut torque; otherwise refuse to start.
-    interval: time between two exchanges [s]; 0 without a fixed rate, in which case the servos' status is not read.
+    interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
     """
 
     url: str
@@ -94,6 +98,8 @@ class ServoBus:
         self._measured = self._drives
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
+        self.exchanges_per_sample = 1
+        """Number of exchanges that keeps them CHECK_S apart, if the bus is fast enough; set by `prepare`."""
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
         self._watchdog = 0.0
@@ -231,7 +237,8 @@ class ServoBus:
         tables = [servo.table for servo in servos]
         modes = [drive.mode for drive in self._drives]
         return_delay = max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos)
-        span, status_every = self._status_turns(tables, return_delay) if status else (None, 0)
+        every, span, status_every = self._cadence(tables, return_delay) if status else (1, None, 0)
+        self.exchanges_per_sample = every
         return Exchange(
             self.port,
             [servo.id for servo in servos],
@@ -246,23 +253,32 @@ class ServoBus:
             slow_every=slow_every or self.config.slow_every,
             status=span,
             status_every=status_every,
-            interval=self.config.interval,
+            interval=self.config.interval / every,
         )
 
-    def _status_turns(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[Spans | None, int]:
-        """Return the status registers to read and the number of cycles between reads; None if there is no time."""
-        interval, modes, count = self.config.interval, [drive.mode for drive in self._drives], len(self._drives)
-        if not interval:
-            return None, 0
+    def _cadence(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[int, Spans | None, int]:
+        """Return the exchanges per sample, the status registers to read, and the exchanges between two status reads.
+
+        The registers are None if there is no time to read them.
+        """
+        if not self.config.interval:
+            return 1, None, 0
+        modes, count = [drive.mode for drive in self._drives], len(self._drives)
         # Without a current sensor in the motor, a loss of torque shows first in Torque Enable: worth a late sample.
         share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
+        goals = 14 * len(set(modes)) + 3 * count
+        every, interval = 1, self.config.interval
         for whole in (True, False):
             span = status_span(modes, tables, whole=whole)
-            goals = 14 * len(set(modes)) + 3 * count
             taken = self.port.wire_time(goals + 14 + count + count * (11 + one_each(span, count)[0].size))
-            if taken + return_delay * count < share * interval:
-                return span, max(1, round(STATUS_S / interval))
-        return None, 0
+            taken += return_delay * count
+            if whole:
+                least = max(CHECK_S, taken / share + HOST_S)
+                every = max(1, math.floor(self.config.interval / least + 1e-6))
+                interval /= every
+            if taken < share * interval:
+                return every, span, max(1, round(STATUS_S / interval))
+        return every, None, 0
 
     @property
     def prepared(self) -> Exchange:
@@ -278,9 +294,10 @@ class ServoBus:
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
         )
 
-    def exchange(self, goals: Sequence[float], *, hurried: bool = False) -> State:
+    def exchange(self, goals: Sequence[float], *, between: bool = False) -> State:
         """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
+        between: an exchange between two samples (`Exchange.cycle`).
         A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
         are heard repeatedly; ValueError for a goal that is not a finite number.
         """
@@ -288,7 +305,7 @@ class ServoBus:
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
         ticks = self._converter.ticks(goals)
         exchange = self._exchange or self.prepared
-        reply = exchange.cycle(ticks, hurried=hurried)
+        reply = exchange.cycle(ticks, between=between)
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:

@@ -100,8 +100,7 @@ class Exchange:
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self._slow_spans = len(spans) - 1
         least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
-        self._shortest_timeouts = [self._timeout(read, return_delay) for read in self._reads]
-        self._timeouts = [max(shortest, least) for shortest in self._shortest_timeouts]
+        self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
         self._soonest = [0.5 * port.wire_time(self._bytes(read)) for read in self._reads]
         self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
@@ -130,16 +129,18 @@ class Exchange:
         if self._status_every < _NEVER:
             self._until_status = min(self._until_status, 1)
 
-    def cycle(self, goal_ticks: Sequence[int], *, hurried: bool = False) -> Reply:
+    def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
+
+        between: an extra cycle between two samples. The slow spans wait for the next sample, which is recorded.
 
         Raises PortLost; ValueError for the wrong number of goals or a goal that does not fit into two bytes.
         """
         port = self._port
-        self._until_slow -= 1
+        self._until_slow -= not between
         self._until_status -= 1
-        usual = self._until_slow > 0 and self._until_status > 0 and not self._late_possible
-        span = 0 if usual else self._other_span()
+        usual = (between or self._until_slow > 0) and self._until_status > 0 and not self._late_possible
+        span = 0 if usual else self._other_span(between)
         read = self._reads[span]
         try:
             goals = self._write.pack(goal_ticks)
@@ -147,7 +148,7 @@ class Exchange:
                 goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
-        timeout = (self._shortest_timeouts if hurried else self._timeouts)[span]
+        timeout = self._timeouts[span]
         before = self._now()
         if self._echoes:
             received = self._ask_behind_echo(goals, read, timeout, before)
@@ -178,7 +179,7 @@ class Exchange:
             return servos
         return read.unpack(received) or self._search(read, received, deadline)
 
-    def _other_span(self) -> int:
+    def _other_span(self, between: bool) -> int:
         """Choose the span for a cycle that does not simply read the first: after a loss, a slow span, or the status."""
         if self._late_possible:
             self._late_possible = False
@@ -186,7 +187,7 @@ class Exchange:
             # A reply that arrives even later must not be taken for the reply to this request. Nothing in a packet
             # identifies the request it belongs to, but its length differs if another span was requested.
             return self._next_slow() if self._lost == 0 else 0
-        if self._until_slow <= 0:
+        if self._until_slow <= 0 and not between:
             self._until_slow = self._slow_every
             # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
             return self._next_slow()

@@ -22,7 +22,7 @@ class IntegrationOptions:
 class MinimiserOptions:
     """Options of Levenberg-Marquardt, for coordinates of order 1."""
 
-    max_iterations: int = 60
+    max_iterations: int = 150
     max_step: float = 2.0
     """Maximum change of a coordinate per iteration."""
     unfinished: float = 1e-2

@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -118,10 +118,16 @@ def _shown(value: object) -> str:
 
 def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
     model: Any = root
+    free = False  # whether the next part is a key of the user's own
     for part in location[:-1]:
-        if isinstance(part, str):
-            fields = {field.alias or name: field for name, field in model.model_fields.items()}
-            model = _model_in(fields[part].annotation)
+        if not isinstance(part, str) or part.startswith(UNSAID):
+            continue
+        if free:
+            free = False
+            continue
+        fields = {field.alias or name: field for name, field in model.model_fields.items()}
+        free = get_origin(fields[part].annotation) is dict
+        model = _model_in(fields[part].annotation)
     names = [field.alias or name for name, field in model.model_fields.items() if not field.exclude]
     close = difflib.get_close_matches(str(location[-1]), names, n=1)
     return f"did you mean {close[0]}?" if close else f"allowed: {', '.join(names)}"

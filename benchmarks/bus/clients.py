@@ -90,7 +90,7 @@ def run(name: str, pythons: Sequence[str]) -> dict[str, Any]:
     environment.pop("PYTHONPATH", None)
     for python in pythons:
         with served(ARMS.get(name, "koch")) as device:
-            command = [python, str(ROOT / "benchmarks" / "client_calls.py"), name, device]
+            command = [python, str(ROOT / "benchmarks" / "bus" / "client_calls.py"), name, device]
             done = subprocess.run(
                 command, capture_output=True, text=True, timeout=PATIENCE_S, env=environment, check=False
             )

@@ -184,7 +184,7 @@ def _held(
     weight: float,
 ) -> float:
     """Draw the initial pose [rad]: off the rest pose by as much as friction holds, at most 6 degrees."""
-    held = 0.6 * drive["coulomb"] / max(_moment(links, models, joint) * weight, 1e-9)
+    held: float = 0.6 * drive["coulomb"] / max(_moment(links, models, joint) * weight, 1e-9)
     return float(random.uniform(-1, 1)) * min(6 * DEGREE, held)
 
 

@@ -26,7 +26,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.identify import identify, predict
 from hil.estimator.models.model import Model
-from hil.estimator.selection.settled import relative_error
+from hil.estimator.selection.other_period import relative_error
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.motor import Motor
 from tests.support.recorded_arm import record, servo_arm, wave
@@ -41,7 +41,7 @@ def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding
     """Errors of one identification; all infinite if the fit or the prediction does not converge."""
     keys = (*(f"{group}_error" for group in GROUPS), "held_out_rms", "residual_ticks")
     try:
-        found = identify(period, Model(2, "stribeck", "lag", ("presliding",) if presliding else ()))
+        found = identify(period, Model(2, "stribeck", "lag", ["presliding"] if presliding else []))
         predicted = predict(found, held_out.torque, held_out.rate, held_out.command_to_sample)
     except (ConvergenceError, PeriodicityError):
         return dict.fromkeys(keys, math.inf)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from hil.drivers.packet import HEADER, Framer, Packet, crc, encode_status
+from hil.drivers.packet import HEADER, Framer, Instruction, Packet, crc, encode, encode_status
 
 PRESENT = {"current": (126, 2), "velocity": (128, 4), "position": (132, 4)}
 """Address and size of the present registers whose values can be forged."""
@@ -34,6 +34,9 @@ class Kind(StrEnum):
     DEAF_TO_GOALS = "deaf_to_goals"
     TWICE_TOLD = "twice_told"
     TORQUE_TAKEN = "torque_taken"
+    MODE_TAKEN = "mode_taken"
+    GOAL_FIGHT = "goal_fight"
+    ANSWERS_LESS = "answers_less"
     WATCHDOG_TRIPPED = "watchdog_tripped"
     STRANGE_GOAL = "strange_goal"
     RAISED_LIMIT = "raised_limit"
@@ -49,6 +52,8 @@ class Kind(StrEnum):
     WEAK = "weak"
     SATURATED = "saturated"
     PUSHED = "pushed"
+    GRIPPED = "gripped"
+    PLAY = "play"
     DISK_FULL = "disk_full"
     STALL = "stall"
     SIGINT = "SIGINT"
@@ -62,8 +67,8 @@ FORGED = frozenset({Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY, Kind.BIAS, 
     Kind.STUCK_BIT,
     Kind.CONSTANT,
 }
-ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED})
-ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD})
+ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED, Kind.GRIPPED, Kind.PLAY})
+ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD, Kind.GOAL_FIGHT})
 AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - {Kind.ECHO})
 """Attacks that happen once, at their start time."""
 
@@ -124,6 +129,13 @@ def goals_in(packet: Packet) -> dict[int, tuple[int, int]]:
         body[at]: (body[0], int.from_bytes(body[at + 1 : at + 3], "little", signed=True))
         for at in range(4, len(body) - 2, 3)
     }
+
+
+def without_goal(data: bytes, servo_id: int) -> bytes:
+    """A Sync Write of two-byte goals without this servo's, as if its receiver had missed the packet."""
+    body = data[8:-2]
+    kept = [body[at : at + 3] for at in range(4, len(body) - 2, 3) if body[at] != servo_id]
+    return encode(data[4], Instruction(data[7]), body[:4] + b"".join(kept)) if kept else b""
 
 
 def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:

@@ -7,11 +7,12 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import serial
@@ -36,7 +37,7 @@ from hil.plan.plan import make_plan
 from hil.runs.recording import load_samples
 from hil.setup import bus_rate
 
-AFTER_S = 1.5
+AFTER_S = 0.5
 """Time for which the arm is observed after the program has ended [s]."""
 
 STATE = "XDG_STATE_HOME"
@@ -106,7 +107,7 @@ def prepare(setting: Setting, period: float = PERIOD_S) -> Ready:
     config = parse_config(path.read_text(encoding="utf-8"), path)
     ready = Ready(setting, path, config, Story(np.empty(0), None, 0.0, None, ""))  # type: ignore[arg-type]
     story, _, changed = _play(ready, Drawn((), ()), 0)
-    if story.code:
+    if story.code != 0:
         raise DoesNotRun(f"{setting.name} at {setting.rate} Hz does not run undisturbed: {story.text.strip()}")
     return Ready(setting, path, config, story, changed)
 
@@ -239,15 +240,16 @@ def _designed(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> 
 def _quick() -> Iterator[None]:
     """Play with cached waves, whose design takes as long as the run, and with a short measurement of the bus."""
 
-    def remembered(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Multisine:
-        return _designed(rate, period, tuple(map(tuple, lines)), tuple(peaks), seed)
+    def remembered(
+        rate: float, period: float, lines: Sequence[Sequence[int]], peak_torque: Sequence[float], seed: int
+    ) -> Multisine:
+        return _designed(rate, period, tuple(map(tuple, lines)), tuple(peak_torque), seed)
 
-    kept = plan_module.design_multisine, bus_rate.CYCLES
-    plan_module.design_multisine, bus_rate.CYCLES = remembered, _CHECKED_CYCLES
-    try:
+    with (
+        mock.patch.object(plan_module, "design_multisine", remembered),
+        mock.patch.object(bus_rate, "CYCLES", _CHECKED_CYCLES),
+    ):
         yield
-    finally:
-        plan_module.design_multisine, bus_rate.CYCLES = kept
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ TOGETHER_S = 0.3
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
-REFUSED, STRANGER, DISK = "refused", "stranger", "disk"
+REFUSED, STRANGER, DISK, MIXED = "refused", "stranger", "disk", "mixed"
 
 WORDS = {
     SILENCE: r"heard nothing|received nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl"
@@ -41,6 +41,7 @@ WORDS = {
     MODEL: r"any arm|repeat its motion|than (the )?model|predicted|not as planned|foreseen|the dry run",
     REFUSED: r"refus|alert, hardware error: none|answers? with an? error",
     STRANGER: r"another (program|master)|somebody else|not asked for|collision|other master",
+    MIXED: r"another servo's|mixed up|swapped",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
 }
@@ -59,7 +60,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.REPEAT: _BYTES,
     Kind.FLIP: _BYTES,
     Kind.ECHO: _BYTES,
-    Kind.SWAP: _FORGED,
+    Kind.SWAP: _FORGED | {MIXED},
     Kind.FREEZE: _FORGED,
     Kind.SCALE: _FORGED | {LIMIT},
     Kind.REPLAY: _FORGED | {LATE},
@@ -76,6 +77,9 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.TORQUE_TAKEN: _LOST_GOALS,
     Kind.WATCHDOG_TRIPPED: _LOST_GOALS,
     Kind.STRANGE_GOAL: _LOST_GOALS | {LIMIT},
+    Kind.GOAL_FIGHT: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
+    Kind.MODE_TAKEN: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
+    Kind.ANSWERS_LESS: frozenset({SILENCE}),
     Kind.RAISED_LIMIT: frozenset(),
     Kind.LOWERED_LIMIT: _LOST_GOALS | {LIMIT},
     Kind.WATCHDOG_OFF: frozenset({TORQUE, STRANGER}),
@@ -89,6 +93,8 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.WEAK: _FORGED | {LIMIT},
     Kind.SATURATED: _FORGED | {LIMIT},
     Kind.PUSHED: _FORGED | {LIMIT},
+    Kind.GRIPPED: _FORGED,
+    Kind.PLAY: _FORGED | {LIMIT},
     Kind.DISK_FULL: frozenset({DISK}),
     Kind.STALL: frozenset({PROGRAM, LATE}),
     Kind.SIGINT: frozenset({SIGNAL}),
@@ -123,7 +129,6 @@ UNHEARD = _INSTRUCTIONS | {
     Kind.KILLED,
     Kind.NEW_ID,
     Kind.NEW_BAUD,
-    Kind.TURNED_ROUND,  # with a reboot
     FaultKind.CABLE_PULLED,
     FaultKind.SILENT_SERVO,
     FaultKind.REBOOT,
@@ -234,6 +239,10 @@ def _amount(kind: Kind, field: str, random: Random) -> float:
         Kind.WEAK: random.choice((-1.0, 0.0, 0.3, 0.5, 0.8, 1.3)),
         Kind.SATURATED: random.uniform(0.02, 0.8),
         Kind.PUSHED: sign * random.uniform(0.1, 2.0),
+        Kind.GRIPPED: random.uniform(0.1, 2.0),
+        Kind.PLAY: 10 ** random.uniform(-2.0, -0.7),
+        Kind.GOAL_FIGHT: sign * random.uniform(0.02, 1.0),
+        Kind.ANSWERS_LESS: float(random.randrange(2)),
     }.get(kind, 0.0)
 
 

@@ -71,8 +71,8 @@ class Verdict:
 
     owed: why the current had to end, "" if there was no reason. late_ms: how long it flowed after that. beyond:
     overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
-    stopped the run. misleading: the output names only wrong causes. unseen: late_ms counts from the moment at which the
-    fault became observable (`fault_campaign.visible`), later than it began.
+    stopped the run. misleading: the output names only wrong causes. unseen: it is unsafe, but counted from when a
+    detector that knows more than the program could see the fault (`fault_campaign.visible`), it would not be.
     """
 
     owed: str
@@ -88,7 +88,7 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     """Judge the run of `story`, into which `drawn` was injected."""
     reasons = _reasons(config, drawn, story, undisturbed)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
-    driven = story.record["driven"].any(axis=1)
+    driven = np.asarray(story.record["driven"].any(axis=1))
     time = story.record["time"][:, 0]
     bound = BOUND_MS
     if set(drawn.kinds) & UNHEARD:
@@ -96,9 +96,8 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     late_ms, unseen = _flowed_ms(time[driven], since), False
     if late_ms > bound:
         seen = visible_from(*_shown(config, story, undisturbed))
-        later = [(what, max(when, seen) if what.endswith(TO_BE_SEEN) else when) for what, when in reasons]
-        owed, since = min(later, key=lambda reason: reason[1])
-        late_ms, unseen = _flowed_ms(time[driven], since), late_ms > _flowed_ms(time[driven], since)
+        later = [max(when, seen) if what.endswith(TO_BE_SEEN) else when for what, when in reasons]
+        unseen = _flowed_ms(time[driven], min(later)) <= bound
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
@@ -271,7 +270,7 @@ class _Told:
             return np.zeros(time.size, bool)
         latest = heard[np.clip(np.searchsorted(heard, time, "right") - 1, 0, None)]
         running = (time > max(self._begun, heard[0])) & (time < ended)
-        return running & (time - latest > interval + 2e-3)
+        return np.asarray(running & (time - latest > interval + 2e-3))
 
     def disobeys(self, joint: int, time: NDArray[Any], own: NDArray[Any], interval: float) -> NDArray[np.bool_]:
         if not self.sent[joint]:
@@ -287,7 +286,7 @@ class _Told:
             index = np.clip(latest - back, 0, None)
             off = np.minimum(off, np.abs(done - goals[index]))
         current = (latest >= 0) & (time - when[np.clip(latest, 0, None)] < 2 * interval + 2e-3)
-        return current & (off > tolerance)
+        return np.asarray(current & (off > tolerance))
 
 
 def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:
@@ -310,6 +309,6 @@ def _astray(drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[An
 def describe(verdict: Verdict) -> str:
     """The verdict on one line."""
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
-    said += ["seen only later"] * verdict.unseen
-    said += ["UNSAFE"] * verdict.unsafe + ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
+    said += ["UNSAFE"] * verdict.unsafe + ["but hard to see"] * verdict.unseen
+    said += ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
     return ", ".join(said)

@@ -22,9 +22,10 @@ from benchmarks.fault_campaign.attack import (
     Request,
     packets_of,
     request_in,
+    without_goal,
 )
 from benchmarks.fault_campaign.forger import Forger
-from benchmarks.fault_campaign.touch import Killed, happen, prepare
+from benchmarks.fault_campaign.touch import Killed, happen, overwrite_goals, prepare
 from hil.drivers.packet import HEADER, encode_status
 from hil.fakes.protocol_fake import FakeSerial
 
@@ -58,6 +59,7 @@ class Middle(FakeSerial):
         self._raw = bytearray()
         self._request: Request | None = None
         self._forger = Forger()
+        self._fights: list[Attack] = []
         self._undo: list[Callable[[], None]] = []
         super().__init__(*args, **kwargs)
 
@@ -226,10 +228,15 @@ class Middle(FakeSerial):
         is_goal = len(packet) > 7 and packet[7] == 0x83
         copies = 1
         for each in self._lasting(now, ON_INSTRUCTIONS):
-            if (each.kind == Kind.DEAF_TO_GOALS and not is_goal) or not self._strikes(each, now):
+            if (each.kind in (Kind.DEAF_TO_GOALS, Kind.GOAL_FIGHT) and not is_goal) or not self._strikes(each, now):
                 continue
-            copies = copies * 2 if each.kind == Kind.TWICE_TOLD else 0
-        for _ in range(copies):
+            if each.kind == Kind.GOAL_FIGHT:
+                self._fights.append(each)
+            elif each.kind == Kind.DEAF_TO_GOALS and each.servo is not None:
+                packet = without_goal(packet, each.servo)
+            else:
+                copies = copies * 2 if each.kind == Kind.TWICE_TOLD else 0
+        for _ in range(copies if packet else 0):
             yield packet
 
     # What happens once
@@ -237,6 +244,10 @@ class Middle(FakeSerial):
     def _strike(self, now: float) -> None:
         if self.dead:
             raise Killed
+        if self._fights and not self.bus.on_the_way:
+            for each in self._fights:
+                overwrite_goals(each, self)
+            self._fights.clear()
         while self._to_come and self._to_come[0].start <= now:
             each = self._to_come.pop(0)
             if not self.over:

@@ -21,6 +21,7 @@ _SLOWEST_REPLY = 254  # Return Delay Time
 _ROOM_BYTES = 1 << 12  # a file may grow to this once the disk is full
 _WRAP_S = 32.768
 _SHORT_BOOT_S = 5e-3
+_POSITION_MODE = 3
 
 
 class Killed(BaseException):
@@ -62,6 +63,19 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
     return []
 
 
+def overwrite_goals(attack: Attack, port: "Middle") -> None:
+    """Write another goal, as a second master does that answers each of the program's commands."""
+    for servo in port.bus._servos:
+        if attack.concerns(servo.id):
+            _write_goal(attack, servo)
+
+
+def _write_goal(attack: Attack, servo: EmulatedServo) -> None:
+    with contextlib.suppress(KeyError):
+        goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
+        servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
+
+
 def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
     match attack.kind:
         case Kind.TORQUE_TAKEN:
@@ -69,29 +83,42 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
         case Kind.WATCHDOG_TRIPPED if servo.torque_enabled:
             servo.trip_watchdog()
         case Kind.STRANGE_GOAL:
-            with contextlib.suppress(KeyError):
-                goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
-                servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
-        case Kind.WATCHDOG_OFF:
-            _change(servo, "Bus Watchdog", 0)
-        case Kind.WATCHDOG_LONG:
-            return _change(servo, "Bus Watchdog", 127, 0)
-        case Kind.LOWERED_LIMIT if "Current Limit" in servo.memory:
-            return _change(servo, "Current Limit", round(attack.amount * servo.value("Current Limit")))
-        case Kind.RAISED_LIMIT if "Current Limit" in servo.memory:
-            return _change(servo, "Current Limit", 2 * servo.value("Current Limit"))
+            _write_goal(attack, servo)
+        case Kind.MODE_TAKEN if servo.torque_enabled:
+            # It is also the mode from before the run, so nothing has to be undone.
+            for address, value in ((64, 0), (11, _POSITION_MODE), (64, 1)):
+                servo.write(address, bytes((value,)))
         case Kind.TURNED_ROUND:
             undo = _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
             servo.reboot(now, _SHORT_BOOT_S)  # with torque on it could not be written
             return undo
+        case Kind.CLOCK_RATE:
+            servo.present._clock_rate *= 1.0 + attack.amount
+        case _:
+            return _reconfigure(attack, servo)
+    return None
+
+
+def _reconfigure(attack: Attack, servo: EmulatedServo) -> Undo | None:
+    """Change one register."""
+    limit = "Current Limit" if "Current Limit" in servo.memory else "PWM Limit"
+    match attack.kind:
+        case Kind.WATCHDOG_OFF:
+            _change(servo, "Bus Watchdog", 0)
+        case Kind.WATCHDOG_LONG:
+            return _change(servo, "Bus Watchdog", 127, 0)
+        case Kind.ANSWERS_LESS:
+            return _change(servo, "Status Return Level", round(attack.amount))
+        case Kind.LOWERED_LIMIT:
+            return _change(servo, limit, round(attack.amount * servo.value(limit)))
+        case Kind.RAISED_LIMIT if limit == "Current Limit":
+            return _change(servo, limit, 2 * servo.value(limit))
         case Kind.SLOW_REPLIES:
             return _change(servo, "Return Delay Time", _SLOWEST_REPLY)
         case Kind.NEW_ID:
             return _change(servo, "ID", _ELSEWHERE_ID)
         case Kind.NEW_BAUD:
             return _change(servo, "Baud Rate", 1)
-        case Kind.CLOCK_RATE:
-            servo.present._clock_rate *= 1.0 + attack.amount
     return None
 
 

@@ -5,7 +5,7 @@ velocity, does the current agree with the goals, and could any arm consistent wi
 last question is a sequential test: the arm's equations of motion, integrated over intervals of `STRETCH_S`, are linear
 in its parameters. These start from the prior of the program's configuration and are estimated from all intervals so
 far; each new interval is compared with its prediction. Unlike the program, the detector knows the noise in advance,
-from an undisturbed run of the same arm. A run may therefore continue if even this detector finds nothing.
+from an undisturbed run of the same arm. It excuses nothing: it says of an unsafe run whether more could have been seen.
 """
 
 from collections.abc import Sequence

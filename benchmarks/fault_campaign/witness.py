@@ -1,5 +1,6 @@
 """The emulated servos' own record: goals, motor currents and motion, every millisecond."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,9 @@ from hil.fakes.servo.servo import EmulatedServo
 
 STEP_S = 1e-3
 CURRENT_MODE, PWM_MODE = 0, 16
+GRIP_RAD_S = 0.1
+"""Velocity at which a hand that grips the arm brakes with most of its force [rad/s]."""
+
 PUSH_RISES_S = 0.03
 """Rise time of a push [s]: no hand is faster."""
 
@@ -38,6 +42,7 @@ class Witness:
         self._rows: list[list[tuple[Any, ...]]] = []
         self._disturbed: list[tuple[int, Attack]] = []
         self._missing = [0.0] * bus.plant.joints
+        self._turned_at = [(0.0, -1.0)] * bus.plant.joints  # sign of the current, and when it changed
         self._largest = [0.0] * bus.plant.joints
         self.joints = bus.plant.joints
         bus.plant = self
@@ -76,10 +81,23 @@ class Witness:
                     self._missing[joint] += before - felt[joint]
                 case Kind.SATURATED:
                     felt[joint] = max(-most, min(most, before))
+                case Kind.GRIPPED:
+                    felt[joint] = before - most * math.tanh(self._plant.velocity[joint] / GRIP_RAD_S)
+                    self._missing[joint] += before - felt[joint]
+                case Kind.PLAY:
+                    felt[joint] = 0.0 if self._turns(joint, before, now) < each.amount else before
+                    self._missing[joint] += before - felt[joint]
                 case Kind.PUSHED:
                     felt[joint] = before + most * min(1.0, (now - each.start) / PUSH_RISES_S)
                     self._missing[joint] += before - felt[joint]
         return felt
+
+    def _turns(self, joint: int, current: float, now: float) -> float:
+        """Time since the current has changed its sign [s]."""
+        sign, since = self._turned_at[joint]
+        if current * sign < 0.0 or sign == 0.0:
+            self._turned_at[joint] = sign, since = math.copysign(1.0, current), now
+        return now - since
 
     def jam(self, joint: int, jammed: bool) -> None:
         self._plant.jam(joint, jammed)  # type: ignore[attr-defined]

@@ -52,7 +52,11 @@ def recorded_states(config: Config) -> list[State]:
         samples = load_samples(run.samples_path, len(config.joints))
     names = ("goal_current", "current", "velocity", "position", "error", "missing")
     return [
-        State(float(row["time_before_write"]), float(row["time_after_read"]), *(tuple(row[n].tolist()) for n in names))
+        State(
+            float(row["time_before_write"]),
+            float(row["time_after_read"]),
+            **{name: tuple(row[name].tolist()) for name in names},  # type: ignore[arg-type]
+        )
         for row in samples[samples["phase"] == Phase.PERIODIC]
     ]
 

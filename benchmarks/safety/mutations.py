@@ -18,6 +18,7 @@ import sys
 import time
 import types
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import hypothesis
@@ -29,18 +30,27 @@ PATIENCE_S = 300
 _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
     "hil/experiment/guard.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/work.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/following.py": [f"{_EXPERIMENT}/test_following.py"],
     "hil/experiment/consistency.py": [f"{_EXPERIMENT}/test_consistency.py"],
     "hil/experiment/status_check.py": [f"{_EXPERIMENT}/test_status_check.py"],
     "hil/experiment/repetition.py": [f"{_EXPERIMENT}/test_repetition.py"],
+    "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
-    "hil/plan/silence.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
     "hil/experiment/stream.py": [f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"],
     "hil/drivers/torque_off.py": ["tests/drivers/test_torque.py"],
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
 }
 """Modules, and the tests that should detect mutations."""
+
+_SLOW_IMPORTS = (
+    *("numpy", "scipy", "numba", "pydantic", "serial", "hil.estimator.identify"),
+    *("hil.estimation.settled_estimate", "hil.dry_run.ensemble", "hil.plan.chain_plan"),
+)
+"""Imported once, before the children are forked. Few of the modules under test are among what these import."""
 
 Change = Callable[[], None]
 
@@ -75,14 +85,14 @@ def _spots(tree: ast.AST) -> Iterator[tuple[ast.expr, Change]]:
                 if type(operator) in _COMPARE:
                     yield node, _set(node.ops, index, _COMPARE[type(operator)]())
         elif isinstance(node, ast.BinOp) and type(node.op) in _OPERATE:
-            yield node, lambda node=node: setattr(node, "op", _OPERATE[type(node.op)]())
+            yield node, partial(setattr, node, "op", _OPERATE[type(node.op)]())
         elif isinstance(node, ast.BoolOp):
-            other = ast.Or if isinstance(node.op, ast.And) else ast.And
-            yield node, lambda node=node, other=other: setattr(node, "op", other())
+            other = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+            yield node, partial(setattr, node, "op", other)
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            yield node, lambda node=node: setattr(node, "op", ast.UAdd())
-        elif isinstance(node, ast.Constant) and type(node.value) in (int, float, bool):
-            yield node, lambda node=node: setattr(node, "value", _other(node.value))
+            yield node, partial(setattr, node, "op", ast.UAdd())
+        elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+            yield node, partial(setattr, node, "value", _other(node.value))
 
 
 def _set(ops: list[ast.cmpop], index: int, operator: ast.cmpop) -> Change:
@@ -99,9 +109,7 @@ def _of_messages(tree: ast.AST) -> Iterator[ast.AST]:
     """Yield nodes in formatted strings and annotations, which are not mutated."""
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr | ast.AnnAssign):
-            parts = [node] if isinstance(node, ast.JoinedStr) else [node.annotation]
-            for part in parts:
-                yield from ast.walk(part)
+            yield from ast.walk(node if isinstance(node, ast.JoinedStr) else node.annotation)
         elif isinstance(node, ast.keyword) and node.arg == "strict":
             yield node.value
         elif isinstance(node, ast.FunctionDef):
@@ -150,8 +158,8 @@ def _test_in_child(module: str, source: str) -> None:
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
         name = module.removesuffix(".py").replace("/", ".")
-        if name.startswith("hil.drivers."):
-            # The libraries imported beforehand hold the driver: what has taken names from it is imported again.
+        if name in sys.modules:
+            # Imported beforehand: what has taken names from it is imported again.
             for loaded in [each for each in sys.modules if each == "hil" or each.startswith("hil.")]:
                 del sys.modules[loaded]
         mutated = types.ModuleType(name)
@@ -173,8 +181,7 @@ def main() -> None:
     options = parser.parse_args()
     os.chdir(ROOT)
     sys.path.insert(0, str(ROOT))
-    # Import slow libraries that contain none of the modules under test.
-    for library in ("numpy", "scipy", "numba", "pydantic", "serial", "hil.config.schema", "hil.estimator.identify"):
+    for library in _SLOW_IMPORTS:
         importlib.import_module(library)
     hypothesis.settings.register_profile("mutations", database=None, derandomize=True)
     hypothesis.settings.load_profile("mutations")

@@ -67,7 +67,7 @@ def identified(name: str) -> dict[str, Any]:
     away = np.array([abs(each.value - truth[key]) / each.std for key, each in found.parameters.items()])
     return {
         "trust": found.verdict.trust,
-        "steps": len(found.steps),
+        "steps": len(found.steps or ()),
         "residual_ticks": round(max(found.fit.residual_rms_ticks), 3),
         "held_out_percent": round(100 * max(found.validation.held_out_rms or (np.nan,)), 3),
         "coverage_95": round(float((away < 1.96).mean()), 3),

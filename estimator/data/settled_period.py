@@ -49,6 +49,12 @@ class SettledPeriod:
 
     A simulated arm may diverge from the real one without it.
     """
+    before: Array | None = None
+    """Angles and velocities one period before the first sample (2, joints) [rad, rad/s], as read by the encoders.
+
+    A motion counts as settled if it differs little from that of the period before; what is left of the transient can be
+    predicted from there.
+    """
     valid: Mask = field(init=False)
     """Whether each sample was received (joints, samples)."""
     noise: Array = field(init=False)

@@ -7,6 +7,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ConvergenceError
+from hil.estimator.fit.bounded_step import bounded_step
 from hil.estimator.options import MinimiserOptions
 
 DEFAULTS = MinimiserOptions()
@@ -134,22 +135,11 @@ def _improve(
 def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
     """Return the damped step, with every coordinate's change between `least` and `most`.
 
-    A coordinate that would exceed its limit is fixed there and the others are solved for again: scaling the whole step
-    would let an almost flat coordinate, such as the logarithm of a value near zero, stop all others.
+    Only the coordinates that reach their limit are held there: scaling the whole step would let an almost flat
+    coordinate, such as the logarithm of a value near zero, stop all others.
     """
     scale = np.sqrt(np.diag(normal))
     scale = np.maximum(scale, 1e-12 * scale.max())
     matrix = normal / np.outer(scale, scale)
     matrix[np.diag_indices_from(matrix)] += damping
-    slope = gradient / scale
-    step = np.zeros_like(gradient)
-    free = np.ones(gradient.size, dtype=np.bool_)
-    while free.any():
-        held = np.where(free, 0.0, step * scale)
-        step[free] = -np.linalg.solve(matrix[free][:, free], (slope + matrix @ held)[free]) / scale[free]
-        too_long = free & ((step < least) | (step > most))
-        if not too_long.any():
-            break
-        step[too_long] = np.clip(step, least, most)[too_long]
-        free &= ~too_long
-    return step
+    return np.asarray(bounded_step(matrix, gradient / scale, least * scale, most * scale) / scale)

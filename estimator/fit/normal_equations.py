@@ -12,6 +12,8 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 
+LANES = 8
+
 
 def normal_equations(jacobian: Array, residual: Array, weight: Array | None = None) -> tuple[Array, Array]:
     """Return J'WJ (columns, columns) and J'Wr (columns,).
@@ -22,7 +24,8 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array | None = No
     product = np.zeros((columns, columns + 1))
     both = np.ascontiguousarray(jacobian)
     _multiply(both, residual, np.ones(len(residual)) if weight is None else weight, product)
-    return product[:, :-1], product[:, -1]
+    normal = np.tril(product[:, :-1])
+    return normal + np.tril(normal, -1).T, product[:, -1]
 
 
 def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:
@@ -36,7 +39,7 @@ def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:
         z = weight[m] if first + 3 < rows else 0.0
         for a in range(columns):
             p, q, s, t = w * J[i, a], x * J[j, a], y * J[k, a], z * J[m, a]
-            for b in range(columns):
+            for b in range(min(columns, a // LANES * LANES + LANES)):  # the lower triangle, in whole vectors
                 product[a, b] += p * J[i, b] + q * J[j, b] + s * J[k, b] + t * J[m, b]
             product[a, columns] += p * r[i] + q * r[j] + s * r[k] + t * r[m]
 

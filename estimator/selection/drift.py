@@ -19,6 +19,7 @@ from hil.estimator.selection.candidates import by_parameters, colour, linearised
 ITERATIONS = 3
 LEAST = 0.005  # minimum relative change of friction that matters
 MOST = 0.3  # maximum relative change of friction in one iteration
+UNEVEN = 0.25  # relative part of a change that is not even in time, or not the same for all friction
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
 
 
@@ -37,6 +38,10 @@ class Drift:
     def is_seen(self) -> bool:
         """Whether any joint's friction changed significantly and by more than half a percent."""
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
+
+    def after_correction(self) -> "Drift":
+        """Return what a correction for this change may leave: its own error, and change that is not even in time."""
+        return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 
     def at_the_later(self, estimate: Estimate) -> Estimate:
         """Return the estimate with the friction of the later periods."""

@@ -19,12 +19,14 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.fit.stage2 import Near
-from hil.estimator.identify import Estimate, identify, predict
+from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.model import Model
-from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
 from hil.estimator.options import IntegrationOptions, LikelihoodOptions, MinimiserOptions, SelectionOptions
 from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
+from hil.estimator.selection.drift import Drift, friction_change
+from hil.estimator.selection.other_period import predict_period, relative_error
+from hil.estimator.selection.steadied import steadied
 
 DEFAULTS = SelectionOptions()
 THOROUGH = LikelihoodOptions()
@@ -58,6 +60,10 @@ class Choice:
 
     trials: tuple[Trial, ...]
     chosen: Trial
+    period: SettledPeriod
+    """The first period as it was fitted: corrected for a change of friction, if one was seen."""
+    drift: Drift | None = None
+    """The change of friction for which it was corrected."""
 
     @property
     def estimate(self) -> Estimate:
@@ -106,6 +112,7 @@ def choose(
     by_voltage: Collection[int] = (),
     lever: float | None = None,
     starts: Sequence[Mapping[str, float]] = (),
+    seconds: float | None = None,
     options: SelectionOptions = DEFAULTS,
     executor: Executor | None = None,
 ) -> Choice:
@@ -117,7 +124,8 @@ def choose(
     cables, encoder nonlinearity. Adding them one by one would be misleading, since each takes over the effects of the
     missing ones; together, with typical sizes as a prior, they can be separated. Then presliding friction and torque
     ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler
-    one is not chosen.
+    one is not chosen. If friction differs between the two recordings, it also changed within each of them, which is
+    corrected (`hil.estimator.selection.steadied`).
 
     Args:
         periods: settled periods of one arm to be fitted; the first is used to find missing terms.
@@ -128,6 +136,7 @@ def choose(
         by_voltage: joints, from 1, that are driven by voltage.
         lever: as of `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
+        seconds: time from the middle of `periods` to that of `held_out` [s], if known.
         options: thresholds.
         executor: of concurrent.futures; fits that may be needed are begun before it is known that they are. The choice
             is the same with and without it.
@@ -135,13 +144,14 @@ def choose(
     Raises:
         ConvergenceError: if no model can be fitted.
     """
-    search = Selection(periods, held_out, starts, options, "torque_scale" if torque_scale else None, executor)
+    fixed: Option | None = "torque_scale" if torque_scale else None
+    search = Selection(periods, held_out, starts, options, fixed, executor, seconds)
     try:
         grown = search.grow(Model(periods[0].joints, "stribeck", drive, by_voltage=by_voltage, lever=lever))
         pruned = search.prune(grown)
     finally:
         search.end()
-    return Choice(tuple(search.trials), search.judged(pruned))
+    return Choice(tuple(search.trials), search.judged(pruned), search.period, search.drift)
 
 
 @dataclass(frozen=True)
@@ -151,6 +161,8 @@ class Fitting:
     periods: Sequence[SettledPeriod]
     held_out: SettledPeriod | None
     starts: Sequence[Mapping[str, float]]
+    drift: Drift | None = None
+    """Change of friction from the periods to `held_out`, for which both are corrected."""
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
         """Fit `model` from the result of `near`, using `values` for what it lacks, or from scratch.
@@ -171,7 +183,8 @@ class Fitting:
         if other is None:
             return None, _criterion(estimate, self.periods)
         try:
-            predicted = predict_period(estimate, other)
+            later = estimate if self.drift is None else self.drift.at_the_later(estimate)
+            predicted = predict_period(later, other)
         except PeriodicityError:
             return None, np.inf
         return relative_error(other, predicted), float(
@@ -190,6 +203,7 @@ class Selection:
         options: SelectionOptions,
         fixed: Option | None,
         executor: Executor | None = None,
+        seconds: float | None = None,
     ) -> None:
         self._periods = [without_spikes(period) for period in periods]
         self._held_out = held_out
@@ -197,9 +211,20 @@ class Selection:
         self._options = options
         self._fixed = fixed
         self._executor = executor
+        self._seconds = seconds
         self._begun: dict[tuple[Model, int, bool], Future[Trial]] = {}
         self.trials: list[Trial] = []
-        """All trials in chronological order."""
+        """All trials of the periods as they are corrected now, in chronological order."""
+
+    @property
+    def period(self) -> SettledPeriod:
+        """The first period as it is fitted."""
+        return self._periods[0]
+
+    @property
+    def drift(self) -> Drift | None:
+        """The change of friction for which the periods are corrected."""
+        return self._fitting.drift
 
     def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
         """Start a fit that may be needed, if there is an executor; it only becomes a trial once it is needed."""
@@ -221,13 +246,13 @@ class Selection:
         self._begin(model.having(*unknown), coarse=True)
         self._begin(smooth)
         self._begin(smooth.having("presliding"), coarse=True)
-        plain = self._try_or_none(model.having(*unknown), coarse=True)
+        plain = self._steadied(self._try_or_none(model.having(*unknown), coarse=True))
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
             return plain
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
-            best = self._better(self._try_or_none(smooth, plain), plain)
+            best = self._steadied(self._better(self._try_or_none(smooth, plain), plain))
         if best is None or self._left(best) > self._options.presliding_residual**2:
             best = self._better(self._try_or_none(smooth), best)
         if best is None:
@@ -237,6 +262,32 @@ class Selection:
         if not self._is_explained(best):
             best = self._with_ripple(best)
         return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
+
+    def _steadied(self, trial: Trial | None) -> Trial | None:
+        """Correct the periods for a change of friction, if one is seen and explains part of the residual.
+
+        Returns the fit of the corrected periods, or else `trial`.
+        """
+        other, seconds = self._held_out, self._seconds
+        if trial is None or trial.estimate is None or other is None or seconds is None or self.drift is not None:
+            return trial
+        if len(self._periods) > 1 or self._is_explained(trial):
+            return trial
+        drift = friction_change(other, trial.estimate, seconds)
+        if not drift.is_seen:
+            return trial
+        former = self._periods, self._fitting, self.trials
+        self._periods = [steadied(self.period, trial.estimate, drift)]
+        corrected = steadied(other, drift.at_the_later(trial.estimate), drift)
+        self._fitting = replace(self._fitting, periods=self._periods, held_out=corrected, drift=drift)
+        self.trials = []
+        self.end()
+        self._begun.clear()
+        again = self._try_or_none(trial.model, trial)
+        if again is not None and self._left(again) < self._left(trial):
+            return again
+        self._periods, self._fitting, self.trials = former
+        return trial
 
     def _seen(self, trial: Trial) -> list[Candidate]:
         assert trial.estimate is not None
@@ -350,19 +401,6 @@ class Selection:
         return trial
 
 
-def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
-    """Predict the positions (joints, samples) [rad] of another settled period by `estimate`, from its torque alone.
-
-    Raises PeriodicityError if the simulated arm does not settle.
-    """
-    if other.stabiliser is None:
-        return predict(estimate, other.torque, other.rate, other.command_to_sample)
-    pose = other.stabiliser.feedback.pose
-    return other.stabiliser.settled_positions(
-        Physics.of(estimate.parameters), pose, other.rate, other.command_to_sample
-    )
-
-
 def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
     """Return the model without parts that do not differ significantly from zero, the least significant removed first.
 
@@ -415,13 +453,6 @@ def _tested(model: Model, plainer: Model) -> list[str]:
     """
     lacking = [name for name in model.names if name not in plainer.names]
     return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "stribeck_velocity")]
-
-
-def relative_error(period: SettledPeriod, predicted: Array) -> Array:
-    """Return the RMS of measured minus predicted position relative to that of the motion about its mean (joints,)."""
-    motion = period.position - np.nanmean(period.position, axis=1, keepdims=True)
-    error: Array = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1) / np.nanmean(motion**2, axis=1))
-    return error
 
 
 def _criterion(estimate: Estimate, periods: Sequence[SettledPeriod]) -> float:

@@ -26,6 +26,7 @@ WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
+WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # relative to the time in which a change was seen; s
 IMPROVEMENT = {
     "inertia": "faster motion: raise the upper edge of experiment.band or peak_torque",
     "coupling": "faster motion of both joints together: raise peak_torque",
@@ -62,6 +63,8 @@ class Evidence:
     """Change of friction while the arm moved."""
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
+    notes: tuple[str, ...] = field(default=())
+    """What else was found, as sentences that cast no doubt on the values."""
     tried_all: bool = False
     """Whether the model was selected from all available terms."""
 
@@ -75,6 +78,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *_drifted(evidence.drift),
         *_predicted(evidence.held_out),
         *evidence.doubts,
+        *evidence.notes,
         *_weak(validation),
         *_alike(validation),
         *_outliers(estimate, explained),
@@ -182,11 +186,16 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
         return ()
     return tuple(
         f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {100.0 * abs(change):.2g} % within "
-        f"{drift.seconds:.0f} s, as is typical while grease warms up: the values hold for the fitted periods. Repeat "
-        "the run while the arm is warm to obtain its warm values."
+        f"{drift.seconds:.0f} s, as is typical while grease warms up: the values hold for the fitted periods. To "
+        f"obtain those of the warm arm, set experiment.warm_up = {_warm_up(drift.seconds)}."
         for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
         if abs(change) > max(LEAST, 3.0 * std)
     )
+
+
+def _warm_up(seconds: float) -> int:
+    """Return a warm-up [s] that should suffice if friction still changed between motions `seconds` apart."""
+    return int(WARM_UP_ROUNDING * np.ceil(WARM_UP_TIMES * seconds / WARM_UP_ROUNDING))
 
 
 def _predicted(held_out: Array | None) -> tuple[str, ...]:

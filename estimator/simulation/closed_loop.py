@@ -80,6 +80,13 @@ class Stabilised:
         state = np.concatenate((start, self.former_torque[None], self.former))
         return respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback).position
 
+    def continued(self, physics: Physics, state: Array, rate: float, command_to_sample: float) -> tuple[Array, Array]:
+        """Return the simulated angles (joints, samples) [rad] from `state` on, and the state after them; see
+        `Response.state`.
+        """
+        response = respond(_earlier(physics, command_to_sample), state, self.excitation, rate, self.feedback)
+        return response.position, response.state
+
     def settled_positions(self, physics: Physics, pose: Array, rate: float, command_to_sample: float) -> Array:
         """Return the encoder readings (joints, samples) [rad] predicted without measurements, from rest in `pose`.
 
@@ -120,11 +127,10 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     full[5, :joints] = first_bend(physics, state[1])
     full[: len(state), :joints] = state
     position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
-    lag = physics.lag + max(physics.delay, 0.0)
     moving = without_dry_friction(physics.vector)
     respond_compiled(
         *(physics.vector, has_bristles(physics), moving, full, both, gains, physics.encoder),
-        *(lag, step, steps, finer_pieces(physics, step), position, velocity, torque),
+        *(physics.late, step, steps, finer_pieces(physics, step), position, velocity, torque),
     )
     return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
 
@@ -138,7 +144,7 @@ def _loop(
     command: Any,
     gains: Any,
     e: Any,
-    lag: float,
+    lag: Any,
     step: float,
     steps: int,
     pieces: int,
@@ -152,8 +158,9 @@ def _loop(
     b = state[5]
     a1 = a2 = 0.0
     piece = step / pieces
-    fallen = 1.0 - math.exp(-step / lag) if lag > 0.0 else 1.0
-    share = fallen * lag / step if lag > 0.0 else 0.0
+    fallen1 = 1.0 - math.exp(-step / lag[0]) if lag[0] > 0.0 else 1.0
+    fallen2 = 1.0 - math.exp(-step / lag[1]) if lag[1] > 0.0 else 1.0
+    share1, share2 = fallen1 * lag[0] / step, fallen2 * lag[1] / step
     for k in range(command.shape[1]):
         c1 = command[0, k] + gains[0, 0] * (gains[2, 0] - s1) - gains[1, 0] * w1
         c2 = command[1, k] + gains[0, 1] * (gains[2, 1] - s2) - gains[1, 1] * w2
@@ -173,10 +180,10 @@ def _loop(
         torque[1, k] = c2
         for _ in range(steps):
             # Exact mean of the motor's torque over the step, under a constant command.
-            m1 = c1 + (t1 - c1) * share
-            m2 = c2 + (t2 - c2) * share
-            t1 += (c1 - t1) * fallen
-            t2 += (c2 - t2) * fallen
+            m1 = c1 + (t1 - c1) * share1
+            m2 = c2 + (t2 - c2) * share2
+            t1 += (c1 - t1) * fallen1
+            t2 += (c2 - t2) * fallen2
             left = pieces
             while left > 0:
                 n = pieces_now(p, v1, v2, a1, a2, piece, left)

@@ -108,7 +108,7 @@ class ManyArms:
             np.stack([each.vector for each in self.physics]),
             np.array([has_bristles(each) for each in self.physics]),
             np.stack([without_dry_friction(each.vector) for each in self.physics]),
-            np.array([each.lag + max(each.delay, 0.0) for each in self.physics]),
+            np.stack([each.late for each in self.physics]),
             np.array([finer_pieces(each, step, ROUGH_PIECES) for each in self.physics]),
             *(scale, pose, gains, step, steps),
         )

@@ -15,8 +15,10 @@ from hil.estimation.after_a_stop import after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress as StreamProgress
+from hil.model_file import read_result
 from hil.report.page import FILE_NAME, write_report
 from hil.report.run_data import RunData
+from hil.results.result import Result
 from hil.runs.run_folder import RunFolder
 
 __all__ = ["identify", "record"]
@@ -32,6 +34,7 @@ def identify(
     *,
     out: str | PathLike[str] | None = None,
     take_over: bool = False,
+    start_from: str | PathLike[str] | None = None,
     on_progress: OnProgress = ignore,
 ) -> Identification:
     """Excite the arm, record a settled period and estimate the arm's parameters: `hil identify` as a function.
@@ -42,6 +45,8 @@ def identify(
         config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
         out: run folder, which must be new or empty; by default runs/TIME-ARM.
         take_over: take over an arm whose torque another program left on, and lower it slowly; support it by hand.
+        start_from: run folder or result.json of an earlier identification of the same arm, which replaces the prior, so
+            that fewer runs are needed; only with experiment.pilot. If the arm moves otherwise, the prior is used.
         on_progress: called with a `Progress` about 20 times a second while the arm moves, in a separate thread on a
             real bus. It cannot disturb the experiment: reports that arrive too fast are dropped, and if it raises, the
             exception is logged and it is not called again.
@@ -60,6 +65,7 @@ def identify(
     checked, shown = loaded(config)
     if take_over:
         checked = _taking_over(checked)
+    earlier = None if start_from is None else _earlier(checked, shown, Path(start_from))
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
 
@@ -73,7 +79,7 @@ def identify(
         if checked.experiment.pilot:
             from hil.pilot import identify_in_steps
 
-            torque, result = identify_in_steps(checked, run, shown, watch, say)
+            torque, result = identify_in_steps(checked, run, shown, watch, say, earlier)
             say(torque)
         else:
             say(run_experiment(checked, run, shown, watch))
@@ -109,6 +115,16 @@ def record(
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
     tell(Progress("experiment", torque))
     return load_run(run.path)
+
+
+def _earlier(config: Config, shown: Path, path: Path) -> Result:
+    """The result of an earlier run. Raises ConfigError, ResultError, RunFolderError."""
+    if config.is_chain or not config.experiment.pilot:
+        raise ConfigError(
+            f"{shown}: an earlier run replaces the prior of a pilot, so it needs experiment.pilot = true and an arm in "
+            "a plane. Without a pilot there is nothing to start from: peak_torque is given."
+        )
+    return read_result(path)
 
 
 @contextmanager

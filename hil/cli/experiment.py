@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 TakeOver = Annotated[
     bool, typer.Option("--take-over", help="Take over an arm whose torque is on: support it by hand; it sinks slowly.")
 ]
+StartFrom = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="RUN", help="Earlier run of the same arm: its result replaces the pilot's prior."),
+]
 Recordings = Annotated[
     list[Path],
     typer.Argument(
@@ -34,13 +38,19 @@ AllSamples = Annotated[
 ]
 
 
-def identify(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
+def identify(
+    config: ConfigPath,
+    out: OutPath = None,
+    start_from: StartFrom = None,
+    take_over: TakeOver = False,
+    json_only: Json = False,
+) -> None:
     """Excite the arm, record one settled period, and print its parameters with error bars."""
     from hil.api.experiment import identify as identify_arm
     from hil.cli.terminal import Terminal
 
     with Terminal(quiet=json_only).following(config) as follow:
-        result = identify_arm(config, out=out, take_over=take_over, on_progress=follow)
+        result = identify_arm(config, out=out, take_over=take_over, start_from=start_from, on_progress=follow)
     _show(result, json_only)
 
 

@@ -23,6 +23,7 @@ _PHASES = {
     Phase.REST: "resting",
     Phase.RAMP_IN: "ramping in",
     Phase.PERIODIC: "exciting",
+    Phase.WARM_UP: "warming up",
     Phase.RAMP_OUT: "ramping out",
     Phase.COMING_TO_REST: "coming to rest",
     Phase.BRAKING: "braking",

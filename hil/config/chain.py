@@ -48,7 +48,7 @@ def only_planar(config: "Config", what: str) -> None:
     if config.is_chain:
         raise ConfigError(
             f"{config.path}: {what} supports only planar arms so far; this one has arm.urdf. For spatial arms, use "
-            "`hil identify` on a fake arm, and `hil estimate`, `hil report` and `hil export` on its runs."
+            "`hil identify`, `hil dry-run`, `hil estimate`, `hil report` and `hil export`."
         )
 
 
@@ -89,8 +89,6 @@ def chain_slips(config: "Config") -> Iterator[str]:
     told = [option for option in _OPTIONS if getattr(config.model, option)]
     if told:
         yield f"model.{told[0]} = true: only planar arms support this term so far; remove it"
-    if config.model.friction == "auto":
-        yield 'model.friction = "auto": only for planar arms so far; choose "coulomb", "stribeck" or "stribeck_load"'
     yield from _path_slips(config)
 
 

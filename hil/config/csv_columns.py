@@ -28,6 +28,7 @@ from hil.toml_errors import describe
 
 Column = Annotated[str, Field(min_length=1)]
 TICKS = "ticks"
+PLANAR = 2
 POSITION_UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295, "turns": 6.283185307179586, TICKS: 1.0}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2, "kgf cm": 0.0980665}
@@ -47,7 +48,7 @@ class Columns(_Table):
     rate: PositiveFloat | None = Field(None, le=1e5, description="samples per second, where there is no column of time")
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     position: list[Column] | None = Field(
-        None, min_length=1, max_length=2, description="one column per joint, from the base outwards"
+        None, min_length=1, max_length=7, description="one column per joint, from the base outwards"
     )
     position_unit: Literal["rad", "mrad", "deg", "turns", "ticks"] | None = None
     ticks_per_turn: PositiveFloat | None = Field(None, description="of the encoders, for positions in ticks")
@@ -124,12 +125,22 @@ class Columns(_Table):
                 raise ValueError(f"columns.{key} has {size} entries; position has {count}, one per joint")
 
 
+class JointName(BaseModel):
+    """`[[joints]]`; only the name is used here, for arms with a URDF."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
+
+    name: str | None = None
+
+
 class ArmFacts(BaseModel):
-    """`[arm]`; only gravity is used here."""
+    """`[arm]`; only gravity and geometry are used here."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
+    urdf: str | None = Field(None, description="URDF or MJCF of a spatial arm, relative to the TOML file")
+    base: list[float] = Field([0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch, yaw")
 
 
 class RecordingConfig(BaseModel):
@@ -141,6 +152,23 @@ class RecordingConfig(BaseModel):
     arm: ArmFacts = ArmFacts()
     model: ModelConfig = ModelConfig(friction="auto", drive="delay")
     known: KnownConfig | None = None
+    joints: list[JointName] = []
+
+    @property
+    def joint_names(self) -> tuple[str, ...] | None:
+        """Names of the joints, from the base outwards; None if one or all have none."""
+        names = tuple(joint.name for joint in self.joints if joint.name is not None)
+        return names if names and len(names) == len(self.joints) else None
+
+    @model_validator(mode="after")
+    def _planar_without_urdf(self) -> Self:
+        count = len(self.columns.position or ())
+        if count > PLANAR and self.arm.urdf is None:
+            raise ValueError(
+                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and [[joints]] with name = "
+                "for each of them; without a URDF, an arm has one or two joints"
+            )
+        return self
 
 
 def load_recording_config(path: Path) -> RecordingConfig:
@@ -159,6 +187,14 @@ def parse_recording_config(text: str, path: Path) -> RecordingConfig:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     try:
-        return RecordingConfig.model_validate(values)
+        return RecordingConfig.model_validate(_with_urdf_beside(values, path))
     except ValidationError as error:
         raise ConfigError(describe(error, path, RecordingConfig)) from error
+
+
+def _with_urdf_beside(values: dict[str, object], path: Path) -> dict[str, object]:
+    """Return the tables with a relative arm.urdf found from the TOML file's folder."""
+    arm = values.get("arm")
+    if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
+        return {**values, "arm": {**arm, "urdf": str(path.parent / arm["urdf"])}}
+    return values

@@ -1,5 +1,6 @@
 """`[experiment]`, `[joint_path]` and `[model]`: the excitation, how it is streamed, and the model terms to fit."""
 
+import math
 from typing import Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
@@ -28,6 +29,9 @@ class ExperimentConfig(Table):
     design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
     ramp: float = Field(1.0, ge=0, le=60, description="s, at start and end")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque beforehand")
+    warm_up: float = Field(
+        0.0, ge=0, le=3600, description="s of the same motion before the first recorded period, until friction is warm"
+    )
     settle_within: PositiveFloat = Field(
         0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
     )
@@ -61,6 +65,11 @@ class ExperimentConfig(Table):
         Relative to the motion's RMS, like settle_within. Warming grease, for example, makes the motion drift.
         """
         return DRIFT * self.settle_within
+
+    @property
+    def warm_up_periods(self) -> int:
+        """Number of periods of the warm-up."""
+        return math.ceil(self.warm_up / self.period - 1e-9)
 
     @property
     def samples(self) -> int:

@@ -16,21 +16,47 @@ from hil.plan.plan import Plan, make_plan, scaled
 
 Array = NDArray[np.float64]
 
-SEARCH_ARMS = 32
-"""Number of arms simulated during the search; the result is checked on all arms."""
 
-PRIOR_ROOM = 0.9
-"""Fraction of the limits used before any identification: a wide prior has longer tails than the simulated arms show."""
+@dataclass(frozen=True)
+class AmplitudeOptions:
+    """Options of the search for the largest safe torque."""
 
-_ROUNDS = 12
-_LAST_ROUNDS = 4
-_CLOSE = 0.94
-"""Fraction of the limits, at the required probability, at which the search stops."""
+    search_arms: int = 32
+    """Number of arms simulated during the search; the result is checked on all arms."""
+    prior_share: float = 0.9
+    """Fraction of the limits used before any identification: a wide prior has longer tails than the simulated arms
+    show.
+    """
+    max_rounds: int = 12
+    """Maximum number of iterations of the search, and of reductions after it."""
+    max_polishing_rounds: int = 4
+    """Maximum number of final raises of single joints."""
+    close: float = 0.94
+    """Fraction of the limits, at the required probability, from which on they count as reached."""
+    over: float = 0.97
+    """Fraction of the limits that an iteration aims at if the last torque was too large."""
+    under: float = 0.99
+    """The same if it was too small."""
+    max_ratio: float = 2.0
+    """Maximum ratio of the torques of two iterations."""
+    damping: float = 0.85
+    """Factor on the exponent of each further correction."""
+    min_exponent: float = 0.4
+    polishing_ratio: float = 1.06
+    """Ratio of torques of a final raise."""
+    back_off: float = 0.93
+    """Ratio of torques after the check on all arms has failed."""
+    torque_share: float = 0.97
+    """Fraction of the current limit that may be used, since clamping would distort the designed wave."""
+    initial_share: float = 0.125
+    """Initial torque, relative to what the current limits allow."""
+    initial_safe_share: float = 0.25
+    """Torque that is assumed to be safe until a larger one is found to be, relative to the initial one."""
 
-_LARGEST_STEP = 2.0
-_BACK_OFF = 0.93
-_TORQUE_SHARE = 0.97
-"""Fraction of the current limit that may be used, since clamping would distort the designed wave."""
+
+DEFAULTS = AmplitudeOptions()
+
+AT_MOST = 0.999  # fraction of the largest torque from which on it counts as reached, whatever the rounding
 
 
 @dataclass(frozen=True)
@@ -50,6 +76,7 @@ def largest_amplitude(
     pose: Array | None = None,
     cap: Array | None = None,
     executor: Executor | None = None,
+    options: AmplitudeOptions = DEFAULTS,
 ) -> Amplitude:
     """Find the largest torque that keeps the arms within `share` of their limits, up to probability
     safety.limit_chance.
@@ -61,21 +88,24 @@ def largest_amplitude(
         plan: plan whose waves are scaled; by default low-crest multisines.
         pose: where the arm starts (joints,) [rad].
         cap: largest torque (joints,) [N m], in addition to the current limits.
+        executor: of concurrent.futures, for the simulations.
+        options: tolerances and limits of the search.
 
     Raises:
         NoSafeTorque: not even a small torque is safe.
     """
     if ensemble.source == "prior":
-        share *= PRIOR_ROOM
-    base = with_peaks(config, most_torque(config) / 8) if plan is None else plan
-    most = most_torque(config) if cap is None else np.minimum(most_torque(config), cap)
-    found = _search(config, base, ensemble.first(SEARCH_ARMS), share, pose, most, executor)
-    for _ in range(_ROUNDS):
+        share *= options.prior_share
+    base = with_peaks(config, options.initial_share * most_torque(config, options)) if plan is None else plan
+    most = most_torque(config, options)
+    most = most if cap is None else np.minimum(most, cap)
+    found = _search(config, base, ensemble.first(options.search_arms), share, pose, most, executor, options)
+    for _ in range(options.max_rounds):
         plan = scaled(config, base, found)
         prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
         if _chance(prediction, share) <= config.safety.limit_chance:
             return Amplitude(plan, found, prediction)
-        found = found * _BACK_OFF
+        found = found * options.back_off
     raise NoSafeTorque(
         "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, add values "
         "to [arm.prior], or raise safety.limit_chance."
@@ -96,6 +126,7 @@ def _search(
     pose: Array | None,
     most: Array,
     executor: Executor | None,
+    options: AmplitudeOptions,
 ) -> Array:
     """Approach the limits in several rounds, since the joints are coupled; return peak torques (joints,) [N m]."""
     torque = base.segments[0].peak_torque
@@ -105,32 +136,32 @@ def _search(
         prediction = predict(config, scaled(config, first, tried), ensemble, pose=pose, briefly=True, executor=executor)
         return _reached(config, prediction, share)
 
-    best, used = 0.25 * torque, 0.0
+    best, used = options.initial_safe_share * torque, 0.0
     torque = np.minimum(torque, most)
-    step = 1.0
-    for _ in range(_ROUNDS):
+    exponent = 1.0
+    for _ in range(options.max_rounds):
         reached = reached_with(torque)
         if reached.max() <= 1.0 and reached.min() > used:
             best, used = torque, float(reached.min())
-        if reached.max() <= 1.0 and ((reached >= _CLOSE) | (torque >= 0.999 * most)).all():
+        if reached.max() <= 1.0 and ((reached >= options.close) | (torque >= AT_MOST * most)).all():
             break
-        wanted = np.where(reached > 1.0, 0.97, 0.99) / np.clip(reached, 1e-3, 1e3)
-        torque = np.minimum(torque * np.clip(wanted**step, 1 / _LARGEST_STEP, _LARGEST_STEP), most)
-        step = max(0.4, 0.85 * step)
-    return _polished(reached_with, best, most)
+        wanted = np.where(reached > 1.0, options.over, options.under) / np.clip(reached, 1e-3, 1e3)
+        torque = np.minimum(torque * np.clip(wanted**exponent, 1 / options.max_ratio, options.max_ratio), most)
+        exponent = max(options.min_exponent, options.damping * exponent)
+    return _polished(reached_with, best, most, options)
 
 
-def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array) -> Array:
+def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array, options: AmplitudeOptions) -> Array:
     """Raise the joint that uses the least of its limits in small steps while all joints stay within their limits."""
     reached = reached_with(torque)
     blocked = np.zeros(torque.size, dtype=bool)
-    for _ in range(_LAST_ROUNDS):
-        blocked |= (reached >= _CLOSE) | (torque >= 0.999 * most)
+    for _ in range(options.max_polishing_rounds):
+        blocked |= (reached >= options.close) | (torque >= AT_MOST * most)
         if blocked.all():
             break
         joint = int(np.argmin(np.where(blocked, np.inf, reached)))
         tried = torque.copy()
-        tried[joint] = min(1.06 * tried[joint], most[joint])
+        tried[joint] = min(options.polishing_ratio * tried[joint], most[joint])
         there = reached_with(tried)
         if there.max() <= 1.0:
             torque, reached = tried, there
@@ -155,7 +186,7 @@ def _chance(prediction: Prediction, share: float) -> float:
     return max(counted, prediction.stop_chance)
 
 
-def most_torque(config: Config) -> Array:
+def most_torque(config: Config, options: AmplitudeOptions = DEFAULTS) -> Array:
     """Largest torque that the current limits allow (joints,) [N m]."""
     limits = np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])
-    return np.asarray(_TORQUE_SHARE * limits)
+    return np.asarray(options.torque_share * limits)

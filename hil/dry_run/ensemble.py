@@ -67,6 +67,12 @@ def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int 
 
     farther: ratio of the range of motion to be simulated to the range used for identification.
     """
+    physics = tuple(Physics.of(each) for each in result_draws(result, count, farther, seed))
+    return Ensemble(physics, np.ones((count, result.joints)), "result")
+
+
+def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> list[dict[str, float]]:
+    """Draw the parameters of `count` arms as in `result_ensemble`, by the estimator's names [SI]."""
     names = result.covariance.names
     covariance = result.covariance.array()
     known = result.values
@@ -78,8 +84,7 @@ def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int 
     extra = np.diag((MODEL_SPREAD * max(1.0, farther) * value) ** 2)
     random = np.random.default_rng((seed, 7))
     drawn = _draws(random, value, widened + extra, count)
-    physics = tuple(Physics.of(_physical(dict(zip(names, row.tolist(), strict=True)), known)) for row in drawn)
-    return Ensemble(physics, np.ones((count, result.joints)), "result")
+    return [_physical(dict(zip(names, row.tolist(), strict=True)), known) for row in drawn]
 
 
 def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:

@@ -227,7 +227,6 @@ def _side_by_side(positions: list[Array]) -> Array:
 
 
 def _shares(values: Array, limits: Array, rest: Array) -> Array:
-    shares = np.abs(values / limits)
-    shares[:, 0] = (rest - values[:, 0]) / (rest - limits[0])
-    shares[:, 1] = (values[:, 1] - rest) / (limits[1] - rest)
-    return shares
+    below = (rest - values[:, 0]) / (rest - limits[0])
+    above = (values[:, 1] - rest) / (limits[1] - rest)
+    return np.concatenate((below[:, None], above[:, None], np.abs(values[:, 2:] / limits[2:])), axis=1)

@@ -13,6 +13,7 @@ from hil.errors import RecordingCutShort
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.simulation.prediction import predict
@@ -39,7 +40,9 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     known = known_chain(config)
     model = wanted_chain_model(config, known)
     period = settled_period(config, facts, samples, IDENTIFY)
-    estimate = identify_chain(period, model, known.prior)
+    fit = choose_chain if config.model.friction == "auto" else identify_chain
+    estimate = fit(period, model, known.prior)
+    model = estimate.model
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if HELD_OUT in facts.segments:
         with suppress(RecordingCutShort):  # stopped in the held-out part: what was finished is estimated
@@ -84,9 +87,14 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 
 
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
-    """The model requested by the configuration."""
+    """The model requested by the configuration.
+
+    Links turned by several joints tie these joints' torques together, so torque constants that are not exact cannot
+    all be right: their ratios are parameters wherever the configuration gives an uncertainty.
+    """
     wanted = config.model
-    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale)
+    scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
+    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, scales)
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:

@@ -18,12 +18,15 @@ from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimation.supply import supply_notes, supply_sag
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
-from hil.estimator.selection.drift import Drift, drifting, friction_change
-from hil.estimator.selection.settled import Choice, choose, predict_period
+from hil.estimator.selection.drift import drifting, friction_change
+from hil.estimator.selection.other_period import predict_period
+from hil.estimator.selection.settled import Choice, choose
+from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
 from hil.estimator.simulation.back_emf import neglected
@@ -52,21 +55,27 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)
     other, cut_short = _held_out(config, facts, samples)
-    estimate, choice = _estimate(config, period, other, run.load_starts(), executor)
+    between = None if other is None else _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
+    recorded = period
+    estimate, choice = _estimate(config, period, other, between, run.load_starts(), executor)
+    period = recorded if choice is None else choice.period
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=_with_neglected(considered(period, estimate), estimate))
-    drift = None if other is None else _drift(facts, samples, other, estimate)
+    drift = None if other is None or between is None else friction_change(other, estimate, between)
     if drift is not None:
-        estimate = replace(estimate, covariance=drifting(period, estimate, drift))
-    played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+        left = drift if choice is None or choice.drift is None else drift.after_correction()
+        estimate = replace(estimate, covariance=drifting(period, estimate, left))
+    played = {IDENTIFY: PlayedPeriod(recorded.rate, recorded.torque, recorded.position, estimate.position)}
     if other is not None:
         later = estimate if drift is None or not drift.is_seen else drift.at_the_later(estimate)
-        predicted = predict_period(later, other)
+        changes = choice is not None and choice.drift is not None and drift is not None
+        predicted = predict_period(later, steadied(other, later, drift) if changes and drift is not None else other)
         played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
-    evidence = Evidence(held_out, left_out, drift, wrong, tried_all=choice is not None)
+    notes = supply_notes(config, supply_sag(config, samples))
+    evidence = Evidence(held_out, left_out, drift, wrong, notes, tried_all=choice is not None)
     checks = Checks(
         describe_validation(validation, held_out),
         describe_verdict(judge(estimate, validation, evidence)),
@@ -113,12 +122,6 @@ def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDAr
     return wider
 
 
-def _drift(facts: RunFacts, samples: NDArray[np.void], other: SettledPeriod, estimate: Estimate) -> Drift:
-    """Estimate how friction changed between the fitted and the held-out motion."""
-    between = _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
-    return friction_change(other, estimate, between)
-
-
 def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
     """Mean time of the last period of a multisine, on the port's clock [s]."""
     rows = samples[(samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))]
@@ -130,6 +133,7 @@ def _estimate(
     config: Config,
     period: SettledPeriod,
     other: SettledPeriod | None,
+    between: float | None,
     starts: list[dict[str, float]],
     executor: Executor | None,
 ) -> tuple[Estimate, Choice | None]:
@@ -144,6 +148,7 @@ def _estimate(
             by_voltage=by_voltage,
             lever=lever,
             starts=starts,
+            seconds=between,
             executor=executor,
         )
         return choice.estimate, choice

@@ -8,12 +8,16 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
+from hil.estimation.supply import supply_sag, torque_factor
 from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.simulation.closed_loop import Stabilised
 from hil.plan.stabiliser import feedback_of, feedback_torque
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
+
+_AROUND_S, _FEWEST_AROUND = 0.04, 4
+"""Time before and after a sample whose readings determine its velocity [s], and the fewest of them on either side."""
 
 
 def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], role: str) -> SettledPeriod:
@@ -41,6 +45,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     begin, end = first * count, (first + experiment.periods) * count
     # Includes the row before, whose goal is in effect until the first write.
     goals = rows["goal_current"][begin - 1 : end].T * _torque_constants(config)[:, None]
+    goals = goals * torque_factor(config, supply_sag(config, samples), rows[begin - 1 : end]).T
     late = lateness(rows[begin:end])
     torque = acting_torque(goals, late, experiment.rate)
     angle = position[first : first + experiment.periods]
@@ -52,6 +57,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         position_step=np.array(facts.position_step),
         periods=experiment.periods,
         stabiliser=None if config.stabiliser is None else _stabilised(config, rows, torque, begin),
+        before=_state_at(samples, int(np.flatnonzero(chosen)[begin - count]), experiment.rate),
     )
     on_time = angle - velocity_of(period) * _by_period(late[None], count)
     return replace(period, position=_mean_of_periods(on_time), position_std=_scatter(on_time))
@@ -62,6 +68,22 @@ def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
     count = np.isfinite(position).sum(axis=0)
     mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
     return mean
+
+
+def _state_at(samples: NDArray[np.void], row: int, rate: float) -> NDArray[np.float64] | None:
+    """Angles and velocities (2, joints) [rad, rad/s] at `row`, from a cubic through the readings nearby; None if too
+    many are missing.
+    """
+    half = max(_FEWEST_AROUND, round(_AROUND_S * rate))
+    near = slice(max(0, row - half), row + half + 1)
+    seconds = samples["deadline"][near] - samples["deadline"][row]
+    state = []
+    for position in samples["position"][near].T:
+        known = np.isfinite(position)
+        if known.sum() < 2 * _FEWEST_AROUND:
+            return None
+        state.append(np.polynomial.polynomial.polyfit(seconds[known], position[known], 3)[:2])
+    return np.ascontiguousarray(np.transpose(state))
 
 
 def _by_period(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from hil.config.joint import JointConfig
 from hil.drivers.servo_model import Mode
 from hil.results.parts import Quantity
 
-RATIO = "torque_scale_2"
+RATIO = "torque_scale"
 
 
 class Driven(Protocol):
@@ -27,7 +27,7 @@ class Driven(Protocol):
 def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity]) -> str:
     """A sentence on how the values depend on the torque constants and how well these are known; empty if exactly.
 
-    extra: the result's terms besides the base parameters. If they include the ratio of the torque constants, only the
+    extra: the result's terms besides the base parameters. If they include the ratios of the torque constants, only the
     first constant remains uncertain.
     """
     unsure = [
@@ -35,17 +35,19 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         for joint in joints
         if joint.torque_per_goal_std
     ]
-    if RATIO not in extra:
+    ratios = [(joint, extra[f"{RATIO}_{n}"]) for n, joint in enumerate(joints, 1) if f"{RATIO}_{n}" in extra]
+    if not ratios:
         known = (
             "Every value also scales with its joint's torque constant, whose relative uncertainty is: "
             f"{', '.join(unsure)}."
         )
         return known if unsure else ""
-    first, second = joints
-    ratio = extra[RATIO]
+    first = joints[0]
+    given = ", ".join(f"{joint.name} gives {ratio.value:.5g} +- {ratio.std:.1g}" for joint, ratio in ratios)
+    its = "its torque constant implies" if len(ratios) == 1 else "their torque constants imply"
     found = (
-        f"Relative to {first.name}, {second.name} gives {ratio.value:.5g} +- {ratio.std:.1g} times the torque that "
-        f"its torque constant implies. Every value scales only with the torque constant of {first.name}"
+        f"Relative to {first.name}, {given} times the torque that {its}. Every value scales only with the torque "
+        f"constant of {first.name}"
     )
     if not first.torque_per_goal_std:
         return f"{found}."

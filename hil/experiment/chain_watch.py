@@ -35,17 +35,20 @@ class ChainWatch:
     """Checks every sample against the model.
 
     planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
-    configuration.
+    configuration. interval: time between two exchanges [s]; by default, that between two samples.
     """
 
-    def __init__(self, config: Config, planned: Sequence[float], arms: ChainArms | None = None) -> None:
+    def __init__(
+        self, config: Config, planned: Sequence[float], arms: ChainArms | None = None, interval: float | None = None
+    ) -> None:
         arms = prior_arms(config, known_chain(config), ARMS) if arms is None else arms
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         mean, covariance = observed_parameters(arms)
         n = len(self._constants)
         # A light joint's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         largest = np.maximum(self._constants * np.array(planned), _FRICTIONS * mean[len(mean) - 2 * n : len(mean) - n])
-        self._observer = ChainObserver(arms.base, mean, covariance, largest, 1.0 / config.experiment.rate)
+        interval = 1.0 / config.experiment.rate if interval is None else interval
+        self._observer = ChainObserver(arms.base, mean, covariance, largest, interval)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
         self._goal: Sequence[float] | None = None

@@ -3,29 +3,46 @@
 A frozen encoder still answers, and a velocity that stays at zero is within every limit. But the integral of the
 velocity must equal the change in position. The difference,
 
-    position - integral of velocity,
+    apart = position - integral of velocity,
 
-is tracked with an exponential memory of `MEMORY_S`. Rounding and encoder noise do not accumulate in it, and a velocity
-that lags by tau, because the servo filters it, contributes at most tau times the change of velocity. The tolerance
-allows for a lag of `LAG_S`, a scale error of `SCALE` and the interval between samples. Once the joint has moved fast
-for `LEARNT_S`, it allows for only twice the largest lag observed so far plus `MORE_LAG_S`: a lag does not grow.
+is tracked with exponential memories: a short one, which shows a sudden fault at once, and a long one, which shows one
+that creeps. Rounding and encoder noise do not accumulate in it. What ordinary servos contribute is known:
+
+- a velocity that lags by tau, because the servo filters it: tau times the velocity, less its mean over the memory. Any
+  lag up to `LAG_S` is accepted;
+- a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
+- the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
+  a fraction `CURVED` of the change of velocity times the interval remains.
+
+Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, twice those
+observed by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 """
 
-MEMORY_S = 0.3
+SHORT_S, LONG_S = 0.3, 1.2
+"""Time constants of the memories [s]."""
+
+LONG_EVERY_S = 0.0099
+"""Shortest interval added to the long memory [s]: that of 100 Hz, whatever its rounding."""
+
+UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
+"""Tolerances [rad] for rounding, encoder noise, and a velocity that is rounded towards zero during each memory."""
+
 LAG_S = 0.03
 LEARNT_S = 1.5
 MORE_LAG_S = 0.008
 _FAST_RAD_S = 2.0
 """Smallest range of velocities within the memory from which the lag can be estimated [rad/s]."""
 
-SCALE = 0.06
-UNSURE_RAD = 0.02
-"""Allowance [rad] for rounding, encoder noise, and a velocity bias of half a tick over MEMORY_S."""
+_SEPARATE = 0.05
+"""Determinant, relative to uncorrelated signals, below which lag and scale error cannot be told apart."""
 
-CURVED = 0.25
-"""Allowance for the velocity between samples, as a fraction of its change times the interval.
+_LAG_SHARE = 0.25
+"""Allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities."""
 
-A wave with four samples per period, the fastest that is played, deviates by 21 %.
+SCALE, MORE_SCALE = 0.06, 0.02
+CURVED = 0.35
+"""Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
+samples per period, the fastest that is played, needs 0.27.
 """
 
 
@@ -35,12 +52,14 @@ class Consistency:
     def __init__(self) -> None:
         self._position: float | None = None
         self._velocity = 0.0
-        self._apart = 0.0
-        self._open = 0.0
-        self._highest = self._lowest = 0.0
-        self._lag_seen = 0.0
+        self._short = _Memory(SHORT_S, UNSURE_RAD)
+        self._long = _Memory(LONG_S, LONG_UNSURE_RAD)
+        self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
         self._learnt_for = 0.0
-        self._lag = LAG_S
+        # Sums of squares and products of the signals per lag and per scale error, and of them with `apart`.
+        self._lag_squared = self._scale_squared = self._crossed = 0.0
+        self._lag_product = self._scale_product = 0.0
+        self._lag, self._scale = LAG_S, SCALE
 
     def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
         """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
@@ -49,33 +68,110 @@ class Consistency:
         """
         former, self._position = self._position, position
         before, self._velocity = self._velocity, velocity
+        short = self._short
         if former is None:
-            self._apart = self._open = 0.0
-            self._highest = self._lowest = velocity
+            short.restart(velocity)
+            self._long.restart(velocity)
+            self._forget_sums()
             return False
-        kept = 1.0 - seconds / MEMORY_S if seconds < MEMORY_S else 0.0
-        moved, felt = position - former, 0.5 * (before + velocity) * seconds
-        change = velocity - before
-        self._apart = kept * self._apart + moved - felt
-        self._open = kept * self._open + SCALE * abs(moved)
-        self._open += CURVED * seconds * abs(change) + unsure * abs(velocity)
-        highest, lowest = kept * self._highest + (1 - kept) * velocity, kept * self._lowest + (1 - kept) * velocity
-        self._highest = highest = velocity if velocity > highest else highest
-        self._lowest = lowest = velocity if velocity < lowest else lowest
-        span = highest - lowest
-        allowed = UNSURE_RAD + self._lag * span + self._open
-        if not -allowed <= self._apart <= allowed:
+        moved = position - former
+        difference = moved - 0.5 * (before + velocity) * seconds
+        curved = CURVED * seconds * abs(velocity - before)
+        unknown = unsure * abs(velocity)
+        short.add(moved, difference, velocity, seconds, curved, unknown)
+        if short.is_wrong(velocity, self._lag, self._scale) or self._looks_long(
+            moved, difference, velocity, seconds, curved, unknown
+        ):
             return True
-        if span > _FAST_RAD_S and not unsure > seconds:
-            self._learn_lag(abs(self._apart) / span, seconds)
+        if self._learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
+            self._learn(velocity, seconds)
         return False
 
-    def _learn_lag(self, lag: float, seconds: float) -> None:
-        self._lag_seen = max(self._lag_seen, lag)
+    def _looks_long(
+        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
+    ) -> bool:
+        """Add an interval to the long memory, which takes several at once: it is slow anyway, and time is scarce."""
+        self._sum_seconds += seconds
+        self._sum_moved += moved
+        self._sum_difference += difference
+        self._sum_unknown += unknown
+        self._most_curved = max(self._most_curved, curved)
+        if self._sum_seconds < LONG_EVERY_S:
+            return False
+        long = self._long
+        long.add(
+            self._sum_moved, self._sum_difference, velocity, self._sum_seconds, self._most_curved, self._sum_unknown
+        )
+        self._forget_sums()
+        return long.is_wrong(velocity, self._lag, self._scale)
+
+    def _forget_sums(self) -> None:
+        self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
+
+    def _learn(self, velocity: float, seconds: float) -> None:
+        apart, per_scale = self._short.apart, self._short.far
+        per_lag = velocity - self._short.mean
+        self._lag_squared += per_lag * per_lag
+        self._scale_squared += per_scale * per_scale
+        self._crossed += per_lag * per_scale
+        self._lag_product += per_lag * apart
+        self._scale_product += per_scale * apart
         self._learnt_for += seconds
-        if self._learnt_for >= LEARNT_S:
-            self._lag = min(LAG_S, 2.0 * self._lag_seen + MORE_LAG_S)
+        if self._learnt_for < LEARNT_S:
+            return
+        determinant = self._lag_squared * self._scale_squared - self._crossed * self._crossed
+        if determinant <= _SEPARATE * self._lag_squared * self._scale_squared:
+            return
+        lag = (self._lag_product * self._scale_squared - self._scale_product * self._crossed) / determinant
+        scale = (self._scale_product * self._lag_squared - self._lag_product * self._crossed) / determinant
+        self._lag = min(LAG_S, 2.0 * max(lag, 0.0) + MORE_LAG_S)
+        self._scale = min(SCALE, 2.0 * abs(scale) + MORE_SCALE)
 
     def lost(self) -> None:
-        """Restart with the next reply, because one is missing."""
+        """Restart with the next reply: too many are missing."""
         self._position = None
+
+
+class _Memory:
+    """Exponential memory with a time constant of `seconds`. unsure: its tolerance [rad].
+
+    apart: position less integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the
+    velocity [rad/s].
+    """
+
+    __slots__ = ("_curved", "_highest", "_lowest", "_seconds", "_unknown", "_unsure", "apart", "far", "mean", "span")
+
+    def __init__(self, seconds: float, unsure: float) -> None:
+        self._seconds, self._unsure = seconds, unsure
+        self.restart(0.0)
+
+    def restart(self, velocity: float) -> None:
+        self.apart = self.far = self.span = self._curved = self._unknown = 0.0
+        self.mean = self._highest = self._lowest = velocity
+
+    def add(
+        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
+    ) -> None:
+        """Add one interval of `seconds`, at the end of which the joint has `velocity`.
+
+        moved, difference: change of position, and the same less the integral of velocity [rad]. curved, unknown: their
+        uncertainty [rad], the second of which accumulates.
+        """
+        kept = 1.0 - seconds / self._seconds if seconds < self._seconds else 0.0
+        new = 1.0 - kept
+        self.apart = kept * self.apart + difference
+        self.far = kept * self.far + moved
+        self._unknown = kept * self._unknown + unknown
+        faded = kept * self._curved
+        self._curved = curved if curved > faded else faded
+        self.mean += new * (velocity - self.mean)
+        highest, lowest = kept * self._highest + new * velocity, kept * self._lowest + new * velocity
+        self._highest = highest = velocity if velocity > highest else highest
+        self._lowest = lowest = velocity if velocity < lowest else lowest
+        self.span = highest - lowest
+
+    def is_wrong(self, velocity: float, lag: float, scale: float) -> bool:
+        """Whether position and velocity disagree, given the largest accepted lag [s] and scale error."""
+        of_lag = lag * (velocity - self.mean)
+        allowed = self._unsure + scale * abs(self.far) + self._curved + self._unknown + _LAG_SHARE * lag * self.span
+        return self.apart > allowed + max(of_lag, 0.0) or self.apart < min(of_lag, 0.0) - allowed

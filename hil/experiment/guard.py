@@ -1,9 +1,9 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
 The checks take a few us per sample for two joints: plain floats, one pass over the joints, constants precomputed.
-Checks that need more than one sample are in separate modules: `following` (does the motor carry the commanded
-current), `consistency` (do position and velocity agree), `status_check` (slow status
-registers), `silence` (time without replies or commands).
+What needs more than one sample is in separate modules: `following` (does the motor carry the commanded current),
+`consistency` (do position and velocity agree), `work` (does the motor turn as commanded), `status_check` (status
+registers), `deadlines` and `silence` (time without commands or replies); `command_limits` clamps what is sent.
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,13 @@ from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment.apart import Apart
+from hil.experiment.command_limits import CommandLimits
 from hil.experiment.consistency import Consistency
+from hil.experiment.deadlines import Deadlines
 from hil.experiment.following import Following, Unfollowed
 from hil.experiment.status_check import StatusCheck
-from hil.plan.silence import is_missing_too_long, late_limit, missing_limit
+from hil.experiment.work import Work
+from hil.plan.silence import is_missing_too_long, missing_limit
 
 JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
@@ -40,21 +43,6 @@ MOST_OUTSIDE_RAD = 0.15
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
-LATE_SHARE = 0.2
-"""Fraction of deadlines that may be missed permanently."""
-
-_OFTEN_LATE = 5.0
-_OF_ONE_STALL = 2  # number of deadlines counted per stall
-
-WORK_TOLERANCE_RAD = 0.03
-"""Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest torque."""
-
-
-_WHY_LATE = (
-    "This program was stopped (Ctrl-Z, SIGSTOP, a debugger), the computer was suspended, or other programs kept it "
-    "busy: close those programs, or lower experiment.rate."
-)
-
 
 class _Limits(NamedTuple):
     """One joint's limits, in order of use."""
@@ -63,9 +51,6 @@ class _Limits(NamedTuple):
     high: float
     velocity: float
     farthest: float
-    current: float
-    work_scale: float
-    work_least: float
 
 
 class Guard:
@@ -73,14 +58,20 @@ class Guard:
 
     planned: largest planned goal of each joint [A, or V under PWM]; by default, from the configuration.
 
+    interval: time between two exchanges [s]; by default, that between two samples.
+
     left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
     have come to rest a little beyond it: a joint found there may move back in, and no farther out.
-
-    The work of the motors is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot
-    return more work than was put in, so a motor that continually takes work out of it turns the wrong way.
     """
 
-    def __init__(self, config: Config, planned: Sequence[float] | None = None, *, left_by_a_run: bool = False) -> None:
+    def __init__(
+        self,
+        config: Config,
+        planned: Sequence[float] | None = None,
+        *,
+        interval: float | None = None,
+        left_by_a_run: bool = False,
+    ) -> None:
         rate = config.experiment.rate
         safety = config.safety
         self._seconds = [[second.id for second in joint.joint.seconds] for joint in config.joints]
@@ -91,19 +82,16 @@ class Guard:
                 joint.position_limit[1],
                 joint.velocity_limit,
                 JUMP_FACTOR * joint.velocity_limit,
-                joint.goal_limit,
-                joint.torque_per_goal,
-                -WORK_TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal,
             )
             for joint in config.joints
         ]
         count = len(config.joints)
         self._safety = safety
-        self._slew = safety.slew / rate
-        self._passive = config.stabiliser is None
-        self._interval = 1.0 / rate
+        self._commands = CommandLimits(config)
+        self._work = Work(config) if config.stabiliser is None else None
+        self._interval = 1.0 / rate if interval is None else interval
         self._missing_limit = missing_limit(config)
-        self._late_limit = late_limit(config)
+        self._deadlines = Deadlines(config)
         self._following = [
             None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
             for joint, peak in zip(config.joints, planned or _planned(config), strict=True)
@@ -111,87 +99,39 @@ class Guard:
         self._apart = Apart()
         self._consistency = [Consistency() for _ in config.joints]
         self._status = StatusCheck(config)
-        self._former_goal = [0.0] * count
         self._position: list[float | None] = [None] * count
         self._seen_at = [0.0] * count
         self._missing = [0] * count
-        self._work = [0.0] * count
-        self._held_goal = [0.0] * count
-        self._late = 0
-        self._often_late = 0.0
         self._resting: tuple[float, ...] | None = None
         self._may_start_outside = left_by_a_run
         self._found_outside: dict[int, float] = {}
         self._shortest = float("inf")
         self._unsure = 0.0
 
-    def clamp(self, goal_current: Sequence[float]) -> list[float]:
-        """Clamp goals to each joint's current limit and slew rate [A or V]. Raises SafetyStop for a goal that is not
-        finite.
-        """
-        slew = self._slew
-        clamped = []
-        for index, (goal, former, limits) in enumerate(zip(goal_current, self._former_goal, self._limits, strict=True)):
-            if not abs(goal) < float("inf"):
-                self._stop(
-                    index, Cause.NOT_A_NUMBER, f"would have received a goal current of {goal}, which is not a number."
-                )
-            limit = limits.current
-            wanted = limit if goal > limit else -limit if goal < -limit else goal
-            change = wanted - former
-            clamped.append(former + slew if change > slew else former - slew if change < -slew else wanted)
-        self._former_goal = clamped
-        return clamped
+    def clamp(self, goals: Sequence[float]) -> list[float]:
+        """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
+        return self._commands.clamp(goals)
 
-    def holding(self, goal: Sequence[float]) -> None:
-        """The goals that the servos have now [A]: `clamp` goes on from there."""
-        self._former_goal = list(goal)
+    def holding(self, goals: Sequence[float]) -> None:
+        """The goals that the servos have now [A or V]: `clamp` goes on from there."""
+        self._commands.holding(goals)
 
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
-        self._late += 1
-        if self._late <= _OF_ONE_STALL:
-            self._often_late += 1.0
-        seconds = max(seconds, self._late * self._interval)
-        allowed, said = self._late_limit
-        if seconds <= allowed:
-            return
-        missed = max(self._late, int(seconds / self._interval))
-        raise SafetyStop(
-            f"{missed} deadlines in a row were missed, {_told(seconds)} without a command; {said} allows "
-            f"{1e3 * allowed:.0f} ms. {_WHY_LATE}{self._acted(seconds)}",
-            Cause.LATE,
-        )
+        self._deadlines.missed(seconds)
 
-    def _judge_rate(self) -> None:
-        """Stop if too large a share of the deadlines is missed; a single stall does not count."""
-        self._often_late = max(0.0, self._often_late - LATE_SHARE)
-        if self._often_late >= max(_OFTEN_LATE, 0.5 * self._late_limit.seconds / self._interval):
-            raise SafetyStop(
-                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed: the replies arrive too late for "
-                f"{1 / self._interval:g} Hz. `hil check` measures what this bus can do: check the adapter's latency "
-                "timer and the servos' return delay, or lower experiment.rate.",
-                Cause.LATE,
-            )
+    def look(self, state: State, watchdog_gap: float = 0.0, *, between: bool = False) -> None:
+        """Check one exchange. Raises SafetyStop when a limit is exceeded or a reply is inconsistent.
 
-    def look(self, state: State, watchdog_gap: float = 0.0) -> None:
-        """Check one sample. Raises SafetyStop when a limit is exceeded or a reply is inconsistent.
-
-        watchdog_gap: time since the previous exchange [s].
+        watchdog_gap: time since the previous exchange [s]. between: it took place between two samples.
         """
         now = state.time_before_write
-        gap = max(watchdog_gap, state.time_after_read - now)
-        if gap >= self._safety.watchdog:
-            raise SafetyStop(
-                f"This program stalled: {_told(gap)} passed between two commands. {_WHY_LATE}{self._acted(gap)}",
-                Cause.LATE,
-            )
         took = state.time_after_read - now
+        self._deadlines.check_gap(max(watchdog_gap, took))
         self._shortest = shortest = min(self._shortest, took)
         self._unsure = took - shortest
-        self._late = 0
-        if self._often_late > 0.0:
-            self._judge_rate()
+        if not between:
+            self._deadlines.met()
         for index, limits in enumerate(self._limits):
             if state.error[index] & ALERT:
                 self._stop(
@@ -215,7 +155,7 @@ class Guard:
         return self._status.is_in_doubt
 
     def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
-        low, high, fastest, farthest, _, work_scale, work_least = limits
+        low, high, fastest, farthest = limits
         position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
         interval = self._interval
         elapsed = now - self._seen_at[index]
@@ -242,13 +182,12 @@ class Guard:
             consistency.lost()
         if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
-        held, self._held_goal[index] = self._held_goal[index], goal
-        # What the goal before has done until now; where it was another one meanwhile, nothing is known.
-        work = self._work[index]
-        if former is not None and elapsed < LONG_GAP * interval and not missed:
-            work = self._work[index] = work + work_scale * held * (position - former)
-        if work < work_least and self._passive:
-            self._judge_work(index)
+        if self._work is not None:
+            # Where a goal before was another one meanwhile, nothing is known about its work.
+            is_known = former is not None and elapsed < LONG_GAP * interval and not missed
+            taken = self._work.look(index, goal, position - former if is_known and former is not None else None)
+            if taken is not None:
+                self._turns_the_wrong_way(index, taken)
 
     def look_at_rest(self, state: State) -> None:
         """Raise SafetyStop when a joint moves before anything has been commanded."""
@@ -270,7 +209,6 @@ class Guard:
             self._seen_at[index] = now
         self._missing[index] += 1
         seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
-        self._consistency[index].lost()
         allowed, said = self._missing_limit
         # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
         # was damaged.
@@ -291,12 +229,13 @@ class Guard:
             )
 
     def _silence_remedy(self) -> str:
-        if len(self._missing) > 1 and all(self._missing):
-            return (
-                "All servos fell silent together: check the adapter, its cable and the supply, and whether other "
-                "programs keep this computer busy."
-            )
-        return "Check its cable and its supply."
+        if len(self._missing) == 1 or not all(self._missing):
+            return "Check its cable and its supply."
+        # With Fast Sync Read a servo that is silent also hides those that would answer after it.
+        return (
+            "No servo was heard: check the adapter, the cables and the supply, and whether other programs keep this "
+            "computer busy."
+        )
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
         self._stop(
@@ -372,16 +311,13 @@ class Guard:
             if wrong is not None:
                 self._stop(index, *wrong)
 
-    def _judge_work(self, index: int) -> None:
-        """Stop a joint whose motor has taken out more energy than friction allows: it moves against its command."""
-        others = sum(work for other, work in enumerate(self._work) if other != index and work > 0)
-        if self._work[index] < self._limits[index].work_least - 0.5 * others:
-            self._stop(
-                index,
-                Cause.WRONG_SIGN,
-                f"moves against its command: its motor has taken {-self._work[index]:.2f} J out of the arm, more than "
-                "friction can account for. Is its direction reversed, or does something else drive the arm?",
-            )
+    def _turns_the_wrong_way(self, index: int, taken: float) -> NoReturn:
+        self._stop(
+            index,
+            Cause.WRONG_SIGN,
+            f"moves against its command: its motor has taken {taken:.2f} J out of the arm, more than friction can "
+            "account for. Is its direction reversed, or does something else drive the arm?",
+        )
 
     def _look_slow(self, slow: Slow) -> None:
         safety = self._safety
@@ -401,20 +337,9 @@ class Guard:
                     f"{safety.max_voltage:g}. Check the supply.",
                 )
 
-    def _acted(self, seconds: float) -> str:
-        """What the servos' watchdogs did during the gap."""
-        watchdog = self._safety.watchdog
-        if seconds < watchdog:
-            return ""
-        return f" The servos' watchdogs act after {1e3 * watchdog:.0f} ms, so the arm had no current by then."
-
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:
         name = self._names[index]
         raise SafetyStop(f"{name[0].upper()}{name[1:]} {what}", cause)
-
-
-def _told(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds >= 1.0 else f"{1e3 * seconds:.0f} ms"
 
 
 def _measures_supply(joint: JointConfig) -> bool:

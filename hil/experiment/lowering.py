@@ -34,13 +34,17 @@ def may_lower(config: Config, error: BaseException) -> bool:
 
 
 class Lowering:
-    """Computes the goals on the way home. Created before torque is switched on; call `begin` when a stop occurs."""
+    """Computes the goals on the way home. Created before torque is switched on; call `begin` when a stop occurs.
 
-    def __init__(self, config: Config, plan: Plan) -> None:
+    interval: time between two exchanges [s]; by default, that between two samples.
+    """
+
+    def __init__(self, config: Config, plan: Plan, interval: float | None = None) -> None:
         segment = plan.segments[0]
         assert isinstance(segment, PathSegment)
         assert config.stabiliser is not None  # checked with the configuration
         self._config = config
+        self._interval = interval
         self._way = WayHome(config, plan)
         self._thought = segment.thought
         self._stiffness, self._damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
@@ -63,7 +67,7 @@ class Lowering:
         share = np.clip((count - np.arange(count)) / self._fade, 0.0, 1.0)
         self._feed = (share * torque).T
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
-        self._guard = _guard_of(self._config, self._path.position, velocity)
+        self._guard = _guard_of(self._config, self._path.position, velocity, self._interval)
         self._guard.holding(goal)
         return int(count)
 
@@ -73,9 +77,9 @@ class Lowering:
         held = np.where(np.array(state.missing), 0.0, self._stiffness * ahead[0] + self._damping * ahead[1])
         return self._guard.clamp(((self._feed[index] + held) / self._constants).tolist())
 
-    def look(self, index: int, state: State, gap: float) -> None:
-        """Process a sample. Raises SafetyStop if the arm leaves its way home or a servo is faulty."""
-        self._guard.look(state, gap)
+    def look(self, index: int, state: State, gap: float, *, between: bool = False) -> None:
+        """Process an exchange. Raises SafetyStop if the arm leaves its way home or a servo is faulty."""
+        self._guard.look(state, gap, between=between)
         away = np.abs(self._position[index] - np.array(state.position))
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:
             joint = self._config.joints[int(np.nanargmax(away))].joint
@@ -86,14 +90,14 @@ class Lowering:
         self._guard.late(seconds)
 
 
-def _guard_of(config: Config, position: np.ndarray, velocity: np.ndarray) -> Guard:
+def _guard_of(config: Config, position: np.ndarray, velocity: np.ndarray, interval: float | None) -> Guard:
     """A guard whose limits are widened just enough for the arm's position and velocity when it was stopped."""
     fastest = max(_FASTER * float(np.abs(velocity).max()), 2.0 * config.safety.lower_speed) + 0.5
     joints = [
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))
         for joint, row in zip(config.joints, position, strict=True)
     ]
-    return Guard(config.model_copy(update={"joints": joints}))
+    return Guard(config.model_copy(update={"joints": joints}), interval=interval)
 
 
 def _allowing(joint: JointConfig, low: float, high: float, velocity: float) -> JointConfig:

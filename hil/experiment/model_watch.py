@@ -39,14 +39,16 @@ class ModelWatch:
     """Checks every sample against the model.
 
     planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
-    configuration.
+    configuration. interval: time between two exchanges [s]; by default, that between two samples.
     """
 
-    def __init__(self, config: Config, planned: Sequence[float], arms: Ensemble | None = None) -> None:
+    def __init__(
+        self, config: Config, planned: Sequence[float], arms: Ensemble | None = None, interval: float | None = None
+    ) -> None:
         self._constants = [joint.torque_per_goal for joint in config.joints]
         largest = np.array([constant * goal for constant, goal in zip(self._constants, planned, strict=True)])
         mean, covariance = known_arm(config, largest, arms)
-        interval = 1.0 / config.experiment.rate
+        interval = 1.0 / config.experiment.rate if interval is None else interval
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         is_described = arms is not None or config.arm.link_lengths is not None
         dry = [_FRICTIONS * is_described * mean[f"coulomb_{number}"] for number in range(1, len(largest) + 1)]

@@ -97,13 +97,21 @@ class StatusCheck:
         offset = (tick - now) % _WRAP_S
         if readings == 0:
             behind = offset
-        ahead = (offset - behind + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S
+        ahead = _wrapped(offset - behind)
         drifted = _CLOCK_DRIFT * (now - seen_at)
         if ahead < -_CLOCK_TOLERANCE_S - drifted or ahead > _REBOOTED_S:
+            if readings < _LEARNT_READINGS:
+                self._clock[joint] = offset, now, 1, 0  # the first requests were late, so this one counts
+                return None
             stale += 1
             self._clock[joint] = behind, seen_at, readings, stale
-            if stale < _STALE_READINGS or readings < _LEARNT_READINGS:
+            if stale < _STALE_READINGS:
                 return None
+            if self._is_anothers(joint, offset, now):
+                return Cause.STALE, (
+                    "returns another servo's data: its reply carries the clock of another joint. Replies are mixed up: "
+                    "check that every servo has an ID of its own, and the adapter."
+                )
             return Cause.STALE, (
                 f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
                 "are delayed in transit, or it was rebooted. Check the adapter, its latency and its cable."
@@ -111,3 +119,17 @@ class StatusCheck:
         least = offset if ahead < drifted else behind + drifted
         self._clock[joint] = least, now, readings + 1, 0
         return None
+
+    def _is_anothers(self, joint: int, offset: float, now: float) -> bool:
+        """Whether a servo minus computer clock is that of another joint, and its servo's clock is a different one."""
+        return any(
+            readings >= _LEARNT_READINGS
+            and abs(_wrapped(offset - behind)) <= _CLOCK_TOLERANCE_S + _CLOCK_DRIFT * (now - seen_at)
+            for other, (behind, seen_at, readings, _) in enumerate(self._clock)
+            if other != joint
+        )
+
+
+def _wrapped(seconds: float) -> float:
+    """The same difference of two clocks, between minus and plus half of their period."""
+    return (seconds + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S

@@ -1,11 +1,14 @@
 """The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-The sequence is: rest; for each multisine a ramp in, periods until two successive ones match, the remaining periods to
-be recorded, and a ramp out; then no current until the arm is at rest. If the cause of a stop allows it, the arm is
-braked before `run` raises; the caller that switched torque on switches it off.
+Where ticks are far apart, the same goals are exchanged again in between, unrecorded, so that every check sees an
+exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
+
+The sequence is: rest; for each multisine a ramp in, the warm-up (only before the first), periods until two successive
+ones match, the remaining periods to be recorded, and a ramp out; then no current until the arm is at rest. If the cause
+of a stop allows it, the arm is braked before `run` raises; the caller that switched torque on switches it off.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -15,7 +18,6 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
-from hil.drivers.exchange import MOST_PATIENCE_S
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
@@ -35,8 +37,8 @@ from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
-_AGAIN_S = 2.2 * MOST_PATIENCE_S
-"""From one sample to the next there is time for two exchanges, however long both take."""
+_FORGETS = 0.98
+"""Factor per exchange by which the memory of the longest one fades."""
 
 
 class Progress(NamedTuple):
@@ -79,27 +81,30 @@ class Stream:
         self._safety = config.safety
         planned = _largest_goals(plan)
         self._left_by_a_run = has_moved()
-        self._guard = Guard(config, planned, left_by_a_run=self._left_by_a_run)
+        self._turns = bus.exchanges_per_sample
+        self._apart = 1 / plan.rate / self._turns
+        self._guard = Guard(config, planned, interval=self._apart, left_by_a_run=self._left_by_a_run)
         self._model: ModelWatch | ChainWatch = (
-            ModelWatch(config, planned, arms)
+            ModelWatch(config, planned, arms, self._apart)
             if not isinstance(arms, ChainArms) and not config.is_chain
-            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None)
+            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None, self._apart)
         )
-        self._lowering = Lowering(config, plan) if config.is_chain else None
+        self._lowering = Lowering(config, plan, self._apart) if config.is_chain else None
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
         self._watch = watch
         self._note = note
         self._interval = 1 / plan.rate
-        # A lost reply is asked for again where the next sample is far away.
-        self._asks_again = self._interval > _AGAIN_S
         self._ticks = FixedRate(bus.port.clock, plan.rate)
         self._index = 0
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
         self._goal = [0.0] * len(bus.joints)
         self._segment = 0
         self._state: State | None = None
+        self._sampled: State | None = None
+        self._deadline: float | None = None
+        self._takes = 0.0
         self._sent_at: float | None = None
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
@@ -107,7 +112,7 @@ class Stream:
 
     @property
     def state(self) -> State | None:
-        """The latest sample."""
+        """The latest state, also from between two samples."""
         return self._state
 
     def run(self) -> None:
@@ -127,6 +132,8 @@ class Stream:
             self._segment = number
             self._note(f"{segment.role}: ramp in")
             self._play(self._ramps[number][0], Phase.RAMP_IN)
+            if number == 0:
+                self._warm_up(segment)
             self._play_periods(segment)
             self._note(f"{segment.role}: ramp out")
             self._play(self._ramps[number][1], Phase.RAMP_OUT)
@@ -146,6 +153,12 @@ class Stream:
             raise ExperimentError(
                 f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
             )
+
+    def _warm_up(self, segment: Segment) -> None:
+        """Play periods that are recorded, but used for nothing."""
+        for number in range(self._plan.warm_up_periods):
+            self._note(f"{segment.role}: warm-up, period {number + 1} of {self._plan.warm_up_periods}")
+            self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
         """Play periods until one matches its predecessor; it is the first settled one. Then play the other periods to
@@ -219,18 +232,19 @@ class Stream:
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
-        deadline, now, late = self._ticks.wait()
+        for state in self._between_samples():
+            self._look(state, phase, between=True)
+            self._stop.check()
+        self._deadline, now, late = self._ticks.wait()
         if late:
             # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
             state = missed(self._goal, now)
         else:
-            wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._state)
+            wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._sampled)
             self._goal = self._guard.clamp(wanted)
-            state = self._bus.exchange(self._goal)
-            if self._asks_again and any(state.missing):
-                self._guard.look(state)
-                state = self._bus.exchange(self._goal, hurried=True)
+            self._sampled = state = self._bus.exchange(self._goal)
             self._sent_at = state.time_before_write
+        deadline = self._deadline
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
         if late:
@@ -244,9 +258,28 @@ class Stream:
             self._watch(Progress(self._index, self._plan.expected, phase, role, state))
         return state
 
-    def _look(self, state: State, phase: Phase) -> None:
+    def _between_samples(self) -> Iterator[State]:
+        """Exchange the same goals until the next sample is due; yield each state.
+
+        An exchange that might delay the next sample is left out: the adapter may be slow, or a servo silent.
+        """
+        if self._deadline is None:
+            return
+        following = self._deadline + self._interval
+        for turn in range(1, self._turns):
+            due = self._deadline + turn * self._apart
+            self._clock.wait_until(due)
+            now = self._clock.now()
+            if now - due < self._apart and now + self._takes < following:
+                state = self._bus.exchange(self._goal, between=True)
+                self._sent_at = state.time_before_write
+                self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
+                yield state
+
+    def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:
         former, self._state = self._state, state
-        self._guard.look(state, 0.0 if former is None else state.time_before_write - former.time_before_write)
+        gap = 0.0 if former is None else state.time_before_write - former.time_before_write
+        self._guard.look(state, gap, between=between)
         if state.status is not None and self._guard.wants_status:
             self._bus.read_status_next()
         self._model.look(state)
@@ -257,15 +290,17 @@ class Stream:
         """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""
         brake = Brake(self._config)
         state = self._state
+        ticks = FixedRate(self._clock, 1 / self._apart)
         with suppress(DriverError):
-            for _ in range(self._plan.brake_samples):
+            for number in range(round(self._safety.damp_time / self._apart)):
                 goals = None if state is None else brake.goals(state)
                 if goals is None:
                     return
-                deadline, _, late = self._ticks.wait()
+                # The first brake is sent at once: until then the goals that led to the stop drive the arm.
+                deadline, _, late = ticks.wait() if number else (self._clock.now(), 0.0, False)
                 if late or self._stop.insisted:
                     return
-                state = self._bus.exchange(goals)
+                state = self._bus.exchange(goals, between=True)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
     def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
@@ -286,7 +321,11 @@ class Stream:
         """The last state; raises SafetyStop, StopRequested, DriverError."""
         asked = max(1, self._stop.count)
         for index in range(lowering.begin(state, self._goal)):
+            for checked in self._between_samples() if index else ():
+                lowering.look(index - 1, checked, checked.time_before_write - state.time_before_write, between=True)
+                state = checked
             deadline, now, late = self._ticks.wait()
+            self._deadline = deadline
             self._stop.check_again(asked)
             if late:
                 self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))

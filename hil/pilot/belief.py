@@ -13,16 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
-from hil.dry_run.ensemble import Ensemble, scale_draws, within_range
+from hil.dry_run.ensemble import Ensemble, result_draws, scale_draws, within_range
 from hil.dry_run.prior import base_draws
+from hil.errors import ConfigError
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
 from hil.estimator.simulation.many_arms import ManyArms
 from hil.pilot.seen import Seen
 from hil.plan.stabiliser import feedback_of
+from hil.results.result import Result
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_FRICTION = ("viscous", "coulomb", "stribeck_rise")
+_FRICTION_CHANGE = 0.1  # relative standard deviation of friction from one day to another
 
 _LINEAR = ("offset", "zero")
 """Parameters of either sign, which are not represented by their logarithm."""
@@ -176,6 +181,32 @@ def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
     if scale.shape[1] == 2:
         supposed["torque_scale_2"] = scale[:, 1] / scale[:, 0]
     return _of_draws(supposed, seed)
+
+
+def earlier_belief(config: Config, result: Result, arms: int, seed: int = 0) -> Belief:
+    """Draw the belief from the result of an earlier run on the same arm. Raises ConfigError.
+
+    Terms that the result's model lacks are absent. Friction varies more than its error bars: with temperature.
+    """
+    prior = prior_belief(config, arms, seed)
+    if result.joints != len(config.joints):
+        raise ConfigError(
+            f"{config.path} describes {len(config.joints)} joints; the earlier run identified {result.joints}."
+        )
+    random = np.random.default_rng((seed, 10))
+    drawn = result_draws(result, arms, seed=seed)
+    supposed = dict(prior.fixed)
+    draws: dict[str, Array] = {}
+    for name in prior.names:
+        values = np.array([each.get(name, term_of(name).absent) for each in drawn])
+        if name.startswith(_FRICTION):
+            values = values * np.exp(_FRICTION_CHANGE * random.standard_normal(arms))
+        if np.ptp(values) == 0.0 or (not name.startswith(_LINEAR) and values.min() <= 0.0):
+            supposed[name] = result.values.get(name, term_of(name).absent)
+        else:
+            draws[name] = values
+    belief = _of_draws(draws, seed)
+    return replace(belief, fixed=supposed | belief.fixed, learned=1)
 
 
 def _of_draws(draws: dict[str, Array], seed: int) -> Belief:

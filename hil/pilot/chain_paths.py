@@ -35,7 +35,7 @@ _WAY_POSES = 40
 class Paths:
     """The designed paths.
 
-    identify: optimised path. held_out: path around the same centre, with random phases.
+    identify: optimised path. held_out: wide path around the same centre, with random phases.
     """
 
     config: Config
@@ -69,7 +69,7 @@ class Paths:
                 known.base, known.prior, experiment.rate, experiment.period, experiment.band[1], limits
             )
             best = designer.design(experiment.seed)
-            other = designer.plain(best.centre, experiment.seed + 1)
+            other = designer.widest(best.centre, experiment.seed + 1)
         except ExcitationError as error:
             raise NoSafeTorque(
                 f"{config.path}: {error}. Widen position_limit, raise current_limit, correct [clearance], or give "

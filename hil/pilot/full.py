@@ -12,24 +12,17 @@ from hil.pilot.chain_search import identify_chain_in_steps
 from hil.pilot.search import Search, with_torque
 from hil.pilot.steps import Played, Player, Say
 from hil.plan.plan import ROLES
-from hil.results.result import SettledResult
+from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
 
-MOST_TRIES = 6
-"""Largest number of full runs if one exceeds a limit or does not settle; each has less torque than the one before."""
-
-_MOST_UNSETTLED = 0.1
-"""Largest experiment.settle_within that a repeated full run goes on to."""
-
-_BACK_OFF = 0.85
-"""Torque factor after a run that never settled: large motion with little friction may never settle."""
-
 
 def identify_in_steps(
-    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
+    config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, earlier: Result | None = None
 ) -> tuple[str, SettledResult]:
-    """Identify an arm from link lengths only. Returns the sentence about the torque state and the result.
+    """Identify an arm from link lengths only, or from an `earlier` result for the same arm.
+
+    Returns the sentence about the torque state and the result.
 
     Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
     """
@@ -38,7 +31,7 @@ def identify_in_steps(
     # A stop request in one step also cancels all later ones. Servo settings are saved and restored once for all steps,
     # because EEPROM wears.
     with StopRequest(), servo_session(config, run.path, say):
-        search = Search.of(config, run, Player(shown_path, watch, say))
+        search = Search.of(config, run, Player(shown_path, watch, say), earlier=earlier)
         played = _full(search, *search.find())
         run.write_starts([search.belief.middle])
         result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
@@ -50,10 +43,11 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
     """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle.
 
     Friction may hold an arm elsewhere in every period, however long it moves: each time more of that is accepted. The
-    fit does not need the periods to be equal, and the verdict says how well they are predicted.
+    fit does not need the periods to be equal, and the verdict says how well they are predicted. A period unlike the one
+    before counts as not settled too; if it happens again and again, something is wrong with the arm.
     """
-    run, say = search.run, search.player.say
-    number = 0
+    run, say, options = search.run, search.player.say, search.options
+    number = unlike = 0
     while True:
         number += 1
         chosen = with_torque(config, found.peak_torque)
@@ -62,23 +56,24 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         search.learn(chosen, played)
         if played.error is None:
             return played
-        if number == MOST_TRIES:
+        unlike += played.unlike_before
+        if number == options.max_full_runs or unlike == options.max_unlike_runs:
             raise played.error
         say("Repeating with less torque.")
         run.set_aside(f"stopped-{number}", chosen)
         if played.passed_limit:
             config, plan = search.held, found.plan
         else:
-            search.cap = _BACK_OFF * found.peak_torque
-            search.config = _tolerant(search.config)
+            search.cap = options.torque_after_unsettled * found.peak_torque
+            search.config = _tolerant(search.config, options.max_settle_within)
             config = search.held
             plan = search.waves(config)
         found = search.amplitude(config, 1.0, plan)
 
 
-def _tolerant(config: Config) -> Config:
+def _tolerant(config: Config, most: float) -> Config:
     """The configuration with other waves, and with periods that may differ twice as much."""
     experiment = config.experiment
-    within = min(2.0 * experiment.settle_within, max(experiment.settle_within, _MOST_UNSETTLED))
+    within = min(2.0 * experiment.settle_within, max(experiment.settle_within, most))
     update = {"seed": experiment.seed + len(ROLES), "settle_within": within}
     return config.model_copy(update={"experiment": experiment.model_copy(update=update)})

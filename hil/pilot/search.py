@@ -15,45 +15,18 @@ from hil.dry_run.prediction import GUARDED, predict
 from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.models.parameters import Physics
-from hil.pilot.belief import MOVED_STEPS, Belief, prior_belief
+from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
+from hil.pilot.breakaway import broke_free, narrowed, raised
 from hil.pilot.gains import falls_over, with_stabiliser
+from hil.pilot.options import PilotOptions
 from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
+from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 
 Array = NDArray[np.float64]
 
-ARMS = 96
-PILOT_SHARES = (0.45, 0.6, 0.75, 0.9)
-"""Fraction of the limits that successive pilots may use; the last one applies to all further pilots."""
-
-MOST_STEPS, MOST_PILOTS = 12, 10
-"""Largest number of runs before the full one, and of those in which not all joints have moved yet."""
-
-CERTAIN = 0.85
-"""Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
-
-_PILOT_PERIOD_SHARE = 0.5
-_PILOT_SETTLING = 1
-_AFTER_LIMIT = 0.85
-"""Cap on further torque, relative to the torque at which a limit was exceeded."""
-_MUCH_ROOM = 0.74
-"""Share of the position range used, of the joint that uses least, below which other waves are tried."""
-_OTHER_WAVES = 7
-"""How many at most: a wave with either sign of each joint, and all of these reversed in time."""
-_FALLING_RAISE = 1.35
-"""Largest ratio of torques of two runs of an arm that falls over when it is stopped."""
-_FALLING_SHARE = 0.85
-"""Share of the limits for an arm that falls over when it is stopped."""
-_LEAST_TORQUE = 0.05
-"""Torque that such an arm may get whatever it got before, as a share of what the current limit allows."""
-_INSIDE = 0.95
-"""Share of the limits within which an arm is assumed to start that a stopped run left beyond them."""
-_MOST_RAISE = 1.6
-_AT_LIMIT = 0.99
-_MORE, _LITTLE_MORE, _FAIR = 1.15, 1.03, 0.7
-"""Smallest torque increase that justifies another run, and the fraction of the limit from which the larger one applies.
-"""
+DEFAULTS = PilotOptions()
 
 
 @dataclass
@@ -74,11 +47,30 @@ class Search:
 
     springs: NDArray[np.bool_] | None = None
     """Joints that a stabiliser held (joints,)."""
+    options: PilotOptions = DEFAULTS
+    from_earlier: bool = False
+    """Whether the belief comes from an earlier run that no run so far has contradicted."""
+    earlier_swing: Array | None = None
+    """Range of motion of each joint in that run (joints,) [rad], if known."""
 
     @classmethod
-    def of(cls, config: Config, run: RunFolder, player: Player) -> "Search":
-        """Start a search from the prior. Raises ConfigError."""
-        return cls(config, run, player, prior_belief(config, ARMS))
+    def of(
+        cls,
+        config: Config,
+        run: RunFolder,
+        player: Player,
+        options: PilotOptions = DEFAULTS,
+        earlier: Result | None = None,
+    ) -> "Search":
+        """Start a search from the prior, or from the result of an earlier run on the same arm. Raises ConfigError."""
+        if earlier is None:
+            return cls(config, run, player, prior_belief(config, options.arms), options=options)
+        belief = earlier_belief(config, earlier, options.arms)
+        swing = None
+        if isinstance(earlier, SettledResult) and earlier.steps:
+            low, high = np.array(earlier.steps[-1].seen)[:2]
+            swing = high - low
+        return cls(config, run, player, belief, options=options, from_earlier=True, earlier_swing=swing)
 
     @property
     def held(self) -> Config:
@@ -98,12 +90,16 @@ class Search:
         self.steps.append(played.step)
         if config.stabiliser is not None:
             self.springs = np.array(config.stabiliser.stiffness) > 0.0  # a joint that had one keeps it
-        if played.passed_limit:
-            self.cap = _AFTER_LIMIT * played.step.peak_torque
+        if played.passed_limit and not broke_free(self.config, config, played.step.seen).any():
+            self.cap = self.options.torque_after_limit * played.step.peak_torque
+        if self.from_earlier and not (played.error is None and played.step.within):
+            self.from_earlier, self.earlier_swing = False, None
+            self.belief = prior_belief(self.config, self.options.arms)
+            self.player.say("The arm does not move as the earlier run predicts: starting from the prior instead.")
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
-        self.pose = _within_limits(self.config, played.seen.end)
+        self.pose = _within_limits(self.config, played.seen.end, self.options.start_inside)
         swing = played.seen.swing
         self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
 
@@ -120,12 +116,13 @@ class Search:
         If there is none, the amplitude of the last run is used, which the real arm has shown to be safe, or less if it
         was not. Raises NoSafeTorque if there was no run yet.
         """
-        ensemble = self.belief.ensemble(self._farther)
+        ensemble, options = self.belief.ensemble(self._farther), self.options
         cap = self.cap
         if falls_over(config, self.belief):
-            share *= _FALLING_SHARE
+            share *= options.falling_share
             if self.steps:
-                most = np.maximum(_FALLING_RAISE * self.steps[-1].peak_torque, _LEAST_TORQUE * most_torque(config))
+                least = options.min_falling_torque * most_torque(config)
+                most = np.maximum(options.falling_raise * self.steps[-1].peak_torque, least)
                 cap = most if cap is None else np.minimum(cap, most)
         try:
             return largest_amplitude(config, ensemble, share, plan, self.pose, cap)
@@ -134,66 +131,90 @@ class Search:
                 raise
         torque = self.steps[-1].peak_torque
         torque = torque if self.cap is None else np.minimum(torque, self.cap)
-        plan = with_peaks(config, torque) if plan is None else scaled(config, plan, torque)
-        return Amplitude(plan, torque, predict(config, plan, ensemble, pose=self.pose))
+        return self._with(config, with_peaks(config, torque) if plan is None else plan, torque)
+
+    def _with(self, config: Config, plan: Plan, torque: Array) -> Amplitude:
+        """The waves of `plan` with these peak torques (joints,) [N m], whether they are safe or not."""
+        plan = scaled(config, plan, torque)
+        return Amplitude(plan, torque, predict(config, plan, self.belief.ensemble(self._farther), pose=self.pose))
 
     @property
     def _farther(self) -> float:
         """Ratio of the allowed to the observed range of motion, for the joint with the most room."""
         allowed = np.ptp(np.array([joint.position_limit for joint in self.config.joints]), axis=1)
-        swing = np.zeros(len(allowed)) if self.swing is None else self.swing
+        swings = [each for each in (self.swing, self.earlier_swing) if each is not None]
+        swing = np.max(swings, axis=0) if swings else np.zeros(len(allowed))
         return float((allowed / np.maximum(swing, 0.02)).max())
 
     def _pilot(self) -> None:
-        """Play small runs until every joint moves."""
-        while len(self.steps) < MOST_PILOTS:
+        """Play small runs until every joint moves, with more torque from run to run, up to the current limits."""
+        options = self.options
+        while True:
             number = len(self.steps)
-            config = pilot_config(self.held)
-            found = self._pilot_amplitude(config, PILOT_SHARES[min(number, len(PILOT_SHARES) - 1)])
+            config, found = self._pilot_amplitude(pilot_config(self.held, options), number)
             self._play(config, f"pilot-{number + 1}", "Pilot" if number == 0 else f"Pilot {number + 1}", found)
             moved = self.moved
             if moved.all():
                 return
             still = [joint.name for joint, moves in zip(self.config.joints, moved, strict=True) if not moves]
-            if (found.peak_torque[~moved] >= _AT_LIMIT * most_torque(config)[~moved]).all():
+            at_limit = found.peak_torque[~moved] >= options.at_limit * most_torque(config)[~moved]
+            if at_limit.all() or len(self.steps) >= options.max_pilots:
                 self._give_up(config, still)
             self.player.say(
                 f"{_and(still)} did not move: friction is larger than this torque. Repeating with more torque."
             )
-        moved = self.moved
-        if not moved.all():
-            self._give_up(config, [j.name for j, m in zip(self.config.joints, moved, strict=True) if not m])
 
-    def _pilot_amplitude(self, config: Config, share: float) -> Amplitude:
-        """The safe amplitude of a pilot; a joint that has not moved yet gets only moderately more torque than before.
+    def _pilot_amplitude(self, config: Config, number: int) -> tuple[Config, Amplitude]:
+        """Configuration and amplitude of a pilot.
 
-        Just above static friction, motion grows quickly with torque, and a joint that stood still reveals little about
-        it.
+        A joint that has not moved yet gets moderately more torque than before. If that is too much for some plausible
+        arms, its position limits are brought close to where it is (hil.pilot.breakaway).
         """
-        found = self.amplitude(config, share)
+        options = self.options
+        share = options.pilot_shares[min(number, len(options.pilot_shares) - 1)]
+        if self.from_earlier:
+            share = max(share, options.pilot_share_known)
+        most, falls = most_torque(config), falls_over(config, self.belief)
+        try:
+            found = self.amplitude(config, share)
+        except NoSafeTorque:
+            if falls:
+                raise
+            torque = options.first_torque_share * most
+            every = np.ones(len(most), dtype=np.bool_)
+            return self._narrowed(config, every), self._with(config, with_peaks(config, torque), torque)
         if not self.steps:
-            return found
-        most = np.where(self.moved, np.inf, _MOST_RAISE * self.steps[-1].peak_torque)
-        if (found.peak_torque <= most).all():
-            return found
-        plan = scaled(config, found.plan, np.minimum(found.peak_torque, most))
-        torque = plan.segments[0].peak_torque
-        return Amplitude(plan, torque, predict(config, plan, self.belief.ensemble(self._farther), pose=self.pose))
+            return config, found
+        still = ~self.moved
+        ratio = options.falling_breakaway_raise if falls else options.breakaway_raise
+        wanted = raised(found.peak_torque, self.steps[-1].peak_torque, still, ratio, most)
+        if (wanted == found.peak_torque).all():
+            return config, found
+        risky = wanted > found.peak_torque
+        config = config if falls else self._narrowed(config, risky)
+        return config, self._with(config, found.plan, wanted)
+
+    def _narrowed(self, config: Config, at: NDArray[np.bool_]) -> Config:
+        pose = np.array(config.arm.rest_pose) if self.pose is None else self.pose
+        return narrowed(config, pose, at, self.options)
 
     def _raise_to_limits(self) -> tuple[Config, Amplitude]:
         """Play intermediate runs until the arm is known well enough to go straight to its limits."""
         config = self.held
         plan = self.waves(config)
         found = self.amplitude(config, 1.0, plan)
-        while not self._certain(config, found) and len(self.steps) < MOST_STEPS:
+        options, pilots = self.options, len(self.steps)
+        while not self._certain(config, found) and len(self.steps) - pilots < options.max_steps:
             self.player.say(
                 "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
             )
             number = len(self.steps) + 1
-            self._play(step_config(config), f"step-{number}", f"Step {number}", only_first(found))
+            self._play(step_config(config, options), f"step-{number}", f"Step {number}", only_first(found, options))
             former, config = found.peak_torque, self.held
             found = self.amplitude(config, 1.0, self.waves(config) if config.stabiliser is not None else plan)
-            if (found.peak_torque <= (_MORE if self._shares(found).min() > _FAIR else _LITTLE_MORE) * former).all():
+            is_fair = self._shares(found).min() > options.fair_share
+            worthwhile = options.worthwhile_raise if is_fair else options.worthwhile_raise_far
+            if (found.peak_torque <= worthwhile * former).all():
                 break  # the updated belief allows hardly more torque
         return config, self._roomiest(config, found)
 
@@ -202,13 +223,14 @@ class Search:
 
         A little more torque may throw some of the arms over: with other waves that comes later, or to the other side.
         """
-        limited = (found.peak_torque >= _AT_LIMIT * most_torque(config)).all() or self.cap is not None
-        if limited or config.experiment.design == "optimal" or used_range(found).min() >= _MUCH_ROOM:
+        options = self.options
+        limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
+        if limited or config.experiment.design == "optimal" or used_range(found).min() >= options.wide_range:
             return found
-        for plan in roomy_plans(config, Physics.of(self.belief.middle), 1 + _OTHER_WAVES)[1:]:
+        for plan in roomy_plans(config, Physics.of(self.belief.middle), 1 + options.other_waves)[1:]:
             other = self.amplitude(config, 1.0, plan)
             found = max(found, other, key=lambda each: float(used_range(each).min()))
-            if used_range(found).min() >= _MUCH_ROOM:
+            if used_range(found).min() >= options.wide_range:
                 break
         return found
 
@@ -232,10 +254,11 @@ class Search:
         return roomy_plan(config, arm)
 
     def _certain(self, config: Config, found: Amplitude) -> bool:
-        shares = self._shares(found)
-        full = found.peak_torque >= _AT_LIMIT * most_torque(config)
-        capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= _AT_LIMIT * self.cap
-        enough = CERTAIN * (_FALLING_SHARE if falls_over(config, self.belief) else 1.0)
+        shares, options = self._shares(found), self.options
+        full = found.peak_torque >= options.at_limit * most_torque(config)
+        capped = np.zeros_like(full) if self.cap is None else found.peak_torque >= options.at_limit * self.cap
+        certain = options.certain_share_known if self.from_earlier else options.certain_share
+        enough = certain * (options.falling_share if falls_over(config, self.belief) else 1.0)
         return bool(((shares >= enough) | full | capped).all())
 
     @staticmethod
@@ -263,15 +286,15 @@ def used_range(found: Amplitude) -> Array:
     return used
 
 
-def pilot_config(config: Config) -> Config:
+def pilot_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
     """A pilot's configuration: half the period if the band allows it, no held-out multisine, no waiting for steady
     state.
     """
     experiment = config.experiment
-    update: dict[str, Any] = {"held_out": False, "peak_torque": None, "periods": 1}
-    update["max_settling_periods"] = min(experiment.max_settling_periods, _PILOT_SETTLING)
+    update: dict[str, Any] = {"held_out": False, "peak_torque": None, "periods": 1, "warm_up": 0.0}
+    update["max_settling_periods"] = min(experiment.max_settling_periods, options.max_pilot_settling)
     if experiment.band is not None:
-        samples = round(experiment.samples * _PILOT_PERIOD_SHARE)
+        samples = round(experiment.samples * options.pilot_period_share)
         period = samples / experiment.rate
         low, high = experiment.band
         update |= {"period": period, "band": [max(low, 1 / period), high]}
@@ -283,16 +306,18 @@ def _from_anywhere(config: Config) -> Config:
     return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_tolerance": 2 * np.pi})})
 
 
-def _within_limits(config: Config, pose: Array) -> Array:
+def _within_limits(config: Config, pose: Array, inside: float) -> Array:
     """A pose beyond a limit, where a stopped run may leave the arm, moved to it: the next run begins by moving in."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    return np.asarray(np.clip(pose, middle - _INSIDE * half, middle + _INSIDE * half))
+    return np.asarray(np.clip(pose, middle - inside * half, middle + inside * half))
 
 
-def only_first(found: Amplitude) -> Amplitude:
+def only_first(found: Amplitude, options: PilotOptions = DEFAULTS) -> Amplitude:
     """The same amplitude with only the first multisine."""
-    plan = replace(found.plan.first_segment(), max_settling_periods=_PILOT_SETTLING, periods=1)
+    plan = replace(
+        found.plan.first_segment(), max_settling_periods=options.max_pilot_settling, periods=1, warm_up_periods=0
+    )
     return Amplitude(plan, found.peak_torque, found.prediction)
 
 
@@ -302,10 +327,10 @@ def with_torque(config: Config, peak_torque: Array) -> Config:
     return config.model_copy(update={"experiment": experiment})
 
 
-def step_config(config: Config) -> Config:
+def step_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
     """The configuration without the second multisine and without waiting for a steady motion."""
-    settling = min(config.experiment.max_settling_periods, _PILOT_SETTLING)
-    update = {"held_out": False, "max_settling_periods": settling, "periods": 1}
+    settling = min(config.experiment.max_settling_periods, options.max_pilot_settling)
+    update = {"held_out": False, "max_settling_periods": settling, "periods": 1, "warm_up": 0.0}
     return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
 
 

@@ -23,6 +23,8 @@ from hil.runs.run_folder import RunFolder
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
 
+_AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY)
+
 
 @dataclass(frozen=True)
 class Step:
@@ -80,7 +82,12 @@ class Played:
     @property
     def passed_limit(self) -> bool:
         """Whether the guard stopped the run at a motion limit."""
-        return isinstance(self.error, SafetyStop) and self.error.cause is not Cause.UNEXPECTED
+        return isinstance(self.error, SafetyStop) and self.error.cause in _AT_A_LIMIT
+
+    @property
+    def unlike_before(self) -> bool:
+        """Whether the run was stopped because its motion did not repeat."""
+        return isinstance(self.error, SafetyStop) and self.error.cause is Cause.UNLIKE_BEFORE
 
 
 @dataclass(frozen=True)
@@ -95,7 +102,7 @@ class Player:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
         Raises what a run raises, except errors that are informative about the arm: limit exceeded, no motion, no steady
-        motion.
+        motion, a period unlike the one before.
         """
         torque, error = "", None
         try:
@@ -121,10 +128,10 @@ class Player:
 
 def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
-    motion.
+    motion, a period unlike the one before.
     """
     if isinstance(error, SafetyStop):
-        return error.cause in (Cause.POSITION, Cause.VELOCITY)
+        return error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE
     return isinstance(error, NotSettled | DidNotMove)
 
 

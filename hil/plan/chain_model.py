@@ -53,7 +53,14 @@ def known_chain(config: Config) -> KnownChain:
     gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
     base = BaseParameters.of(Chain(*arm.geometry, gravity))
     rotors = np.full(len(arm.joints), ARMATURE)
-    return KnownChain(base, Prior.of(base, arm.parameters), np.column_stack((arm.parameters, rotors)).reshape(-1))
+    unsure = torque_constant_stds(config)
+    prior = Prior.of(base, arm.parameters, scale_std=unsure if unsure.any() else None)
+    return KnownChain(base, prior, np.column_stack((arm.parameters, rotors)).reshape(-1))
+
+
+def torque_constant_stds(config: Config) -> Array:
+    """Relative standard deviation of each joint's torque constant (joints,), 0 where the configuration gives none."""
+    return np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
 
 
 def described_torque(config: Config, known: KnownChain) -> ChainTorque:

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.drivers.bus import CHECK_S
 from hil.errors import ConfigError
 from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
+from hil.plan.stabiliser import check_rate
 
 IDENTIFY, HELD_OUT = "identify", "held_out"
 ROLES = (IDENTIFY, HELD_OUT)
@@ -67,10 +69,13 @@ class Plan:
     rest_samples: int
     end_samples: int
     brake_samples: int
+    """Largest number of exchanges during which a stop brakes."""
     max_settling_periods: int
     periods: int
     settle_within: float
     drift_within: float
+    warm_up_periods: int = 0
+    """Number of periods of the first multisine that are played before those that may be used."""
     lower_samples: int = 0
     """Largest number of samples for lowering a spatial arm after a stop."""
 
@@ -83,13 +88,19 @@ class Plan:
         """Largest possible number of samples."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played + 2 * self.end_samples + self.brake_samples + self.lower_samples
+        still = self.rest_samples + 2 * self.end_samples
+        return still + self.warm_up_samples + played + self.brake_samples + self.lower_samples
+
+    @property
+    def warm_up_samples(self) -> int:
+        """Number of samples of the warm-up."""
+        return self.warm_up_periods * len(self.segments[0].period_current)
 
     @property
     def expected(self) -> int:
         """Number of samples if the second period is already settled, as on most arms."""
         played = sum((1 + self.periods) * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        return self.rest_samples + played
+        return self.rest_samples + self.warm_up_samples + played
 
 
 def scaled(config: Config, plan: Plan, peak_torque: NDArray[np.float64]) -> Plan:
@@ -120,6 +131,7 @@ def make_plan(config: Config) -> Plan:
 
 def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) -> Plan:
     """Make a plan whose segments are designed by `segment`, each for its role and with its own seed."""
+    check_rate(config)
     experiment = config.experiment
     roles = ROLES if experiment.held_out else (IDENTIFY,)
     return Plan(
@@ -127,11 +139,12 @@ def plan_with(config: Config, segment: Callable[[Config, str, int], Segment]) ->
         segments=tuple(segment(config, role, experiment.seed + offset) for offset, role in enumerate(roles)),
         rest_samples=max(1, round(experiment.rest * experiment.rate)),
         end_samples=_end_samples(config),
-        brake_samples=round(config.safety.damp_time * experiment.rate),
+        brake_samples=round(config.safety.damp_time / min(1 / experiment.rate, CHECK_S)),
         max_settling_periods=experiment.max_settling_periods,
         periods=experiment.periods,
         settle_within=experiment.settle_within,
         drift_within=experiment.drift_within,
+        warm_up_periods=experiment.warm_up_periods,
     )
 
 

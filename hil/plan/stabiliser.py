@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
+from hil.errors import ConfigError
 from hil.estimator.simulation.closed_loop import Feedback
 from hil.results.parts import StabiliserShare
+
+DELAY_SAMPLES = 1.5
+"""Mean age of the state that a torque is based on: it is one sample old when sent, and is held for one more."""
 
 
 class Stabiliser:
@@ -39,6 +44,37 @@ class Stabiliser:
             if not former.missing[index]:
                 added[index] = spring * (pose - former.position[index]) - damper * former.velocity[index]
         return [wanted + more for wanted, more in zip(goal, added, strict=True)]
+
+
+def too_slow(config: Config) -> str:
+    """Why the rate is too low for the stabiliser, and what to do; "" if it is not.
+
+    A spring that acts `delay` late drives the motion like a negative damper of stiffness times `delay`. Damping, the
+    configured one and the typical viscous friction of the servo, must outweigh it, or the joint oscillates.
+    """
+    if config.stabiliser is None:
+        return ""
+    rate = config.experiment.rate
+    for joint, stiffness, damping in zip(
+        config.joints, config.stabiliser.stiffness, config.stabiliser.damping, strict=True
+    ):
+        drives = DELAY_SAMPLES / rate * stiffness
+        damps = damping + len(joint.ids) * servo_prior(joint.joint.servo).viscous.median
+        if drives > damps:
+            return (
+                f"experiment.rate = {rate:g} is too low for the stabiliser of joint {joint.name!r}: its torque is "
+                f"based on a state {1e3 * DELAY_SAMPLES / rate:.0f} ms old. A stiffness of {stiffness:g} N m/rad then "
+                f"drives oscillations like a damping of -{drives:.2g} N m s/rad; only {damps:.2g}, including "
+                f"friction, opposes it. At least {rate * drives / damps:.0f} Hz is needed; or lower "
+                "stabiliser.stiffness, or raise stabiliser.damping."
+            )
+    return ""
+
+
+def check_rate(config: Config) -> None:
+    """Raise ConfigError if the rate is too low for the stabiliser."""
+    if why := too_slow(config):
+        raise ConfigError(f"{config.path}: {why}")
 
 
 def feedback_of(config: Config) -> Feedback:

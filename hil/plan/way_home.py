@@ -29,7 +29,7 @@ _ALLOWED_M = 0.001
 
 
 class WayHome:
-    """Computes ways to the rest pose. Created before torque is switched on."""
+    """Plans paths to the rest pose. Created before torque is switched on."""
 
     def __init__(self, config: Config, plan: Plan) -> None:
         segment = plan.segments[0]

@@ -55,9 +55,11 @@ def _verdict(shown: _Shown) -> Section:
     return Section("verdict", title, tone=tone, bullets=(*sentences, *warnings, *notes))
 
 
-def _prediction(shown: _Shown) -> Section:
-    """The longest recording: position and what the model leaves of it."""
+def _prediction(shown: _Shown) -> Section | None:
+    """The longest recording: position and what the model leaves of it; None if nothing was simulated."""
     longest = max(shown.recordings, key=lambda each: each.time.size)
+    if not np.isfinite(longest.predicted).any():
+        return None
     pictures = []
     for joint, facts in enumerate(shown.model.joints):
         time, error = longest.time - longest.time[0], longest.position[joint] - longest.predicted[joint]

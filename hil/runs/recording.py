@@ -39,6 +39,7 @@ class Phase(IntEnum):
     COMING_TO_REST = 5
     BRAKING = 6
     LOWERING = 7
+    WARM_UP = 8
 
 
 def sample_type(joints: int) -> np.dtype[np.void]:

@@ -17,6 +17,7 @@ from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
+from hil.plan.stabiliser import too_slow
 from hil.setup.bus_rate import check_rate, goals_taken
 from hil.setup.others import others_on_the_bus
 from hil.setup.servo_session import recover
@@ -54,6 +55,8 @@ def check_arm(config: Config) -> Iterator[Finding]:
         return
     with bus:
         yield Finding(Level.OK, bus.port.url, "port", f"opened at {config.port.baud} baud")
+        if why := too_slow(config):
+            yield Finding(Level.STOP, "stabiliser", "rate", f"{config.experiment.rate:g} Hz", why)
         yield _latency_timer(bus)
         yield from _others(config, bus)
         all_well = True

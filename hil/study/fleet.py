@@ -1,5 +1,6 @@
-"""Comparison of many arms of one type: how much they differ, and which ones are outliers."""
+"""Comparison of many arms: how much those of one type differ, and which ones are outliers."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,9 @@ UNLIKE = 4.0
 """Threshold for an outlier: robust standard deviations from the fleet's median."""
 
 _PREFIX, _SUFFIX = "parameters.", ".value"
+_TYPE, _TRUST = "arm_type", "verdict.trust"
+
+Floats = np.ndarray[tuple[int], np.dtype[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -34,45 +38,87 @@ class Unlike:
 
 
 @dataclass(frozen=True)
-class Fleet:
-    """Comparison of a fleet; unlike: outliers, largest first; empty if there are too few arms."""
+class FleetArm:
+    """One arm of the fleet: its recording, its verdict, and its parameters in the order of `Fleet.spreads` [SI].
 
-    arms: int
+    deviations: distance from the median in combined standard deviations, in the same order; NaN where not identified.
+    """
+
+    recording: str
+    trust: str
+    values: tuple[float, ...]
+    deviations: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Comparison of the arms of one type; spreads and unlike (outliers, largest first) are empty for too few arms."""
+
+    type: str
+    arms: tuple[FleetArm, ...]
     spreads: tuple[FleetSpread, ...]
     unlike: tuple[Unlike, ...]
 
 
-def fleet(table: pa.Table) -> Fleet:
-    """Compare the rows of a study with task = "estimate"; arms that could not be estimated are ignored.
+def fleets(table: pa.Table) -> list[Fleet]:
+    """Compare the rows of a study with task = "estimate", arms of each type (their servos) among themselves.
+
+    Arms that could not be estimated are ignored. The largest fleet comes first.
+    """
+    types = _texts(table, _TYPE)
+    known = [name for name, _ in Counter(each for each in types if each).most_common()] or [""]
+    return [_fleet(name, table.filter(pa.array([each == name for each in types]))) for name in known]
+
+
+def _fleet(kind: str, table: pa.Table) -> Fleet:
+    """Compare arms of one type.
 
     An arm's standard error is added to the fleet's spread, so that a poor recording does not count as an outlier.
     """
-    names = [name[len(_PREFIX) : -len(_SUFFIX)] for name in table.column_names if _is_value(name)]
-    recordings = table.column("recording").to_pylist() if "recording" in table.column_names else []
-    spreads, unlike, arms = [], [], 0
-    for name in names:
+    recordings, trusts = _texts(table, "recording"), _texts(table, _TRUST)
+    spreads, values, deviations = [], [], []
+    for name in [column[len(_PREFIX) : -len(_SUFFIX)] for column in table.column_names if _is_value(column)]:
         value = _numbers(table, f"{_PREFIX}{name}{_SUFFIX}")
         known = np.isfinite(value)
-        arms = max(arms, int(known.sum()))
         if known.sum() < FEWEST_ARMS:
             continue
         median = float(np.median(value[known]))
         spread = float(_MAD_TO_STD * np.median(np.abs(value[known] - median)))
         spreads.append(FleetSpread(name, median, spread))
-        std = np.nan_to_num(_numbers(table, f"{_PREFIX}{name}.std"), nan=0.0)
-        scale = np.hypot(spread, std)
-        for arm in np.flatnonzero(known & (np.abs(value - median) > UNLIKE * scale)):
-            deviations = float((value[arm] - median) / scale[arm]) if scale[arm] else np.inf
-            unlike.append(Unlike(str(recordings[arm]), name, float(value[arm]), median, deviations))
+        values.append(value)
+        deviations.append(_deviations(value - median, spread, _numbers(table, f"{_PREFIX}{name}.std")))
+    arms = [
+        FleetArm(recording, trust, tuple(float(v[row]) for v in values), tuple(float(d[row]) for d in deviations))
+        for row, (recording, trust) in enumerate(zip(recordings, trusts, strict=True))
+        if not spreads or any(np.isfinite(v[row]) for v in values)
+    ]
+    unlike = [
+        Unlike(arm.recording, spread.name, value, spread.median, deviation)
+        for arm in arms
+        for spread, value, deviation in zip(spreads, arm.values, arm.deviations, strict=True)
+        if abs(deviation) > UNLIKE
+    ]
     unlike.sort(key=lambda each: -abs(each.deviations))
-    return Fleet(arms, tuple(spreads), tuple(unlike))
+    return Fleet(kind, tuple(arms), tuple(spreads), tuple(unlike))
+
+
+def _deviations(away: Floats, spread: float, std: Floats) -> Floats:
+    scale = np.hypot(spread, np.nan_to_num(std, nan=0.0))
+    same = np.where(away == 0.0, 0.0, np.copysign(np.inf, away))
+    return np.asarray(np.divide(away, scale, out=same, where=scale > 0.0))
 
 
 def _is_value(name: str) -> bool:
     return name.startswith(_PREFIX) and name.endswith(_SUFFIX)
 
 
-def _numbers(table: pa.Table, name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _texts(table: pa.Table, name: str) -> list[str]:
+    if name not in table.column_names:
+        return [""] * table.num_rows
+    return ["" if each is None else str(each) for each in table.column(name).to_pylist()]
+
+
+def _numbers(table: pa.Table, name: str) -> Floats:
     if name not in table.column_names:
         return np.full(table.num_rows, np.nan)
     return np.array([np.nan if each is None else float(each) for each in table.column(name).to_pylist()])

@@ -10,10 +10,12 @@ from jinja2 import Environment, StrictUndefined
 from hil import __version__
 from hil.errors import RunFolderError
 from hil.study.figures import QUANTILES, Figures, figures
-from hil.study.fleet import fleet
+from hil.study.fleet import UNLIKE, fleets
 
 FILE_NAME = "study.html"
 _BINS = 24
+_MOST_ARMS = 200
+"""Rows of a fleet's table on the page; the dataset has all."""
 _MANY = 100
 """Values from which on the outermost hundredths are left out of a histogram."""
 
@@ -28,7 +30,9 @@ def write_page(table: pa.Table, title: str, path: Path) -> Figures:
     text = template.render(
         title=title,
         figures=found,
-        fleet=fleet(table) if "recording" in table.column_names else None,
+        fleets=fleets(table) if "recording" in table.column_names else [],
+        unlike_from=UNLIKE,
+        most_arms=_MOST_ARMS,
         histograms=histograms,
         quantiles=[f"{100 * share:g} %" for share in QUANTILES],
         version=__version__,

@@ -29,7 +29,7 @@ DEFAULT_COLUMNS = {
     "fault": ("fault.*",),
     "empty": ("*",),
 }
-DEFAULT_COLUMNS["estimate"] = (*DEFAULT_COLUMNS["identify"], "recording", "config")
+DEFAULT_COLUMNS["estimate"] = (*DEFAULT_COLUMNS["identify"], "recording", "arm_type", "config")
 
 
 @dataclass(frozen=True)

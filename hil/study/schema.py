@@ -20,15 +20,34 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainValidator,
+    PositiveFloat,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from hil.errors import ConfigError
-from hil.toml_errors import describe
+from hil.toml_errors import UNSAID, describe
 
 Task = Literal["identify", "dry_run", "fault", "estimate", "empty"]
 ON_ARM: tuple[Task, ...] = ("identify", "dry_run", "fault")
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
-Scalar = bool | int | float | str
+
+
+def _scalar(value: Any) -> bool | int | float | str:
+    if isinstance(value, bool | int | float | str):
+        return value
+    raise ValueError("must be a number, text in quotes, true or false")
+
+
+Scalar = Annotated[bool | int | float | str, PlainValidator(_scalar)]
 
 MOST_RUNS = 10_000_000
 
@@ -102,12 +121,29 @@ class EngineTable(_Table):
     run_seconds: PositiveFloat = Field(3600.0, description="processor time after which a run counts as failed")
 
 
+def _values(value: Any) -> Any:
+    if isinstance(value, list | dict | Draw):
+        return value
+    raise ValueError("must be a list of values or a draw such as { uniform = [0.1, 0.2] }")
+
+
+def _list_or_draw(value: Any) -> str:
+    return f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}draw"
+
+
+Varied = Annotated[
+    Annotated[list[Scalar], Tag(f"{UNSAID}list")] | Annotated[Draw, Tag(f"{UNSAID}draw")],
+    Discriminator(_list_or_draw),
+    BeforeValidator(_values),
+]
+
+
 class Study(_Table):
     """The complete study. `path` is the file it was read from."""
 
     path: Path = Field(exclude=True)
     study: StudyTable
-    vary: dict[str, list[Scalar] | Draw] = {}
+    vary: dict[str, Varied] = {}
     keep: KeepTable = KeepTable()
     engine: EngineTable = EngineTable()
 

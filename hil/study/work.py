@@ -79,7 +79,7 @@ def work(spec: Spec) -> Row:
 
 
 def lost_row(spec: Spec, error: BaseException | None) -> Row:
-    """The row of a run that never came back, because it took its workers with it."""
+    """Return the row of a run that returned no result because every worker that tried it died."""
     why = RuntimeError("no worker brought it to an end") if error is None else error
     if type(error).__name__ == "KilledWorker":
         why = MemoryError("every worker that tried it died: it needs more than engine.worker_memory_gib, or crashes")
@@ -236,4 +236,6 @@ def _estimated(spec: Spec, folder: Path) -> Any:
     for path in source.iterdir():
         if path.is_file() and path.name not in ("result.json", "report.html", "period.npz"):
             shutil.copy2(path, copy / path.name)
-    return {"recording": str(source), **estimate_run(RunFolder.open(copy)).to_json()}
+    run = RunFolder.open(copy)
+    kind = ", ".join(each.model for each in run.load_config().joints)
+    return {"recording": str(source), "arm_type": kind, **estimate_run(run).to_json()}

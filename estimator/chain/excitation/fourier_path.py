@@ -4,6 +4,9 @@ The arm is driven with the torque that an approximate model requires for the pat
 The series is optimised for the purpose of the result: to predict the torque of other motions in the same range, for the
 worst joint. The criterion includes all unknowns of the regression, friction and offsets too: if a joint moves little,
 its gravity torque cannot be distinguished from an offset, which a criterion on inertial parameters alone would miss.
+
+This designer is for a box of angles and speeds that the user has chosen ([joint_path]); nothing else limits the path.
+Where the box is to be found too, within limits of torque and clearance, `path_design` chooses it.
 """
 
 from dataclasses import dataclass
@@ -65,14 +68,18 @@ class Box:
         return Path(self.centre[:, None] + scale * position, scale * velocity, scale * acceleration)
 
     def draw(self, rng: np.random.Generator) -> NDArray[np.complex128]:
-        """Return coefficients (joints, harmonics) with random phases and amplitudes.
+        """Return random coefficients (joints, harmonics)."""
+        return random_lines(rng, self.centre.size, self.harmonics)
 
-        The spectra of some joints are steep, for slow and wide motions; those of others are flat, for fast ones.
-        """
-        shape = self.centre.size, self.harmonics
-        slower = np.arange(1, self.harmonics + 1) ** -rng.uniform(0.0, STEEPEST, (self.centre.size, 1))
-        lines = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-        return (slower * lines).astype(np.complex128)
+
+def random_lines(rng: np.random.Generator, joints: int, harmonics: int) -> NDArray[np.complex128]:
+    """Return Fourier coefficients (joints, harmonics) with random phases and amplitudes.
+
+    The spectra of some joints are steep, for slow and wide motions; those of others are flat, for fast ones.
+    """
+    slower = np.arange(1, harmonics + 1) ** -rng.uniform(0.0, STEEPEST, (joints, 1))
+    lines = rng.standard_normal((joints, harmonics)) + 1j * rng.standard_normal((joints, harmonics))
+    return (slower * lines).astype(np.complex128)
 
 
 def design_path(

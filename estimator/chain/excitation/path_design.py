@@ -4,6 +4,10 @@ An evolution strategy (a mean that moves towards the better half of random varia
 Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite Fourier series of
 `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is scaled to the
 limits of position and speed and then shrunk until `allowed` accepts it.
+
+This designer serves the pilot, which knows only limits: it chooses the centre and the width of the motion too. For a
+box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of other motions in
+that box, needs the box to be given.
 """
 
 from collections.abc import Callable
@@ -12,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.excitation.fourier_path import Path
+from hil.estimator.chain.excitation.fourier_path import Path, random_lines
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.errors import ExcitationError
@@ -20,6 +24,7 @@ from hil.estimator.errors import ExcitationError
 LOOKED_AT = 120  # samples at which a variation is evaluated
 NOISE = 0.02  # assumed residual of a regression, relative to a joint's RMS torque
 CENTRES = 48
+WIDEST_OF = 12
 OFFSPRING, PARENTS = 20, 6
 GENERATIONS = 60
 FIRST_STEP, FASTER, SLOWER = 0.3, 1.1, 0.9
@@ -140,9 +145,21 @@ class PathDesigner:
             )
         return best[1], best[2]
 
+    def widest(self, centre: Array, seed: int, tries: int = WIDEST_OF) -> Design:
+        """Return the random path about a centre whose least moved joint moves most, for validation.
+
+        A prediction cannot be seen to be more exact than encoder rounding relative to the motion. Raises
+        ExcitationError if no path is allowed.
+        """
+        random = np.random.default_rng(seed)
+        found = [self._finished(centre, self._random_lines(random)) for _ in range(tries)]
+        allowed = [design for design in found if design is not None]
+        if not allowed:
+            raise ExcitationError("no path about this centre stays within the limits of torque and clearance")
+        return max(allowed, key=lambda design: float(design.path.position.std(axis=1).min()))
+
     def _random_lines(self, random: np.random.Generator) -> Array:
-        shape = self._joints, self._count
-        return np.asarray(random.standard_normal(shape) + 1j * random.standard_normal(shape))
+        return np.asarray(random_lines(random, self._joints, self._count))
 
     def _score(self, vector: Array) -> float:
         path = self._fitted(*self._split(vector), self._few)

@@ -88,6 +88,11 @@ class ChainCoordinates:
         return index, np.log(pairs[:, 0]), pairs[:, 1]
 
     @cached_property
+    def torque_scales(self) -> npt.NDArray[np.int64]:
+        """Indices of the torque scales, in the order of the joints."""
+        return np.flatnonzero([kind == "torque_scale" for kind in self._kinds])
+
+    @cached_property
     def _kinds(self) -> tuple[str, ...]:
         return tuple(kind_of(name) for name in self.names)
 

@@ -7,7 +7,7 @@ follow any motion but carry little information; soft gains carry nearly as much 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,17 @@ from hil.estimator.options import MinimiserOptions
 from hil.estimator.simulation.drive import torque_and_slopes
 
 MINIMISER = MinimiserOptions()
+MOST_KEPT = 1 << 26  # bytes of derivatives
+
+
+@dataclass
+class _Latest:
+    """The latest simulation with derivatives: at the end of a fit, the covariance needs that of the minimum again."""
+
+    x: Array | None = None
+    parts: dict[int, list[tuple[slice, Array, Array]]] = field(default_factory=dict)
+    """Samples, residuals and derivatives of each period that was simulated to its end."""
+    size: int = 0
 
 
 @dataclass(frozen=True)
@@ -47,8 +58,12 @@ class ChainProblem:
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
     """Number of smaller integration steps that replace one where a joint may be near standstill."""
+    every: int = 1
+    """Only every so many samples are compared, with integration steps as many times as long; above 1 only if
+    `steps` is 1."""
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
+    _latest: _Latest = field(init=False, repr=False, compare=False, default_factory=_Latest)
 
     @property
     def count(self) -> int:
@@ -72,17 +87,24 @@ class ChainProblem:
             period.torque, period.rate, period.command_to_sample, self.steps, delay=delay, lag=lag
         )
         return ChainRun(
-            np.ascontiguousarray(np.moveaxis(torque, 0, 2)),
-            np.ascontiguousarray(np.transpose(slopes, (2, 3, 0, 1))),
-            np.ascontiguousarray(period.position.T),
-            1.0 / (period.rate * self.steps),
+            self._thinned(np.moveaxis(torque, 0, 2)),
+            self._thinned(np.transpose(slopes, (2, 3, 0, 1))),
+            np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every]),
+            self.every / (period.rate * self.steps),
             self.finer,
         )
+
+    def _thinned(self, of_steps: Array) -> Array:
+        """Return the means over each `every` samples of what stands for each step (samples, steps, ...)."""
+        if self.every > 1:
+            whole = of_steps[: len(of_steps) // self.every * self.every]
+            of_steps = whole.reshape(-1, self.every, *of_steps.shape[1:]).mean(axis=1)
+        return np.ascontiguousarray(of_steps)
 
     def gain(self, period: SettledPeriod) -> Array:
         """Return the gains of the critically damped observer (2, joints) [1, 1/s] per sample."""
         turn = 2.0 * np.pi * self.softness
-        gains = np.array([2.0 * turn, turn * turn]) / period.rate
+        gains = np.array([2.0 * turn, turn * turn]) * self.every / period.rate
         return np.repeat(gains[:, None], period.joints, axis=1)
 
     def evaluate(self, x: Array) -> Quadratic:
@@ -98,7 +120,7 @@ class ChainProblem:
             for part, r, J in self._pieces(x, index, period, parameters):
                 if r is None:
                     return Quadratic(np.inf, normal, gradient)
-                square = np.square(weight[part]).reshape(-1)
+                square = np.square(weight[:: self.every][part]).reshape(-1)
                 found = normal_equations(J.reshape(-1, slopes.size), r.reshape(-1), square)
                 J_J, J_r = J_J + found[0], J_r + found[1]
                 cost += float(square @ r.reshape(-1) ** 2)
@@ -174,10 +196,6 @@ class ChainProblem:
             every[:, where] = jacobian[:, joint]
             yield residual[:, joint], every
 
-    def softer(self, softness: float) -> "ChainProblem":
-        """Return the same problem with another natural frequency of the observer [Hz]."""
-        return replace(self, softness=softness)
-
     def _pieces(
         self, x: Array, index: int, period: SettledPeriod, parameters: dict[str, float]
     ) -> Iterator[tuple[slice, Array | None, Array]]:
@@ -186,15 +204,28 @@ class ChainProblem:
         The residuals, predicted minus measured (samples, joints) [rad], are 0 where a sample is missing, and None if
         the motion diverges. The derivatives are by parameters and initial state.
         """
+        latest = self._latest
+        if latest.x is None or not np.array_equal(latest.x, x):
+            latest.x, latest.parts, latest.size = x.copy(), {}, 0
+        if index in latest.parts:
+            yield from latest.parts[index]
+            return
         run = self.run_of(period, parameters)
         names = self.coordinates.names
         simulation = Simulation(self.model.base, parameters, self.start(x, index), self.gain(period), names)
-        for part in pieces(period.samples):
+        kept = []
+        for part in pieces(len(run.measured)):
             position, derivative = simulation.go_on(run, part)
             if position is None:
                 yield part, None, derivative
                 return
-            yield part, np.where(period.valid.T[part], position - run.measured[part], 0.0), derivative
+            r = np.where(np.isnan(run.measured[part]), 0.0, position - run.measured[part])
+            yield part, r, derivative
+            latest.size += derivative.nbytes
+            if latest.size < MOST_KEPT:
+                kept.append((part, r, derivative))
+        if latest.size < MOST_KEPT:
+            latest.parts[index] = kept
 
     def _where(self, x: Array, index: int) -> tuple[list[int], Array]:
         """Return the coordinates on which a period's motion depends, and the slopes of parameters and state by them."""
@@ -215,4 +246,10 @@ class ChainProblem:
         away = (x[shapes] - likely) / spread
         normal[shapes, shapes] += 1.0 / spread**2
         gradient[shapes] += away / spread
-        return float(miss @ miss) + float(away @ away)
+        cost = float(miss @ miss) + float(away @ away)
+        precision, scales = self.prior.scale_precision, self.coordinates.torque_scales
+        if precision is not None and scales.size:
+            normal[np.ix_(scales, scales)] += precision
+            gradient[scales] += precision @ x[scales]  # the coordinates are logarithms
+            cost += float(x[scales] @ precision @ x[scales])
+        return cost

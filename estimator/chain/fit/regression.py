@@ -29,7 +29,7 @@ def fit_filtered(
     cutoff: cut-off frequency of the filter [Hz]. delay: delay of the torque [s]. Raises RecordingError if the recording
     cannot be filtered.
     """
-    rows = [_rows(recording, model, cutoff, delay) for recording in recordings]
+    rows = [filtered_torque(recording, model, cutoff, delay) for recording in recordings]
     Y = np.concatenate([columns for columns, _ in rows], axis=1)
     tau = np.concatenate([torque for _, torque in rows], axis=1)
     left = np.maximum(np.sqrt(np.mean(tau**2, axis=1)), 1e-9)
@@ -39,7 +39,8 @@ def fit_filtered(
     return theta, std
 
 
-def _rows(recording: Recording, model: ChainModel, cutoff: float, delay: float) -> tuple[Array, Array]:
+def filtered_torque(recording: Recording, model: ChainModel, cutoff: float, delay: float) -> tuple[Array, Array]:
+    """Return the filtered regressor of `ChainModel.linear_names` (joints, rows, names) and torque (joints, rows)."""
     position, torque, dt = uniform(recording, delay)
     trim = int(np.ceil(TRIM / (cutoff * dt)))
     keep = max(1, int(1.0 / (PER_CYCLE * cutoff * dt)))

@@ -45,6 +45,8 @@ class ChainOptions:
     """
     lost: float = 1.5
     """Cost increase, beyond what the softness explains, above which the previous observer is kept (a ratio)."""
+    first_step: float = 5.2e-3
+    """Integration step while the observer is stiff [s]; samples within it are skipped."""
     coarse_step: float = 2.6e-3
     """Integration step [s]."""
     fine_step: float = 1.3e-3
@@ -123,25 +125,9 @@ def fit_periods(
     problem, x = _problem(periods, model, linear, prior, options)
     coarse = replace(problem, steps=_steps(periods, options.coarse_step))
     x = _towards_prior(coarse, x, options)
-    spent = 0
-    found: Minimum | None = None
-    softness = options.softness[0]
-    for frequency in options.softness:
-        ftol = options.ftol_near if frequency == options.softness[-1] else options.ftol_coarse
-        try:
-            trial = coarse.softer(frequency).minimise(x if found is None else found.x, ftol)
-        except ConvergenceError:
-            if found is None:
-                raise
-            break
-        spent += trial.iterations
-        growth = options.lost * (softness / frequency) ** 2
-        if found is not None and trial.at.cost > growth * (found.at.cost + trial.x.size):
-            break
-        found, softness = trial, frequency
-    assert found is not None
+    soft, softness, spent = _softened(coarse, x, options)
     sticking = replace(coarse, softness=softness, finer=options.finer)
-    near = sticking.minimise(found.x, options.ftol_near)
+    near = sticking.minimise(soft, options.ftol_near)
     positions = sticking.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
     weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
@@ -154,6 +140,33 @@ def fit_periods(
     minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
     spent += near.iterations + nearer.iterations + damped.iterations + minimum.iterations
     return _fit(last, minimum, outliers, COVARIANCE, spent)
+
+
+def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Array, float, int]:
+    """Return the minimum with the softest observer that follows the motion, its softness and the number of simulations.
+
+    Raises ConvergenceError if even the stiffest does not.
+    """
+    skip = max(1, int(options.first_step * min(period.rate for period in coarse.periods)))
+    spent = 0
+    cost: float | None = None
+    softness = options.softness[0]
+    for frequency in options.softness:
+        last = frequency == options.softness[-1]
+        every = 1 if last or coarse.steps > 1 else skip
+        trial = replace(coarse, softness=frequency, every=every)
+        try:
+            found = trial.minimise(x, options.ftol_near if last else options.ftol_coarse)
+        except ConvergenceError:
+            if cost is None:
+                raise
+            break
+        spent += found.iterations
+        growth = options.lost * (softness / frequency) ** 2
+        if cost is not None and found.at.cost * every > growth * (cost + x.size):
+            break
+        x, softness, cost = found.x, frequency, found.at.cost * every
+    return x, softness, spent
 
 
 def _problem(

@@ -38,9 +38,10 @@ def room(joints: int) -> Any:
     mass     mass matrix (joints, joints)
     torque   (joints,)
     by_q, by_v  derivatives of the torque (joints, joints)
+    spare    motions and forces within `differentiate` (5, 6)
     """
     n = joints
-    shapes = (n, 12), (n, 6, 6), (2, n, BODY), (n, 6), (n, n), (n,), (n, n), (n, n)
+    shapes = (n, 12), (n, 6, 6), (2, n, BODY), (n, 6), (n, n), (n,), (n, n), (n, n), (5, 6)
     return tuple(np.zeros(shape) for shape in shapes)
 
 
@@ -133,7 +134,7 @@ def move(link: Any, armature: Any, v: Any, room: Any) -> None:
 
     link: (joints, 10). armature: (joints,). v: joint velocities (joints,).
     """
-    frame, motion, body, seized, mass, _, _, _ = room
+    frame, motion, body, seized, mass, _, _, _, _ = room
     n = v.size
     for i in range(n):
         s, w = motion[i, AXIS], motion[i, VELOCITY]
@@ -169,7 +170,7 @@ def move(link: Any, armature: Any, v: Any, room: Any) -> None:
 
 def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
     """Compute the torques required for the accelerations a (joints,); requires `move`."""
-    _, motion, body, _, _, torque, _, _ = room
+    _, motion, body, _, _, torque, _, _, _ = room
     n = a.size
     for i in range(n):
         x, w, b = motion[i, ACCELERATION], motion[i, VELOCITY], body[0, i]
@@ -197,13 +198,10 @@ def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
 
 def differentiate(gravity: Any, room: Any) -> None:
     """Compute the torques' derivatives by angles and velocities at the accelerations last given to `accelerate`."""
-    _, motion, body, seized, _, _, by_q, by_v = room
+    _, motion, body, seized, _, _, by_q, by_v, spare = room
     n = motion.shape[0]
-    still = np.zeros(6)
-    falling = np.zeros(6)
+    still, falling, force, forced, both = spare[0], spare[1], spare[2], spare[3], spare[4]
     falling[3], falling[4], falling[5] = -gravity[0], -gravity[1], -gravity[2]
-    force, forced = np.empty(6), np.empty(6)
-    both = np.empty(6)
     for i in range(n):
         s = motion[i, AXIS]
         w = motion[i - 1, VELOCITY] if i > 0 else still

@@ -1,4 +1,4 @@
-"""A weak prior on the base parameters from a description of the arm, for what the data do not determine."""
+"""A weak prior from a description of the arm, for what the data do not determine: base parameters, torque constants."""
 
 from dataclasses import dataclass
 
@@ -11,6 +11,7 @@ from hil.estimator.chain.model.dynamics import TERMS
 SPREAD = 1.0  # relative standard deviation of every described parameter: descriptions are rarely accurate
 LEAST_OFFSET = 0.02  # m: minimum standard deviation of a centre of mass
 LEAST_GYRATION = 0.05  # m: minimum standard deviation of a radius of gyration
+LEAST_SCALE = 1e-3  # relative standard deviation of a torque constant that is given as exact
 ARMATURE = 0.02  # kg m^2: standard deviation of an unknown reflected rotor inertia
 
 
@@ -22,10 +23,22 @@ class Prior:
     """Means (base parameters,) [SI]."""
     std: Array
     """Standard deviations (base parameters,) [SI]."""
+    scale_precision: Array | None = None
+    """Inverse covariance of the logarithms of the torque scales of all joints but the first (joints - 1, joints - 1);
+    None if nothing is known of them."""
 
     @classmethod
-    def of(cls, base: BaseParameters, links: Array, armature: Array | None = None) -> "Prior":
-        """Create the prior from described link parameters (joints, 10) and, if known, armatures (joints,)."""
+    def of(
+        cls, base: BaseParameters, links: Array, armature: Array | None = None, scale_std: Array | None = None
+    ) -> "Prior":
+        """Create the prior from described link parameters.
+
+        Args:
+            base: their combinations that matter.
+            links: (joints, 10) [SI].
+            armature: rotor inertias (joints,) [kg m^2], if known.
+            scale_std: relative standard deviations of the joints' torque constants (joints,), if known.
+        """
         joints = base.chain.joints
         rotor = np.full(joints, 0.5 * ARMATURE) if armature is None else armature
         every = np.column_stack((links, rotor)).reshape(-1)
@@ -34,4 +47,10 @@ class Prior:
         spread = np.column_stack((np.maximum(SPREAD * np.abs(links), least), np.maximum(rotor, ARMATURE)))
         std = np.sqrt(base.grouping**2 @ spread.reshape(-1) ** 2)
         assert spread.shape == (joints, TERMS)
-        return cls(base.of_all(every), std)
+        return cls(base.of_all(every), std, None if scale_std is None else _scale_precision(scale_std))
+
+
+def _scale_precision(std: Array) -> Array:
+    """Return the precision of the ratios of the joints' torque constants to the first one's."""
+    variance = np.square(np.maximum(std, LEAST_SCALE))
+    return np.asarray(np.linalg.inv(np.diag(variance[1:]) + variance[0]))

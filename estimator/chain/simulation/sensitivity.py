@@ -70,14 +70,13 @@ class Simulation:
             np.array([at.get("delay", width), at.get("lag", width)]),
         )
         self._gain = np.ascontiguousarray(gain, dtype=np.float64)
-        zq, zv = np.zeros((n, width)), np.zeros((n, width))
+        z = np.zeros((3 * n, width))
         if names:
-            zq[np.arange(n), len(names) + np.arange(n)] = 1.0
-            zv[np.arange(n), len(names) + n + np.arange(n)] = 1.0
-        solve = (np.zeros((2, n)), *np.zeros((3, n, n)), *np.zeros((3, n)))
+            z[np.arange(2 * n), len(names) + np.arange(2 * n)] = 1.0
+        solve = (np.zeros((4, n)), *np.zeros((3, n, n)), *np.zeros((3, n)))
         self._room = (
-            *(room(n), solve, tuple(np.zeros((6, n))), np.zeros(n), zq, zv),
-            *(*np.zeros((3, n, width)), np.zeros((n, width + 1)), np.zeros((3, n, n))),
+            *(room(n), solve, tuple(np.zeros((6, n))), np.zeros(n), z),
+            *(*np.zeros((2, n, width)), np.zeros((n, width + 1)), np.zeros((n, 3 * n)), np.zeros((n, n))),
         )
 
     @property

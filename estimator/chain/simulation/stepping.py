@@ -39,7 +39,7 @@ WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
 
 
 def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
-    """Compute the torque of drive j minus friction and offset, and the slope of friction, into `out`."""
+    """Compute the torque of drive j minus friction and offset, the slope of friction, and its shape, into `out`."""
     motor = p[SCALE, j] * t
     ratio = v / p[FADING, j]
     past = ratio * ratio
@@ -49,25 +49,33 @@ def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
     bent = (1.0 - bend * bend) / p[WIDTH, j]
     out[0, j] = motor - p[OFFSET, j] - p[VISCOUS, j] * v - level * bend
     out[1, j] = p[VISCOUS, j] + level * bent
+    out[2, j], out[3, j] = bump, bend
 
 
 def _direct(
-    p: Any, at: Any, j: int, v: float, t: float, late: float, lagged: float, times: Any, ghk: float, by: Any, row: Any
+    p: Any,
+    at: Any,
+    j: int,
+    v: float,
+    t: float,
+    left: Any,
+    slopes: Any,
+    times: Any,
+    ghk: float,
+    by: Any,
+    row: Any,
 ) -> None:
     """Compute the direct derivatives of joint j's step equation by the drive's parameters, and by v into `by`.
 
-    ghk: gamma h times the stage's acceleration. late, lagged: derivatives of the torque by delay and by lag. times:
-    their columns.
+    left: see `_left`. slopes: derivatives of the torque by delay and by lag. times: their columns. ghk: gamma h times
+    the stage's acceleration.
     """
     scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
     motor = scale * t
     sign = 1.0 if motor > 0.0 else -1.0
-    ratio = v / fading
-    past = ratio * ratio
-    bump = math.exp(-past) if past < FADED else 0.0
+    bump, bend = left[2, j], left[3, j]
     coulomb, rise, load = p[COULOMB, j], p[RISE, j], p[LOAD, j]
     level = coulomb * (1.0 + rise * bump) + load * abs(motor)
-    bend = math.tanh(v / width)
     bent = (1.0 - bend * bend) / width
     level_v = -2.0 * coulomb * rise * bump * v / (fading * fading)
     bent_v = -2.0 * bend * bent / width
@@ -81,47 +89,63 @@ def _direct(
     bent_w = -(bent + 2.0 * bend * bend_w) / width
     row[at[WIDTH, j]] = level * (bend_w + ghk * bent_w)
     row[at[RISE, j]] = coulomb * bump * shape
-    row[at[FADING, j]] = -level_v * ratio * shape
+    row[at[FADING, j]] = -level_v * v / fading * shape
     row[at[LOAD, j]] = abs(motor) * shape
     by_motor = load * sign * shape - 1.0
     row[at[SCALE, j]] = by_motor * t
-    row[times[0]] = by_motor * scale * late
-    row[times[1]] = by_motor * scale * lagged
+    row[times[0]] = by_motor * scale * slopes[0, j]
+    row[times[1]] = by_motor * scale * slopes[1, j]
 
 
-def _mix(out: Any, a: float, x: Any, b: float, y: Any, n: int) -> None:
-    for c in range(n):
-        out[c] += a * x[c] + b * y[c]
+# These take whole arrays and indices: a view of a row costs as much as its arithmetic.
+def _add_eight(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
+    """Add the products of A's columns j to j + 7 in row i with those rows of X to row i of out."""
+    a, b, c, d = A[i, j], A[i, j + 1], A[i, j + 2], A[i, j + 3]
+    e, f, g, h = A[i, j + 4], A[i, j + 5], A[i, j + 6], A[i, j + 7]
+    for k in range(width):
+        out[i, k] += (
+            (a * X[j, k] + b * X[j + 1, k])
+            + (c * X[j + 2, k] + d * X[j + 3, k])
+            + (e * X[j + 4, k] + f * X[j + 5, k])
+            + (g * X[j + 6, k] + h * X[j + 7, k])
+        )
 
 
-def _mix_four(out: Any, a: float, x: Any, b: float, y: Any, c: float, z: Any, d: float, w: Any, n: int) -> None:
-    for i in range(n):
-        out[i] += a * x[i] + b * y[i] + c * z[i] + d * w[i]
+def _add_four(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
+    a, b, c, d = A[i, j], A[i, j + 1], A[i, j + 2], A[i, j + 3]
+    for k in range(width):
+        out[i, k] += (a * X[j, k] + b * X[j + 1, k]) + (c * X[j + 2, k] + d * X[j + 3, k])
 
 
-def _combine(A: Any, X: Any, B: Any, Y: Any, n: int, width: int, out: Any) -> None:
-    """Add A X + B Y to out, where A and B are (n, n), X and Y (n, width)."""
-    for i in range(n):
+def _add_one(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
+    a = A[i, j]
+    for k in range(width):
+        out[i, k] += a * X[j, k]
+
+
+def _add_product(A: Any, X: Any, rows: int, inner: int, width: int, out: Any) -> None:
+    """Add A X to out, where A is (rows, inner), X (inner, width)."""
+    for i in range(rows):
         j = 0
-        while j + 1 < n:
-            _mix_four(out[i], A[i, j], X[j], B[i, j], Y[j], A[i, j + 1], X[j + 1], B[i, j + 1], Y[j + 1], width)
-            j += 2
-        if j < n:
-            _mix(out[i], A[i, j], X[j], B[i, j], Y[j], width)
+        while j + 8 <= inner:
+            _add_eight(out, i, A, X, j, width)
+            j += 8
+        if j + 4 <= inner:
+            _add_four(out, i, A, X, j, width)
+            j += 4
+        while j < inner:
+            _add_one(out, i, A, X, j, width)
+            j += 1
 
 
-def _solved(inverse: Any, R: Any, n: int, width: int, out: Any) -> None:
-    """Set out = -inverse R."""
+def _solved(inverse: Any, minus: Any, R: Any, n: int, width: int, out: Any) -> None:
+    """Set out = -inverse R; `minus` is working space."""
     for i in range(n):
+        for j in range(n):
+            minus[i, j] = -inverse[i, j]
         for c in range(width):
             out[i, c] = 0.0
-        j = 0
-        while j + 1 < n:
-            _mix(out[i], -inverse[i, j], R[j], -inverse[i, j + 1], R[j + 1], width)
-            j += 2
-        if j < n:
-            for c in range(width):
-                out[i, c] -= inverse[i, j] * R[j, c]
+    _add_product(minus, R, n, n, width, out)
 
 
 def _stage(
@@ -176,7 +200,7 @@ def _follow(
     differentiate(chain[3], work)
     regress(base, total, work, direct)
     for j in range(v.size):
-        _direct(p, at, j, v[j], t[j], slopes[0, j], slopes[1, j], times, gh * found[j], by, direct[j])
+        _direct(p, at, j, v[j], t[j], solve[0], slopes, times, gh * found[j], by, direct[j])
         work[7][j, j] += by[j]
     for j in range(v.size):
         column = at[ZERO, j]
@@ -219,11 +243,12 @@ def _run_loop(  # noqa: PLR0912
     The results are written to `position` (samples, joints) and, unless there are no causes, `derivative` (samples,
     joints, causes). A step in which a joint may come near standstill is divided into up to `finer` smaller ones.
     """
-    work, solve, motion, by, zq, zv, dk, dl, R, direct, twice = room
+    work, solve, motion, by, z, dl, R, direct, mixed, minus = room
     q1, v1, k, m, nothing, ahead = motion
     q, v = state[0], state[1]
     n, causes = q.size, derivative.shape[2]
     width = (causes + 7) // 8 * 8
+    zq, zv, dk = z[:n], z[n : 2 * n], z[2 * n :]
     for sample in range(torque.shape[0]):
         for j in range(n):
             position[sample, j] = q[j]
@@ -251,10 +276,12 @@ def _run_loop(  # noqa: PLR0912
                 if causes > 0:
                     _follow(chain, links, p, v, t, slopes[sample, s], k, gh, columns, work, solve, by, direct)
                     for i in range(n):
+                        for j in range(n):
+                            mixed[i, j], mixed[i, n + j] = work[6][i, j], work[7][i, j]
                         for c in range(width):
                             R[i, c] = direct[i, c]
-                    _combine(work[6], zq, work[7], zv, n, width, R)
-                    _solved(solve[2], R, n, width, dk)
+                    _add_product(mixed, z, n, 2 * n, width, R)
+                    _solved(solve[2], minus, R, n, width, dk)
                 for j in range(n):
                     q1[j], v1[j], ahead[j] = q[j] + h * v[j], v[j] + h * k[j], 2.0 * k[j]
                 if not _stage(chain, links, p, q1, v1, t, ahead, gh, m, work, solve):
@@ -263,14 +290,14 @@ def _run_loop(  # noqa: PLR0912
                     _follow(chain, links, p, v1, t, slopes[sample, s], m, gh, columns, work, solve, by, direct)
                     for i in range(n):
                         for j in range(n):
-                            # Derivatives through v' = v + h k, and through k in the acceleration.
-                            twice[0, i, j] = h * work[7][i, j] + 2.0 * work[4][i, j]
-                            twice[1, i, j] = work[7][i, j] + h * work[6][i, j]
+                            # Derivatives by q and v, and by k through v' = v + h k and through the acceleration.
+                            mixed[i, j] = work[6][i, j]
+                            mixed[i, n + j] = work[7][i, j] + h * work[6][i, j]
+                            mixed[i, 2 * n + j] = h * work[7][i, j] + 2.0 * work[4][i, j]
                         for c in range(width):
                             R[i, c] = direct[i, c]
-                    _combine(work[6], zq, twice[1], zv, n, width, R)
-                    _combine(twice[0], dk, twice[2], dk, n, width, R)
-                    _solved(solve[2], R, n, width, dl)
+                    _add_product(mixed, z, n, 3 * n, width, R)
+                    _solved(solve[2], minus, R, n, width, dl)
                     for j in range(n):
                         for c in range(width):
                             zq[j, c] += h * zv[j, c] + 0.5 * h * h * dk[j, c]
@@ -286,7 +313,7 @@ def _run_loop(  # noqa: PLR0912
 _inner: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True
 )
-_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _pieces = map(
-    _inner, (_left, _direct, _mix, _mix_four, _combine, _solved, _stage, _follow, _pieces)
+_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces = map(
+    _inner, (_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces)
 )
 run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"})

@@ -2,16 +2,19 @@
 
 import json
 import re
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.arm_model import JointFacts
 from hil.config.csv_columns import Columns, RecordingConfig, load_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.physical import physical_of
+from hil.estimation.unsettled.chain_recordings import estimate_chain_recordings
 from hil.estimation.unsettled.estimate import Estimated, estimate_any
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
@@ -44,6 +47,8 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
     Raises HilError, EstimationError.
     """
     config = RecordingConfig() if config_path is None else load_recording_config(config_path)
+    if config.arm.urdf is not None:
+        return _estimate_chain(paths, config_path, config, folder)
     read = _averaged(_zeroed(_read(paths, config.columns), config.arm.gravity))
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
@@ -53,7 +58,28 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
     if config.known is not None:
         result = replace(result, physical=physical_of(result, config.known.quantities(), gravity))
     if folder is not None:
-        _keep(folder, paths, config_path, config, read, found)
+        _keep(folder, paths, config_path, config, read, found.predicted)
+        write_json(folder / "result.json", result.to_json())
+    return result
+
+
+def _estimate_chain(
+    paths: Sequence[Path], config_path: Path | None, config: RecordingConfig, folder: Path | None
+) -> ShootingResult:
+    """The same for a spatial arm; its URDF is kept beside the result."""
+    read = _read(paths, config.columns)
+    shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
+    found = estimate_chain_recordings(read.recordings, config, shown)
+    arm = _arm(read, config.arm.gravity)
+    names = config.joint_names
+    assert names is not None and config.arm.urdf is not None  # checked by the estimate
+    arm = replace(arm, joints=tuple(replace(each, name=name) for each, name in zip(arm.joints, names, strict=True)))
+    result = replace(found.result, recordings=read.names, arm=arm, notes=read.notes)
+    if folder is not None:
+        _keep(folder, paths, config_path, config, read, found.predicted)
+        urdf = Path(config.arm.urdf)
+        if not (folder / urdf.name).exists():
+            shutil.copyfile(urdf, folder / urdf.name)
         write_json(folder / "result.json", result.to_json())
     return result
 
@@ -71,7 +97,7 @@ def _read(paths: Sequence[Path], columns: Columns) -> _Read:
 
 
 def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
-    """One encoder has one step: of what several recordings show, the smallest."""
+    """Use one encoder step for all recordings of an arm: the smallest that any of them shows."""
     if len(found) == 1:
         return recordings
     step = np.min([each.position_step for each in recordings], axis=0)
@@ -176,11 +202,11 @@ def _keep(
     config_path: Path | None,
     config: RecordingConfig,
     read: _Read,
-    found: Estimated,
+    predicted: Sequence[NDArray[np.float64]],
 ) -> None:
     kept = [
-        Predicted(name, each.time, each.torque, each.position, predicted)
-        for name, each, predicted in zip(read.names, read.recordings, found.predicted, strict=True)
+        Predicted(name, each.time, each.torque, each.position, motion)
+        for name, each, motion in zip(read.names, read.recordings, predicted, strict=True)
     ]
     text = _as_toml(config, read.columns) if config_path is None else config_path.read_text(encoding="utf-8-sig")
     save(folder, describe("" if config_path is None else str(config_path), paths, read.notes), text, kept)

@@ -40,6 +40,21 @@ def test_without_feedback_it_is_the_open_loop(friction: dict[str, float]) -> Non
     assert np.abs(found.position - expected).max() < 2e-4, "rad; the two begin with slightly different lag states"
 
 
+def test_each_joint_has_its_own_lag() -> None:
+    physics, multisine = Physics.of({**ARM, **SHAPE, "lag_difference_2": 8e-3}), wave(0.5)
+    steps = steps_per_sample(RATE)
+    start, state = np.stack((POSE, np.zeros(2))), resting(POSE)
+    state[2] = multisine.torque[:, -1]
+    found = respond(physics, state, multisine.torque, RATE, Feedback.none(2)).position
+
+    def open_loop(lag: float | np.ndarray) -> np.ndarray:
+        torque = motor_torque(multisine.torque, RATE, 0.0, steps, delay=0.0, lag=lag)
+        return simulate(physics, start, torque, 1 / (RATE * steps))[0]
+
+    error = np.abs(found - open_loop(physics.lags)).max()
+    assert error < 0.1 * np.abs(found - open_loop(1e-3)).max(), "the other joint's lag would be far off"
+
+
 @pytest.mark.parametrize("friction", [SHAPE, BRISTLES], ids=["dry", "presliding"])
 def test_two_halves_are_one_whole_and_one_joint_works(friction: dict[str, float]) -> None:
     feedback = Feedback(np.array([1.0, 0.5]), np.array([0.05, 0.02]), POSE, np.array([2.0, 1.0]))

@@ -92,3 +92,43 @@ def test_after_a_lost_reply_it_begins_anew() -> None:
     assert not look.look(9.0, 4.0, 0.0025), "the way over lost replies is not its affair"
     for index in range(400):
         assert not look.look(9.0 + 0.01 * (index + 1), 4.0, 0.0025)
+
+
+def learnt_motion(now: float) -> tuple[float, float]:
+    """Position and velocity of a swinging joint whose servo filters the velocity with a lag of 5 ms."""
+    late = now - 0.005
+    return (
+        0.4 * math.sin(math.tau * now) + 0.2 * math.sin(5.3 * now),
+        0.4 * math.tau * math.cos(math.tau * late) + 0.2 * 5.3 * math.cos(5.3 * late),
+    )
+
+
+@pytest.mark.parametrize("rate", [100, 400, 1000])
+@pytest.mark.parametrize(("speed", "most"), [(0.25, 0.4), (-0.25, 0.5), (1.0, 0.12), (0.1, 2.0)])
+def test_a_position_that_creeps_is_seen_before_it_is_far_off(rate: int, speed: float, most: float) -> None:
+    begun = 4.0
+    when = seen_after(
+        rate,
+        lambda now: learnt_motion(now)[0] + speed * max(now - begun, 0.0),
+        lambda now: learnt_motion(now)[1],
+    )
+    assert 0.0 < when - begun <= most
+
+
+@pytest.mark.parametrize("scale", [1.25, 0.8, 1.1])
+def test_a_position_that_is_scaled_contradicts_its_velocity(scale: float) -> None:
+    def position(now: float) -> float:
+        origin = learnt_motion(4.0)[0]
+        own = learnt_motion(now)[0]
+        return own if now < 4.0 else origin + scale * (own - origin)
+
+    assert 4.0 < seen_after(100, position, lambda now: learnt_motion(now)[1]) < 5.5
+
+
+@pytest.mark.parametrize(("lag", "scale"), [(0.03, 0.0), (0.0, 0.055), (0.02, -0.05), (0.01, 0.03)])
+def test_lag_and_scale_error_that_a_servo_always_had_are_accepted(lag: float, scale: float) -> None:
+    def velocity(now: float) -> float:
+        late = now - lag
+        return (1.0 + scale) * (0.4 * math.tau * math.cos(math.tau * late) + 0.2 * 5.3 * math.cos(5.3 * late))
+
+    assert seen_after(400, lambda now: learnt_motion(now)[0], velocity) == math.inf

@@ -1,10 +1,10 @@
 """Random faults in every bundled configuration and rate; benchmarks/faults.py draws thousands."""
 
+import re
+
 import pytest
 
-from benchmarks.fault_campaign.arms import RATES, names, settings
-from benchmarks.fault_campaign.attack import Kind
-from benchmarks.fault_campaign.campaign import Outcome
+from benchmarks.fault_campaign.arms import RATES, Setting, names, settings
 from benchmarks.faults import campaign, figures
 
 INJECTIONS = 300
@@ -17,33 +17,30 @@ PARTS = 2
 
 NAMED = 0.95
 
-SEEN_LATER = 0.05
-"""Share of the injections at most whose time counts from when the fault could be seen, later than it began."""
+REFUSED = re.compile(r"fake_inverted at 20 Hz .* rate = 20 is too low for the stabiliser", re.DOTALL)
+"""A software spring that acts 75 ms late cannot hold an arm upright."""
 
-LATE_AT_20_HZ, LATE_MS = frozenset({Kind.STRANGE_GOAL}), 250.0
-"""Another program's goal between two samples is overwritten before the next status: only the motion shows it."""
-
-NOT_STABLE = "fake_inverted at 20 Hz"
-"""A setting that cannot be played: a software spring delayed by 50 ms."""
+EVERY_THIRD = 3
 
 
-def is_known_as_late(outcome: Outcome) -> bool:
-    is_slow = outcome.setting.rate == RATES[0] and outcome.verdict.late_ms <= LATE_MS
-    return is_slow and bool(set(outcome.drawn.kinds) & LATE_AT_20_HZ)
+def chosen() -> list[Setting]:
+    """Every configuration at every rate, except that two thirds of them, for time's sake, are left out at 1 kHz."""
+    return [each for each in settings() if each.rate != RATES[-1] or names().index(each.name) % EVERY_THIRD == 0]
 
 
 @pytest.mark.parametrize("part", range(PARTS))
 def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
-    outcomes, left_out = campaign(settings()[part::PARTS], INJECTIONS // PARTS, jobs=1, period=PERIOD_S, even=False)
-    assert all(why.startswith(NOT_STABLE) for why in left_out), left_out
-    bad = [each for each in outcomes if each.verdict.unsafe and not is_known_as_late(each)]
-    bad += [each for each in outcomes if each.beyond_limit or each.unreadable or each.not_restored]
-    bad += [each for each in outcomes if each.verdict.misleading]
+    outcomes, left_out = campaign(chosen()[part::PARTS], INJECTIONS // PARTS, jobs=1, period=PERIOD_S, even=False)
+    assert all(REFUSED.match(why) for why in left_out), left_out
+    bad = [
+        each
+        for each in outcomes
+        if each.verdict.unsafe or each.beyond_limit or each.unreadable or each.not_restored or each.verdict.misleading
+    ]
     assert not bad, "\n\n".join(map(str, bad))
     counted = figures(outcomes)
     assert counted["unnamed"] <= (1 - NAMED) * counted["stopped"]
     assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it meets stops and runs that go on"
-    assert counted["seen_later"] <= SEEN_LATER * len(outcomes)
 
 
 def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:

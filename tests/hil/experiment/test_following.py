@@ -85,3 +85,104 @@ def test_one_wrong_reply_in_between_is_forgiven() -> None:
     config, planned = joints("xm430_two_link")[0]
     follow = Following(config, planned, 0.3, 0.05)
     assert seen_after(follow, 400, lambda _: planned, lambda goal, now: 0.0 if now % 0.02 < 0.007 else goal) == math.inf
+
+
+STEP = 2.0**-9
+"""Time between two replies [s] in the exact tests below: sums of it are not rounded."""
+
+SHARE, LASTING = 0.3, 16 * STEP
+
+
+def following(planned: float = 1.0, name: str = "xm430_two_link") -> Following:
+    return Following(joints(name)[0][0], planned, SHARE, LASTING)
+
+
+def replies_until_seen(
+    follow: Following, goal: float, carried: float, seconds: float = STEP, followed: int = 1
+) -> tuple[int, float]:
+    """Number of replies that carry `carried` until that is reported, and the time that it reports [s].
+
+    followed: replies before these, in which the motor carries the goal.
+    """
+    for _ in range(followed):
+        assert follow.look(goal, goal, seconds) is None
+    for number in range(1, 200):
+        if (off := follow.look(goal, carried, seconds)) is not None:
+            assert (off.goal, off.carried) == (goal, carried)
+            return number, off.seconds
+    return 0, 0.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("planned", "goal", "carried", "replies"),
+    [
+        (1.0, 0.5, 0.0, 16),  # a ratio of 12.5 counts as 2: 0.06 s / (2 STEP) = 15.4
+        (1.0, 0.15, 0.0, 28),  # 1.125: 27.3
+        (1.0, 0.25, 0.05, 17),  # (0.2^2 - 0.05^2) 50 = 1.875: 16.4
+        (1.0, 0.1, 0.05, 0),  # as near to the goal as to nothing
+        (1.0, 0.5, 0.3, 0),  # nearer to the goal
+        (0.01, 0.02, 0.0, 18),  # sigma is 4 ticks of 2.69 mA: 1.7275: 17.8
+    ],
+)
+def test_replies_that_look_like_no_current(
+    sign: float, planned: float, goal: float, carried: float, replies: int
+) -> None:
+    loose = Following(joints("xm430_two_link")[0][0], planned, 1.0, 1.0)
+    assert replies_until_seen(loose, sign * goal, sign * carried) == (replies, replies * STEP)
+
+
+def test_a_voltage_has_ticks_of_its_own() -> None:
+    """4 ticks of 12 V / 885 are 54 mV: a ratio of 1.70."""
+    follow = Following(joints("xl430_two_link")[0][0], 0.01, 1.0, 1.0)
+    assert replies_until_seen(follow, 0.1, 0.0)[0] == 19
+
+
+def test_one_reply_with_the_goal_takes_back_what_one_without_it_has_added() -> None:
+    follow = following()
+    assert replies_until_seen(follow, 0.5, 0.0, followed=5)[0] == 16
+    follow = following()
+    follow.look(0.5, 0.5, STEP)
+    for carried in (*[0.0] * 15, 0.5):
+        assert follow.look(0.5, carried, STEP) is None
+    assert follow.look(0.5, 0.0, STEP) is None
+    off = follow.look(0.5, 0.0, STEP)
+    assert off is not None and off.seconds == 18 * STEP
+    follow = following()
+    for carried in (*[0.0] * 3, *[0.5] * 9):
+        follow.look(0.5, carried, STEP)
+    assert replies_until_seen(follow, 0.5, 0.0) == (16, 16 * STEP)
+
+
+def test_a_single_reply_never_decides() -> None:
+    assert replies_until_seen(following(), 0.5, 0.0, 0.0625) == (2, 0.125)
+    follow = following()
+    assert follow.look(0.0, 0.5, 0.0625) is None
+    off = follow.look(0.0, 0.5, 0.0625)
+    assert off is not None and off.seconds == 0.125, "the goal was 0 from the first one on"
+    assert replies_until_seen(following(), 1.0, 0.6, 0.0625) == (2, 0.125)
+
+
+@pytest.mark.parametrize(
+    ("planned", "goal", "carried", "replies"),
+    [
+        (1.0, 0.9, 0.59, 16),  # 0.31 off; the plan allows 0.3
+        (1.0, 0.9, 1.21, 16),
+        (1.0, 0.9, 0.61, 0),
+        (1.0, 0.9, 1.19, 0),
+        (1.0, 2.0, 1.41, 0),  # more than was planned: 0.3 of the goal
+        (1.0, 2.0, 1.39, 16),
+        (0.01, 0.02, 0.0093, 0),  # 4 ticks are allowed, 10.76 mA
+        (0.01, 0.02, 0.0091, 16),
+    ],
+)
+def test_replies_that_are_neither_the_goal_nor_nothing(
+    planned: float, goal: float, carried: float, replies: int
+) -> None:
+    assert replies_until_seen(following(planned), goal, carried)[0] == replies
+
+
+def test_a_reply_may_be_measured_before_or_after_the_motor_has_the_goal() -> None:
+    follow = following()
+    for number in range(60):
+        assert follow.look(0.5 if number % 2 else -0.5, 0.4 if number % 4 < 2 else -0.4, STEP) is None

@@ -47,11 +47,22 @@ def test_one_sample_that_stops(arm: Arm, change: dict[str, Any], cause: Cause) -
 
 
 def test_an_encoder_jump_stops_and_the_same_way_over_lost_samples_does_not(arm: Arm) -> None:
-    moved = STILL._replace(position=(-1.57, 0.16))
-    assert look(Guard(arm()), STILL, moved) is Cause.JUMP
+    fast = STILL._replace(velocity=(0.0, 19.0))
+    moved = fast._replace(position=(-1.57, 19.0 * 3 / 400))
+    assert look(Guard(arm()), fast, at(1, moved)) is Cause.JUMP
     guard = Guard(arm())
-    for state in (STILL, MISSING, MISSING, moved):
-        guard.look(state)
+    for number, state in enumerate((fast, MISSING, MISSING, moved)):
+        guard.look(at(number, state))
+
+
+def test_a_frozen_encoder_is_seen_between_lost_replies(arm: Arm) -> None:
+    """A reply lost now and then must not make the comparison of position and velocity begin anew."""
+    guard = Guard(arm())
+    fast = STILL._replace(velocity=(0.0, 4.0))
+    with pytest.raises(SafetyStop) as stop:
+        for number in range(60):
+            guard.look(at(number, MISSING if number % 2 else fast))
+    assert stop.value.cause is Cause.FROZEN
 
 
 def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
@@ -59,6 +70,22 @@ def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
     for state in (*[MISSING] * 5, STILL, *[MISSING] * 5):
         guard.look(state)
     assert look(guard, MISSING) is Cause.MISSING
+
+
+@pytest.mark.parametrize(
+    ("missing", "said"),
+    [
+        ((False, True), "Check its cable and its supply."),
+        ((True, True), "No servo was heard: check the adapter, the cables and the supply."),
+    ],
+)
+def test_silence_of_all_servos_points_to_what_they_share(arm: Arm, missing: tuple[bool, bool], said: str) -> None:
+    guard = Guard(arm())
+    silent = MISSING._replace(missing=missing)
+    with pytest.raises(SafetyStop) as stop:
+        for number in range(10):
+            guard.look(at(number, silent))
+    assert str(stop.value).endswith(said)
 
 
 def test_a_current_that_does_not_follow(arm: Arm) -> None:
@@ -226,7 +253,8 @@ def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:
         for each in range(100):
             total += each
 
-    rounds = [(timeit(look, number=500), timeit(add, number=500)) for _ in range(20)]
+    # Short rounds, so that on a busy machine some of each are not interrupted.
+    rounds = [(timeit(look, number=20), timeit(add, number=20)) for _ in range(500)]
     assert min(looked for looked, _ in rounds) < 3 * min(added for _, added in rounds)
 
 

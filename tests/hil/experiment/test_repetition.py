@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.estimation.settled_period import settling_difference
-from hil.experiment.repetition import FLOOR_RAD, LASTING_S, TIMES, Repetition
+from hil.experiment.repetition import Repetition
 
 INTERVAL = 0.01
 
@@ -89,10 +89,10 @@ def test_noise_and_drift_repeat_the_motion(seed: int, rms: float) -> None:
 @pytest.mark.parametrize("joint", [0, 1])
 def test_a_joint_that_is_elsewhere_than_a_period_before_is_seen_after_the_shortest_time(joint: int, rms: float) -> None:
     periods = drifting(1, rms)
-    deviation = TIMES * rms * 1.4 + 1.01 * FLOOR_RAD
+    deviation = 10.0 * rms * 1.4 + 1.01 * 0.05
     periods[2, joint, 50:] += deviation
     number, index, seen = unlike_at(periods) or (0, 0, -1)
-    assert (number, seen) == (2, joint) and index == 50 + round(LASTING_S / INTERVAL) - 1
+    assert (number, seen) == (2, joint) and index == 52, "the third sample of 10 ms"
     periods = drifting(1, rms)
     periods[2, joint, 50:52] -= deviation  # too short
     assert unlike_at(periods) is None
@@ -125,3 +125,42 @@ def test_other_torques_may_give_another_motion() -> None:
                 repetition.add(index, sample)
                 assert repetition.unlike is None
     assert repetition.difference < 0.02
+
+
+def test_the_floor_of_the_tolerance() -> None:
+    periods = drifting(1, 0.0)
+    periods[2, 0, 50:] += 0.049
+    assert unlike_at(periods) is None
+    periods[2, 0, 50:] += 0.002
+    assert unlike_at(periods) == (2, 52, 0)
+
+
+def test_a_joint_at_zero_from_the_first_sample_on_is_compared_too() -> None:
+    """Nothing of what the buffers hold at first may count as a motion."""
+    periods = np.zeros((3, 1, 10))
+    assert unlike_at(periods) is None
+    repetition = Repetition(10, 1, INTERVAL)
+    assert repetition.unlike is None and math.isnan(repetition.moved[0])
+    played(repetition, periods[0])
+    assert repetition.moved == [0.0] and repetition.difference == math.inf, "there is no period before"
+    played(repetition, periods[1])
+    assert repetition.difference == 0.0, "neither moved"
+    periods[2] += np.linspace(0.0, 1e-3, 10)
+    played(repetition, periods[2])
+    assert 0.0 < repetition.difference < math.inf
+
+
+def test_a_new_torque_compares_with_nothing() -> None:
+    repetition = Repetition(10, 1, INTERVAL)
+    played(repetition, np.full((1, 10), 0.5))
+    repetition.begin(10, anew=True)
+    for index in range(10):
+        repetition.add(index, [0.7])
+    assert repetition.difference == math.inf and repetition.unlike is None
+
+
+def test_a_standstill_elsewhere_is_infinitely_different() -> None:
+    repetition = Repetition(10, 1, INTERVAL)
+    played(repetition, np.full((1, 10), 0.5))
+    played(repetition, np.full((1, 10), 0.6))
+    assert repetition.difference == math.inf

@@ -71,6 +71,24 @@ def test_a_whole_experiment_is_recorded_in_order_and_ends_without_torque(
     assert np.abs(samples["velocity"][-40:]).max() < 0.1
 
 
+def test_a_warm_up_is_played_once_before_the_first_multisine_and_used_for_nothing(arm: Arm, tmp_path: Path) -> None:
+    period = arm().experiment.period
+    config = arm(("[experiment]", f"[experiment]\nwarm_up = {1.5 * period}"))
+    made = run(config, tmp_path / "run")
+    samples = load_samples(made.samples_path, 2)
+    warming = samples["phase"] == Phase.WARM_UP
+    assert warming.sum() == 2 * config.experiment.samples, "whole periods, rounded up"
+    assert set(samples["segment"][warming]) == {0}
+    changes = np.flatnonzero(np.diff(samples["phase"], prepend=0))
+    order = [int(phase) for phase in samples["phase"][changes]]
+    then = [Phase.PERIODIC, Phase.RAMP_OUT]
+    assert order == [Phase.REST, Phase.RAMP_IN, Phase.WARM_UP, *then, Phase.RAMP_IN, *then, Phase.COMING_TO_REST]
+    first, second = samples["goal_current"][warming].reshape(2, config.experiment.samples, 2)
+    assert np.array_equal(first[1:], second[1:])
+    periodic = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == 0) & (samples["period"] == 1)
+    assert np.array_equal(samples["goal_current"][periodic][1:], second[1:]), "the warm-up is the same motion"
+
+
 def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: Path) -> None:
     config = arm()
     first = load_samples(run(config, tmp_path / "a").samples_path, 2)

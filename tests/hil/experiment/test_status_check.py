@@ -80,3 +80,82 @@ def test_replies_that_are_held_up_are_seen_in_two_readings(arm: Arm) -> None:
 def test_a_reboot_is_seen_by_the_servos_clock(arm: Arm) -> None:
     found = readings(StatusCheck(arm()), lambda now: now + 7.0 if now < 1.0 else now - 1.0, 3.0)
     assert found is not None and found[0] < 1.1 and "rebooted" in found[1]
+
+
+def test_another_servos_clock_is_told_from_a_late_reply(arm: Arm) -> None:
+    check = StatusCheck(arm())
+    clocks = (5.0, 5.3)
+    for index in range(20):
+        swapped = index >= 10
+        now = 0.035 * index
+        for joint in (0, 1):
+            tick = now + clocks[1 - joint if swapped else joint]
+            if (wrong := check.look_at_clock(joint, tick, now)) is not None:
+                assert wrong[0] is Cause.STALE and "another servo's data" in wrong[1] and index == 11
+                return
+    raise AssertionError("swapped replies were not seen")
+
+
+def test_either_doubt_asks_for_another_reading(arm: Arm) -> None:
+    check = StatusCheck(arm())
+    check.look(0, FINE._replace(goal=0.05), 0.1, 1.0)
+    assert check.is_in_doubt, "a goal that was not taken"
+    check.look(0, FINE, 0.1, 1.0)
+    assert not check.is_in_doubt
+    late = StatusCheck(arm())
+    for index in range(4):
+        late.look_at_clock(1, 0.035 * index, 0.035 * index)
+        assert not late.is_in_doubt
+    late.look_at_clock(1, 0.1, 0.2)
+    assert late.is_in_doubt, "a clock that is behind"
+
+
+def clocked(check: StatusCheck, leads: list[float], joint: int = 0) -> list[bool]:
+    """Whether each reading, 100 ms apart and ahead of the computer's clock by `leads` [s], counts as stale."""
+    return [check.look_at_clock(joint, 0.1 * index + lead, 0.1 * index) is not None for index, lead in enumerate(leads)]
+
+
+def test_how_far_a_clock_may_be_behind(arm: Arm) -> None:
+    """4 ms, and 1 % of the time since the reading before: 5 ms after 100 ms, 6 ms after 200 ms."""
+    assert clocked(StatusCheck(arm()), [1.0] * 3 + [0.9952] * 3) == [False] * 6
+    assert clocked(StatusCheck(arm()), [1.0] * 3 + [0.9948, 0.9938]) == [False] * 4 + [True]
+    assert clocked(StatusCheck(arm()), [1.0] * 3 + [0.9948, 0.9942]) == [False] * 5, "two are needed, and it may drift"
+    assert clocked(StatusCheck(arm()), [1.0] * 2 + [0.9, 0.9]) == [False] * 4, "after three readings at least"
+    assert clocked(StatusCheck(arm()), [1.0] * 3 + [0.9, 0.9]) == [False] * 4 + [True]
+
+
+def test_how_far_a_clock_may_be_ahead(arm: Arm) -> None:
+    assert clocked(StatusCheck(arm()), [1.0] * 3 + [1.9, 1.9]) == [False] * 5, "a request that left late"
+    assert clocked(StatusCheck(arm()), [1.0] * 3 + [2.1, 2.1]) == [False] * 4 + [True], "a reboot"
+
+
+def test_the_smallest_difference_of_the_clocks_counts(arm: Arm) -> None:
+    """Requests that left late at first make the replies look younger, not those later on older."""
+    assert clocked(StatusCheck(arm()), [1.3, 1.2, 1.0] + [1.0] * 5) == [False] * 8
+    assert clocked(StatusCheck(arm()), [1.3, 1.0, 1.2, 1.2, 0.99, 0.98]) == [False] * 5 + [True]
+
+
+def test_a_goal_that_differs_by_less_than_half_a_tick_is_the_one_sent(arm: Arm) -> None:
+    check, tick = StatusCheck(arm()), 2.69e-3
+    for _ in range(4):
+        assert check.look(0, FINE._replace(goal=0.1 + 0.45 * tick), 0.1, 1.0) is None
+    assert check.look(0, FINE._replace(goal=0.1 + 0.55 * tick), 0.1, 1.0) is None
+    assert check.look(0, FINE._replace(goal=0.1 - 0.55 * tick), 0.1, 1.0) is not None
+
+
+@pytest.mark.parametrize(("lead", "is_anothers"), [(5.3, True), (5.3 + 32.768, True), (5.309, False), (5.288, False)])
+def test_a_clock_is_another_servos_only_if_it_agrees(arm: Arm, lead: float, is_anothers: bool) -> None:
+    """The own servo's lead is 6.5 s; within 4 ms, and 1 % of the time since its last reading, it is the other one's."""
+    check = StatusCheck(arm())
+    clocked(check, [5.3] * 5, joint=1)
+    clocked(check, [6.5] * 3)
+    wrong = [check.look_at_clock(0, lead + now, now) for now in (0.4, 0.5)][-1]
+    assert wrong is not None and ("another servo's" in wrong[1]) is is_anothers
+
+
+def test_a_clock_that_nobody_has_learnt_is_not_another_servos(arm: Arm) -> None:
+    check = StatusCheck(arm())
+    clocked(check, [5.3] * 2, joint=1)
+    clocked(check, [6.5] * 3)
+    wrong = [check.look_at_clock(0, 5.3 + now, now) for now in (0.4, 0.5)][-1]
+    assert wrong is not None and "another servo's" not in wrong[1]

@@ -20,7 +20,8 @@ from hil.study.checks import check_study, checked_arm
 from hil.study.dataset import Dataset
 from hil.study.draw import drawn, put, run_count
 from hil.study.figures import Rate, figures
-from hil.study.fleet import fleet
+from hil.study.fleet import fleets
+from hil.study.page import write_page
 from hil.study.schema import Study, load_study
 from hil.study.work import Spec, flat, work
 
@@ -211,7 +212,50 @@ def test_the_arm_unlike_its_fleet_is_found_and_no_other() -> None:
             "parameters.gravity_1.std": std,
         }
     )
-    found = fleet(table)
-    assert found.arms == 20
+    (found,) = fleets(table)
+    assert len(found.arms) == 20
+    assert max(abs(each) for each in found.arms[7].deviations) > 4.0 > max(map(abs, found.arms[3].deviations))
     assert [(each.recording, each.name) for each in found.unlike] == [("arm_7", "coulomb_1")]
     assert math.isclose(found.spreads[0].spread, 0.0025, rel_tol=0.5)
+
+
+def test_arms_are_compared_with_those_of_their_own_type(tmp_path: Path) -> None:
+    kinds = ["XM430-W350, XM430-W350"] * 6 + ["XL330-M288, XL330-M288"] * 4 + [None]
+    values = [0.05] * 6 + [0.01] * 4 + [None]
+    table = pa.table(
+        {
+            "recording": [f"runs/arm_{index}" for index in range(11)],
+            "status": ["done"] * 10 + ["failed"],
+            "message": [""] * 10 + ["no samples"],
+            "arm_type": kinds,
+            "verdict.trust": ["yes"] * 10 + [None],
+            "parameters.coulomb_1.value": [value and value * (1 + 0.01 * i) for i, value in enumerate(values)],
+            "parameters.coulomb_1.std": [1e-5] * 10 + [None],
+        }
+    )
+    larger, smaller = fleets(table)
+    assert (larger.type, len(larger.arms), len(smaller.arms)) == ("XM430-W350, XM430-W350", 6, 4)
+    assert not larger.unlike and not smaller.unlike
+    write_page(table, "fleet", tmp_path / "study.html")
+    page = (tmp_path / "study.html").read_text(encoding="utf-8")
+    assert "Fleet of XL330-M288, XL330-M288: 4 arms" in page and "arm_9" in page and "No arm is an outlier" in page
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ("5", "vary.fake.seed = 5: must be a list of values or a draw"),
+        ("[[1]]", r"vary.fake.seed\[1\] = \[1\]: must be a number"),
+        ("{ unifrom = [1, 2] }", "vary.fake.seed.unifrom is not a known key; did you mean uniform"),
+        ("{ log_uniform = [3, 1] }", "vary.fake.seed: log_uniform = .* the first must not be larger"),
+        ("{ choice = [] }", "vary.fake.seed.choice = .*: needs at least 1"),
+    ],
+)
+def test_what_is_wrong_in_vary_is_named_without_the_schema_s_own_words(
+    values: str, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(f'[study]\ntask = "empty"\nruns = 2\n[vary]\n"fake.seed" = {values}\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_study(path)
+    assert "union[" not in str(caught.value) and "~" not in str(caught.value)

@@ -1,0 +1,78 @@
+"""Choice of a spatial arm's model: terms are added as long as the recording supports them.
+
+Torque scales are no such choice: they belong to the model wherever the torque constants are uncertain.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from hil.estimator.chain.identify import ChainEstimate, identify_chain
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import ConvergenceError
+
+ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of a rounded angle [encoder steps]
+
+
+@dataclass(frozen=True)
+class ChoiceOptions:
+    """Options of the choice."""
+
+    explained_residual: float = 1.06
+    """RMS residual of the worst joint, in units of encoder rounding, below which no further term is tried."""
+    significance: float = 1e-3
+    """Significance level at which a term is kept (likelihood ratio, corrected for the residual's correlation)."""
+
+
+OPTIONS = ChoiceOptions()
+
+
+def choose_chain(
+    periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior, options: ChoiceOptions = OPTIONS
+) -> ChainEstimate:
+    """Estimate under `model`, and under richer ones if it leaves more than encoder rounding; return the best supported.
+
+    Raises what `identify_chain` raises for `model` itself.
+    """
+    best = identify_chain(periods, model, prior)
+    while float(best.residual_steps.max()) > options.explained_residual * ROUNDING:
+        found = [_tried(periods, richer, prior) for richer in _richer(best.model)]
+        gains = [(_gain(best, each, options), each) for each in found if each is not None]
+        if not gains:
+            break
+        gain, better = max(gains, key=lambda pair: pair[0])
+        if gain <= 0.0:
+            break
+        best = better
+    return best
+
+
+def _richer(model: ChainModel) -> list[ChainModel]:
+    """Return the models with one more term."""
+    more = [] if model.zeros or model.joints == 1 else [replace(model, zeros=True)]
+    if model.friction == "coulomb":
+        more.append(replace(model, friction="stribeck"))
+    if model.friction == "stribeck":
+        more.append(replace(model, friction="stribeck_load"))
+    return more
+
+
+def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate | None:
+    try:
+        return identify_chain(periods, model, prior)
+    except ConvergenceError:
+        return None
+
+
+def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
+    """Return the rise of twice the log likelihood, beyond what chance explains; each joint's noise is unknown."""
+    before, after = (np.nansum(np.square(each.residual), axis=1) for each in (simple, rich))
+    samples = np.isfinite(simple.residual).sum(axis=1)
+    ratio = samples * np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
+    added = len(rich.names) - len(simple.names)
+    level = float(chi2.isf(options.significance, added))
+    return float(ratio.sum()) / max(simple.correlation_time, 1.0) - level

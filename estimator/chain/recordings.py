@@ -1,0 +1,202 @@
+"""Chains estimated from recordings of any motion: no settled period, any experiment.
+
+Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs no
+periodic motion, only torque that was commanded. A measured torque already answers to the motion, so that a simulation
+driven by it gains nothing (docs/theory.md); there the regression is the result, and says so.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
+from hil.estimator.chain.fit.regression import filtered_torque, fit_filtered
+from hil.estimator.chain.fit.stage1 import ChainLinear
+from hil.estimator.chain.fit.stage2 import fit_periods
+from hil.estimator.chain.identify import BELIEVED
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.data.fourier import PeriodicMotion
+from hil.estimator.data.recording import Recording
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.errors import ModelError, RecordingError
+from hil.estimator.fit.covariance import autocorrelation
+
+CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the regression: the first that the recordings' rate and length allow
+LAG = 1e-3  # s: typical lag of a current loop, assumed by the regression
+VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is taken
+
+
+@dataclass(frozen=True)
+class MotionPiece(SettledPeriod):
+    """A recording sampled at equal intervals, for the likelihood of settled periods. Its motion need not be periodic.
+
+    The torque before the first sample is taken to be the last one; the initial state absorbs the difference.
+    """
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "valid", np.isfinite(self.position))
+        assert self.position_std is not None  # `of` gives it
+        object.__setattr__(self, "noise", self.position_std)
+
+    @classmethod
+    def of(cls, recording: Recording) -> "MotionPiece":
+        """Resample a recording: angles by interpolation, torques by their mean over each interval."""
+        dt = recording.interval
+        count = int((recording.time[-1] - recording.time[0]) / dt + 1e-9)
+        at = recording.time[0] + dt * np.arange(count + 1)
+        nearest = np.clip(np.searchsorted(recording.time, at[:-1] - 0.5 * dt), 0, recording.time.size - 1)
+        position = np.stack([np.interp(at[:-1], recording.time, row) for row in recording.filled()])
+        position = np.where(np.isfinite(recording.position[:, nearest]), position, np.nan)
+        torque = recording.mean_torque(at - recording.command_to_sample, 0.0)
+        return cls(
+            1.0 / dt,
+            torque,
+            position,
+            recording.command_to_sample,
+            recording.position_step,
+            position_std=recording.noise,
+        )
+
+
+@dataclass(frozen=True)
+class RecordedChain:
+    """Parameters of a chain estimated from recordings of any motion."""
+
+    model: ChainModel
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    value: Array
+    covariance: Array
+    simulated: bool
+    """Whether the likelihood was used; False: regression, because the torque was measured."""
+    residual_over_noise: Array
+    """RMS of the one-step-ahead residual relative to the noise of the angles (joints,); NaN for a regression."""
+    residual: Array
+    """RMS of the one-step-ahead residual (joints,) [rad]; NaN for a regression."""
+    torque_residual: Array
+    """RMS of the regression's torque residual relative to the torque (joints,)."""
+    positions: tuple[Array, ...]
+    """One-step-ahead prediction for each recording (joints, samples) [rad] at `MotionPiece`'s times."""
+    cutoff: float
+    """Cut-off frequency of the regression [Hz]."""
+    from_prior: tuple[str, ...]
+    """Base parameters that the data hardly determine."""
+
+    @property
+    def std(self) -> Array:
+        """Standard errors."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values by name [SI]."""
+        return dict(zip(self.names, self.value.tolist(), strict=True))
+
+
+@one_blas_thread
+def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> RecordedChain:
+    """Estimate the parameters of `model` from recordings of any motion.
+
+    Raises ModelError for other numbers of joints, RecordingError if a recording cannot be filtered, ConvergenceError if
+    no minimum is found.
+    """
+    for recording in recordings:
+        if recording.joints != model.joints:
+            raise ModelError(f"the model has {model.joints} joints and a recording {recording.joints}: they must agree")
+    value, std, cutoff = _regression(recordings, model, prior)
+    left = _torque_residual(recordings, model, value, cutoff)
+    count = model.base.count
+    if any(recording.between != "held" for recording in recordings):
+        nothing = np.full(model.joints, np.nan)
+        return RecordedChain(
+            model,
+            model.linear_names,
+            model.units[: len(value)],
+            value,
+            np.diag(std**2) * _repeated(recordings, model, value, cutoff),
+            False,
+            nothing,
+            nothing,
+            left,
+            (),
+            cutoff,
+            _from_prior(model, std[:count], prior),
+        )
+    pieces = [MotionPiece.of(recording) for recording in recordings]
+    linear = ChainLinear(value, std, LAG, tuple(map(_beginning, pieces)), left)
+    fit = fit_periods(pieces, model, linear, prior)
+    squares = [np.square(piece.position - found) for piece, found in zip(pieces, fit.positions, strict=True)]
+    rms = np.sqrt(np.nanmean(np.concatenate(squares, axis=1), axis=1))
+    noise = np.sqrt(np.mean([np.square(piece.noise) for piece in pieces], axis=0))
+    spread = np.sqrt(np.diag(fit.covariance))[:count]
+    return RecordedChain(
+        model,
+        model.names,
+        model.units,
+        fit.value,
+        fit.covariance,
+        True,
+        rms / noise,
+        rms,
+        left,
+        fit.positions,
+        cutoff,
+        _from_prior(model, spread, prior),
+    )
+
+
+def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array:
+    """Return the RMS error of the torque that the parameters require for recordings, relative to its RMS (joints,)."""
+    value = np.array([found.parameters[name] for name in found.model.linear_names])
+    return _torque_residual(recordings, found.model, value, found.cutoff)
+
+
+def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> tuple[Array, Array, float]:
+    for cutoff in CUTOFFS[:-1]:
+        try:
+            return (*fit_filtered(recordings, model, prior, cutoff, LAG), cutoff)
+        except RecordingError:
+            continue
+    return (*fit_filtered(recordings, model, prior, CUTOFFS[-1], LAG), CUTOFFS[-1])
+
+
+def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> float:
+    """Return the factor by which correlation of the torque residual widens the variance of the parameters.
+
+    The sum of the autocorrelation up to its first negative value, of the worst joint. Errors of the regressor itself
+    are not in it.
+    """
+    most = 1.0
+    for recording in recordings:
+        Y, torque = filtered_torque(recording, model, cutoff, LAG)
+        for row in torque - Y @ value:
+            rho = autocorrelation(row, row.size // 4)
+            negative = np.flatnonzero(rho <= 0.0)
+            most = max(most, 1.0 + 2.0 * float(rho[1 : negative[0] if negative.size else rho.size].sum()))
+    return most
+
+
+def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> Array:
+    rows = [filtered_torque(recording, model, cutoff, LAG) for recording in recordings]
+    torque = np.concatenate([tau for _, tau in rows], axis=1)
+    left = torque - np.concatenate([Y for Y, _ in rows], axis=1) @ value
+    return np.asarray(np.sqrt(np.mean(left**2, axis=1) / np.maximum(np.mean(torque**2, axis=1), 1e-12)))
+
+
+def _beginning(piece: MotionPiece) -> PeriodicMotion:
+    """Return the motion, with velocities from smoothed angles; only its beginning and its level matter."""
+    position = piece.filled()
+    kernel = np.ones(VELOCITY_SAMPLES) / VELOCITY_SAMPLES
+    padded = np.pad(position, ((0, 0), (VELOCITY_SAMPLES // 2,) * 2), mode="edge")
+    smooth = np.stack([np.convolve(row, kernel, mode="valid") for row in padded])
+    velocity = np.gradient(smooth, 1.0 / piece.rate, axis=1)
+    velocity[:, : VELOCITY_SAMPLES // 2] = velocity[:, VELOCITY_SAMPLES // 2 : VELOCITY_SAMPLES // 2 + 1]
+    return PeriodicMotion(position, velocity, np.zeros_like(velocity))
+
+
+def _from_prior(model: ChainModel, std: Array, prior: Prior) -> tuple[str, ...]:
+    wide = std > BELIEVED * prior.std
+    return tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_)

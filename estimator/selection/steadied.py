@@ -1,0 +1,51 @@
+"""Periods corrected for friction that changes while they are recorded, as it does while grease warms up.
+
+A fit assumes constant friction. If friction changes by a fraction c per second, the torque c (t - t_middle) F(t) is
+missing in it, where F is the friction torque. F is known well from the measured motion and a first fit, and c from a
+later recording (`hil.estimator.selection.drift`), so that the product, a small part of the friction, can be taken from
+the commanded torque. The fit then holds for the middle of the period.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.fourier import cut_off, lines_of, motion_of
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.identify import Estimate
+from hil.estimator.selection.drift import Drift
+
+LEAST_WIDTH = 0.01  # rad/s: width of the Coulomb step for models without one, such as bristles
+
+
+def friction_torque(period: SettledPeriod, estimate: Estimate) -> Array:
+    """Return the friction (joints, samples) [N m] of `estimate` in the measured motion of `period`."""
+    lines = lines_of(period.filled())
+    velocity = motion_of(lines, cut_off(lines), period.fundamental, period.samples).velocity
+    friction = np.empty_like(velocity)
+    for joint, v in enumerate(velocity):
+
+        def of(name: str, absent: float = 0.0, joint: int = joint) -> float:
+            return estimate.parameters.get(f"{name}_{joint + 1}", absent)
+
+        bump = np.exp(-np.minimum((v / of("stribeck_velocity", 1.0)) ** 2, 50.0))
+        level = of("coulomb") * (1.0 + of("stribeck_rise") * bump) + of("load") * np.abs(period.torque[joint])
+        bend = np.tanh(v / max(of("coulomb_width", LEAST_WIDTH), 1e-4))
+        friction[joint] = of("viscous") * v + of("viscous_asymmetry") * v * bend + level * bend
+    return friction
+
+
+def steadied(period: SettledPeriod, estimate: Estimate, drift: Drift) -> SettledPeriod:
+    """Return `period` with the torque that it would have needed under the friction of its middle.
+
+    estimate: fitted to this period, or to one under the same friction. drift: change of friction over `drift.seconds`.
+    """
+    seconds = np.arange(period.samples) / period.rate
+    since = (seconds - seconds.mean()) / drift.seconds
+    scale = np.array([estimate.parameters.get(f"torque_scale_{joint + 1}", 1.0) for joint in range(period.joints)])
+    lacking = drift.change[:, None] * since * friction_torque(period, estimate) / scale[:, None]
+    stabiliser = period.stabiliser
+    if stabiliser is not None:
+        stabiliser = replace(stabiliser, excitation=stabiliser.excitation - lacking)
+    return replace(period, torque=period.torque - lacking, stabiliser=stabiliser)

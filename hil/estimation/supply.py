@@ -1,0 +1,107 @@
+"""A supply whose voltage sags under load: found in the servos' Present Input Voltage, and what it does to the torque.
+
+The bridge of a motor that gets the voltage u (or the current i) at the velocity v draws a current in proportion to
+u^2 and u v (i^2 and i v) from the supply, whose resistance turns it into a drop. The register is read a few times a
+second only, in steps of 0.1 V. A regression of its readings on these products over the whole recording gives the drop
+at every sample nevertheless.
+
+A voltage-driven joint gets its duty cycle's share of what the supply gives at that moment: its torque sags with it. A
+current-driven joint is not affected as long as its servo can still drive the current.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+
+Array = NDArray[np.float64]
+
+FEWEST = 40
+"""Fewest readings of the voltage."""
+STEP_V = 0.1  # of the register
+SIGNIFICANT = 6.0
+"""Standard errors that the drop at full load must differ from zero."""
+LEAST = {Mode.PWM: 0.005, Mode.CURRENT: 0.05}
+"""Largest drop, relative to the voltage without load, that is not worth mentioning, by what drives the joints."""
+_FULL_LOAD = 0.99  # quantile of the drop
+
+
+@dataclass(frozen=True)
+class Sag:
+    """A supply that sags.
+
+    volts: without load, at each servo (joints,) [V]. by_square, by_product: drop per goal squared and per goal times
+    velocity of each joint (joints,). worst: drop at full load [V]. volts and goals as recorded [A, or V under PWM].
+    """
+
+    volts: Array
+    by_square: Array
+    by_product: Array
+    worst: float
+
+    @property
+    def share(self) -> float:
+        """Drop at full load relative to the voltage without load."""
+        return self.worst / float(self.volts.min())
+
+    def remaining(self, samples: NDArray[np.void]) -> Array:
+        """Voltage relative to that without load (samples, joints)."""
+        goal, velocity = samples["goal_current"], np.nan_to_num(samples["velocity"])
+        drop = goal**2 @ self.by_square + (goal * velocity) @ self.by_product
+        return np.asarray(1.0 - np.maximum(drop, 0.0)[:, None] / self.volts)
+
+
+def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
+    """Find a drop of the supply voltage under load in a whole recording; None if there is none worth mentioning."""
+    goal, velocity, volts = samples["goal_current"], samples["velocity"], samples["supply_voltage"]
+    joints = goal.shape[1]
+    read = np.isfinite(volts) & np.isfinite(velocity).all(axis=1)[:, None]
+    row, at = np.nonzero(read)
+    if len(row) < FEWEST or len(set(at)) < joints:
+        return None
+    load = np.concatenate((goal[row] ** 2, goal[row] * velocity[row]), axis=1)
+    size = np.sqrt(np.mean(load**2, axis=0))
+    A = np.concatenate((np.eye(joints)[at], -load / np.maximum(size, 1e-12)), axis=1)
+    measured = volts[row, at].astype(np.float64)
+    solution = np.linalg.lstsq(A, measured, rcond=1e-9)[0]
+    variance = max(float(np.mean((measured - A @ solution) ** 2)), STEP_V**2 / 12)
+    covariance = variance * np.linalg.pinv(A.T @ A, hermitian=True)
+    drop = -A[:, joints:] @ solution[joints:]
+    full = int(np.argsort(drop)[round(_FULL_LOAD * (len(drop) - 1))])
+    std = float(np.sqrt(A[full, joints:] @ covariance[joints:, joints:] @ A[full, joints:]))
+    slopes = solution[joints:] / np.maximum(size, 1e-12)
+    sag = Sag(solution[:joints], slopes[:joints], slopes[joints:], float(drop[full]))
+    least = LEAST[Mode.PWM if by_voltage(config).any() else Mode.CURRENT]
+    return sag if sag.worst > SIGNIFICANT * std and sag.share > least else None
+
+
+def by_voltage(config: Config) -> NDArray[np.bool_]:
+    """Which joints are driven by voltage (joints,)."""
+    return np.array([joint.drive_mode is Mode.PWM for joint in config.joints])
+
+
+def torque_factor(config: Config, sag: Sag | None, samples: NDArray[np.void]) -> Array:
+    """Torque relative to that of a stiff supply (samples, joints)."""
+    if sag is None:
+        return np.ones(samples["goal_current"].shape)
+    return np.where(by_voltage(config), sag.remaining(samples), 1.0)
+
+
+def supply_notes(config: Config, sag: Sag | None) -> tuple[str, ...]:
+    """Sentences for the verdict."""
+    if sag is None:
+        return ()
+    found = f"The supply sags: its voltage falls by up to {sag.worst:.2g} V ({100 * sag.share:.2g} %) under load."
+    if by_voltage(config).any():
+        names = " and ".join(j.name for j, voltage in zip(config.joints, by_voltage(config), strict=True) if voltage)
+        return (
+            f"{found} The torque of {names}, driven by voltage, falls with it, which is taken into account. A stronger "
+            "supply or a shorter, thicker cable helps.",
+        )
+    return (
+        f"{found} The servos control their current, so that it matters only where they are fast: see whether the "
+        "measured current follows. A stronger supply or a shorter, thicker cable helps.",
+    )

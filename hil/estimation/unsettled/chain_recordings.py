@@ -1,0 +1,189 @@
+"""Spatial arms from other tools' recordings: what the estimator found, checked on the last part, as a result."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.csv_columns import RecordingConfig
+from hil.description.arm import ArmDescription, ArmFileError
+from hil.description.files import read_arm
+from hil.description.urdf import rotation_of
+from hil.errors import ConfigError
+from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import EstimationError
+from hil.results.parts import ChainFacts, Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
+from hil.results.result import ShootingResult
+
+Array = NDArray[np.float64]
+
+FITTED_SHARE = 0.75  # of each recording, for the check on the rest
+EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
+TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
+UNSUPPORTED = ("presliding", "asymmetry", "ripple", "saturation", "cable", "encoder", "lags")
+
+
+@dataclass(frozen=True)
+class ChainEstimated:
+    """result: without what the caller adds. predicted: of each recording (joints, samples) [rad], NaN where none is."""
+
+    result: ShootingResult
+    predicted: tuple[Array, ...]
+
+
+def estimate_chain_recordings(
+    recordings: Sequence[Recording], config: RecordingConfig, shown_path: str
+) -> ChainEstimated:
+    """Estimate a spatial arm from recordings. Raises ConfigError, ArmFileError, EstimationError."""
+    refused = [option for option in UNSUPPORTED if getattr(config.model, option)]
+    if refused:
+        raise ConfigError(f"model.{refused[0]} = true: only planar arms support this term so far; remove it.")
+    began = time.perf_counter()
+    arm = _described(config, recordings[0].joints)
+    gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
+    base = BaseParameters.of(Chain(*arm.geometry, gravity))
+    prior = Prior.of(base, arm.parameters)
+    wanted = config.model
+    model = ChainModel(
+        base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1
+    )
+    found = identify_recordings(recordings, model, prior)
+    foretold = _held_out(recordings, model, prior)
+    linear = len(model.linear_names)
+    entries = {
+        name: Quantity(float(value), float(std), unit)
+        for name, value, std, unit in zip(found.names, found.value, found.std, found.units, strict=True)
+    }
+    steps = np.max([each.position_step for each in recordings], axis=0)
+    result = ShootingResult(
+        method=_method(found),
+        config=shown_path,
+        joints=model.joints,
+        parameters=dict(list(entries.items())[:linear]),
+        extra=dict(list(entries.items())[linear:]),
+        covariance=Covariance(found.names, tuple(map(tuple, found.covariance.tolist()))),
+        fit=ShootingFit(
+            residual_rms_rad=tuple(found.residual.tolist()),
+            residual_rms_ticks=tuple((found.residual / steps).tolist()),
+            samples=int(sum(each.time.size for each in recordings)),
+            segments=len(recordings),
+        ),
+        validation=Validation(
+            residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
+        ),
+        verdict=_verdict(found, arm, foretold, prior),
+        timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
+        chain=ChainFacts(
+            urdf=Path(config.arm.urdf or "").name,
+            rotation=tuple(tuple(map(tuple, each)) for each in base.chain.rotation.tolist()),
+            translation=tuple(map(tuple, base.chain.translation.tolist())),
+            axis=tuple(map(tuple, base.chain.axis.tolist())),
+            gravity=tuple(base.chain.gravity.tolist()),
+            groups=dict(zip(base.names, base.groups, strict=True)),
+            from_prior=found.from_prior,
+            held=arm.held,
+            doubts=arm.doubts,
+        ),
+    )
+    return ChainEstimated(result, _predicted(recordings, found))
+
+
+def _described(config: RecordingConfig, joints: int) -> ArmDescription:
+    assert config.arm.urdf is not None  # the caller's condition
+    names = config.joint_names
+    if names is None:
+        raise ConfigError(
+            f"{config.arm.urdf} names the arm, but nothing names its joints: give one [[joints]] with name = "
+            "per column of columns.position, from the base outwards."
+        )
+    if len(names) != joints:
+        raise ConfigError(f"{len(names)} [[joints]], but {joints} columns of positions: give one per joint.")
+    try:
+        return read_arm(Path(config.arm.urdf), names)
+    except ArmFileError as error:
+        raise ConfigError(f"arm.urdf: {error}") from error
+
+
+def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
+    """Return the relative torque error on the last part, of parameters from the rest; None if a part is too short."""
+    try:
+        first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
+        last = [_part(each, FITTED_SHARE, 1.0) for each in recordings]
+        return torque_error(last, identify_recordings(first, model, prior))
+    except EstimationError:
+        return None
+
+
+def _part(recording: Recording, start: float, end: float) -> Recording:
+    some = slice(int(start * recording.time.size), int(end * recording.time.size))
+    return Recording(
+        recording.time[some],
+        recording.torque[:, some],
+        recording.position[:, some],
+        recording.position_step,
+        recording.between,
+        recording.command_to_sample,
+    )
+
+
+def _method(found: RecordedChain) -> str:
+    if found.simulated:
+        return (
+            f"filtered inverse dynamics ({found.cutoff:g} Hz), then maximum likelihood of one-step-ahead position "
+            f"predictions with an observer; {found.model.description}; any motion, commanded torque"
+        )
+    return (
+        f"filtered inverse dynamics ({found.cutoff:g} Hz) by weighted least squares: the torque was measured, not "
+        f"commanded, so nothing was simulated; viscous and Coulomb friction only"
+    )
+
+
+def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, prior: Prior) -> Verdict:
+    names = found.model.base.names
+    weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
+    trust, sentences = "yes", []
+    if found.simulated:
+        worst = float(found.residual_over_noise.max())
+        joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
+        sentences.append(f"The residual of {joint} is the largest: {worst:.2f} times the noise of its angle.")
+        trust = trust if worst <= EXPLAINED else "with care"
+    else:
+        trust = "with care"
+        sentences.append(
+            "The torque was taken as measured, so the result is a regression, whose errors are not only random. If the "
+            'columns hold commands, set columns.between = "held": their likelihood is many times as exact.'
+        )
+    if foretold is None:
+        trust = "with care"
+        sentences.append("The recordings are too short to check the prediction on a part that was not fitted.")
+    else:
+        error, joint = float(foretold.max()), arm.joints[int(np.argmax(foretold))].name
+        part = f"the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
+        sentences.append(
+            f"Fitted to the rest, the torque on {part} is predicted to {100 * error:.1f} %, {joint} worst."
+        )
+        trust = "no" if error > TORQUE_WRONG else "with care" if error > TORQUE_FORETOLD else trust
+    if found.from_prior:
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(
+            f"The recordings hardly determine {', '.join(found.from_prior)}: these values come from the URDF."
+        )
+    return Verdict(trust, weakest, tuple(sentences))
+
+
+def _predicted(recordings: Sequence[Recording], found: RecordedChain) -> tuple[Array, ...]:
+    if not found.simulated:
+        return tuple(np.full_like(each.position, np.nan) for each in recordings)
+    predicted = []
+    for recording, position in zip(recordings, found.positions, strict=True):
+        at = recording.time[0] + np.arange(position.shape[1]) / MotionPiece.of(recording).rate
+        predicted.append(np.stack([np.interp(recording.time, at, row) for row in position]))
+    return tuple(predicted)

@@ -1,0 +1,41 @@
+"""Limits on what is commanded: each joint's goal limit, its rate of change, and no value that is not a number."""
+
+from collections.abc import Sequence
+from math import inf
+from typing import NoReturn
+
+from hil.config.schema import Config
+from hil.errors import Cause, SafetyStop
+
+
+class CommandLimits:
+    """Clamps goals, whatever computed them."""
+
+    def __init__(self, config: Config) -> None:
+        self._names = [joint.joint.title for joint in config.joints]
+        self._limits = [joint.goal_limit for joint in config.joints]
+        self._slew = config.safety.slew / config.experiment.rate
+        self._former = [0.0] * len(config.joints)
+
+    def clamp(self, goals: Sequence[float]) -> list[float]:
+        """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
+        slew = self._slew
+        clamped = []
+        for index, (goal, former, limit) in enumerate(zip(goals, self._former, self._limits, strict=True)):
+            if not abs(goal) < inf:
+                self._not_a_number(index, goal)
+            wanted = limit if goal > limit else -limit if goal < -limit else goal
+            change = wanted - former
+            clamped.append(former + slew if change > slew else former - slew if change < -slew else wanted)
+        self._former = clamped
+        return clamped
+
+    def holding(self, goals: Sequence[float]) -> None:
+        """The goals that the servos have now [A or V]: `clamp` goes on from there."""
+        self._former = list(goals)
+
+    def _not_a_number(self, index: int, goal: float) -> NoReturn:
+        raise SafetyStop(
+            f"{self._names[index]} would have received a goal current of {goal}, which is not a number.",
+            Cause.NOT_A_NUMBER,
+        )

@@ -1,0 +1,77 @@
+"""Missed deadlines: how long the arm may be without a command, and what share of the deadlines may be missed."""
+
+from hil.config.schema import Config
+from hil.errors import Cause, SafetyStop
+from hil.plan.silence import late_limit
+
+LATE_SHARE = 0.2
+"""Fraction of deadlines that may be missed permanently."""
+
+_OFTEN_LATE = 5.0
+_OF_ONE_STALL = 2  # number of deadlines counted per stall
+
+_WHY_LATE = (
+    "This program was stopped (Ctrl-Z, SIGSTOP, a debugger), the computer was suspended, or other programs kept it "
+    "busy: close those programs, or lower experiment.rate."
+)
+
+
+class Deadlines:
+    """Counts missed deadlines of the samples. Every method may raise SafetyStop."""
+
+    def __init__(self, config: Config) -> None:
+        self._interval = 1.0 / config.experiment.rate
+        self._watchdog = config.safety.watchdog
+        self._limit = late_limit(config)
+        self._most_often = max(_OFTEN_LATE, 0.5 * self._limit.seconds / self._interval)
+        self._in_a_row = 0
+        self._often = 0.0
+
+    def missed(self, seconds: float = 0.0) -> None:
+        """Record a missed deadline, `seconds` after the last command."""
+        self._in_a_row += 1
+        if self._in_a_row <= _OF_ONE_STALL:
+            self._often += 1.0
+        seconds = max(seconds, self._in_a_row * self._interval)
+        allowed, said = self._limit
+        if seconds <= allowed:
+            return
+        missed = max(self._in_a_row, int(seconds / self._interval))
+        raise SafetyStop(
+            f"{missed} deadlines in a row were missed, {_told(seconds)} without a command; {said} allows "
+            f"{1e3 * allowed:.0f} ms. {_WHY_LATE}{self._acted(seconds)}",
+            Cause.LATE,
+        )
+
+    def met(self) -> None:
+        """Record a sample taken on time. A single stall does not count, a large share of missed deadlines does."""
+        self._in_a_row = 0
+        if self._often <= 0.0:
+            return
+        self._often = max(0.0, self._often - LATE_SHARE)
+        if self._often >= self._most_often:
+            raise SafetyStop(
+                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed: the replies arrive too late for "
+                f"{1 / self._interval:g} Hz. `hil check` measures what this bus can do: check the adapter's latency "
+                "timer and the servos' return delay, or lower experiment.rate.",
+                Cause.LATE,
+            )
+
+    def check_gap(self, seconds: float) -> None:
+        """Check the time between two exchanges: the servos' watchdogs must not have acted."""
+        if seconds >= self._watchdog:
+            raise SafetyStop(
+                f"This program stalled: {_told(seconds)} passed between two commands. {_WHY_LATE}"
+                f"{self._acted(seconds)}",
+                Cause.LATE,
+            )
+
+    def _acted(self, seconds: float) -> str:
+        """What the servos' watchdogs did during the gap."""
+        if seconds < self._watchdog:
+            return ""
+        return f" The servos' watchdogs act after {1e3 * self._watchdog:.0f} ms, so the arm had no current by then."
+
+
+def _told(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds >= 1.0 else f"{1e3 * seconds:.0f} ms"

@@ -1,0 +1,52 @@
+"""Breakaway of joints that friction holds: more torque from run to run, stopped soon after a joint begins to move.
+
+A joint that stood still reveals little but that its friction is larger than the torque. Just above it, motion grows
+quickly: in a large part of the plausible arms even a few percent more torque passes a limit, so that an amplitude which
+is safe for a whole run can hardly be raised. Instead, the guard gets narrow limits for such joints. The torque can then
+grow by a constant ratio up to the current limit, and the run ends, braked, where the joint has shown its friction.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.joint import JointConfig
+from hil.config.schema import Config
+from hil.pilot.options import PilotOptions
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
+    """Return `torque` (joints,) [N m], with that of joints that stood `still` raised from that of the `former` run.
+
+    most: torque that the current limits allow (joints,) [N m].
+    """
+    return np.asarray(np.where(still, np.minimum(ratio * former, most), torque))
+
+
+def narrowed(config: Config, pose: Array, still: Mask, options: PilotOptions) -> Config:
+    """Return the configuration with position limits close to `pose` (joints,) [rad] for joints that stood `still`."""
+    joints = [
+        joint.model_copy(update={"position_limit": _near(joint, at, options)}) if held else joint
+        for joint, at, held in zip(config.joints, pose.tolist(), still.tolist(), strict=True)
+    ]
+    return config.model_copy(update={"joints": joints})
+
+
+def _near(joint: JointConfig, pose: float, options: PilotOptions) -> tuple[float, float]:
+    low, high = joint.position_limit
+    least = options.min_breakaway_steps * joint.joint.servo.position_unit
+    below, above = (max(options.breakaway_room * abs(end - pose), least) for end in (low, high))
+    return max(low, pose - below), min(high, pose + above)
+
+
+def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
+    """Return which joints (joints,) only passed limits that `narrow` has brought closer.
+
+    seen: lowest and highest position and largest speed of each joint (3, joints) [rad, rad/s].
+    """
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    near_low, near_high = np.array([joint.position_limit for joint in narrow.joints]).T
+    closer = (near_low > low) | (near_high < high)
+    return np.asarray(closer & ((seen[0] < near_low) | (seen[1] > near_high)))

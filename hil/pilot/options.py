@@ -1,0 +1,73 @@
+"""Options of the pilot identification of planar arms, in one frozen object."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PilotOptions:
+    """Options of the search for the largest safe torque and of the full run."""
+
+    arms: int = 96
+    """Number of arms in the belief's ensemble."""
+    pilot_shares: tuple[float, ...] = (0.45, 0.6, 0.75, 0.9)
+    """Fraction of the limits that successive pilots may use; the last one applies to all further pilots."""
+    pilot_share_known: float = 0.75
+    """Fraction of the limits that the first pilot may use if the belief comes from an earlier result."""
+    max_steps: int = 12
+    """Maximum number of runs between the last pilot and the full run."""
+    max_pilots: int = 40
+    """Maximum number of pilots; a still joint reaches its current limit in far fewer."""
+    certain_share: float = 0.85
+    """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
+    certain_share_known: float = 0.72
+    """The same if the belief comes from an earlier result: another run would hardly narrow it."""
+
+    pilot_period_share: float = 0.5
+    """Period of a pilot, relative to experiment.period."""
+    max_pilot_settling: int = 1
+    """Maximum number of settling periods of a pilot or an intermediate run."""
+
+    first_torque_share: float = 0.02
+    """Torque of the first pilot, relative to what the current limits allow, if no torque is safe in the whole range."""
+    breakaway_raise: float = 1.6
+    """Ratio of successive peak torques of a joint that has not moved yet."""
+    breakaway_room: float = 0.25
+    """Fraction of the way to its position limits after which a joint that has just broken away is stopped."""
+    min_breakaway_steps: int = 60
+    """Minimum of that way [encoder steps]."""
+
+    at_limit: float = 0.99
+    """Fraction of a torque limit above which the limit counts as reached."""
+    torque_after_limit: float = 0.85
+    """Cap on further torque, relative to the torque at which a limit was exceeded."""
+    torque_after_unsettled: float = 0.85
+    """The same after a run that never settled: large motion with little friction may never settle."""
+    worthwhile_raise: float = 1.15
+    """Minimum ratio of torques that justifies another run if little of the range is unused."""
+    worthwhile_raise_far: float = 1.03
+    """The same if more of the range is unused."""
+    fair_share: float = 0.7
+    """Fraction of a limit reached by a typical arm that separates the two."""
+
+    wide_range: float = 0.74
+    """Fraction of the position range, of the joint that uses least, below which other waves are tried."""
+    other_waves: int = 7
+    """Maximum number of other waves: either sign of each joint, and all of these reversed in time."""
+
+    falling_raise: float = 1.35
+    """Maximum ratio of the torques of two runs of an arm that falls over when it is stopped."""
+    falling_breakaway_raise: float = 1.2
+    """Ratio of successive peak torques of a joint of such an arm that has not moved yet."""
+    falling_share: float = 0.85
+    """Fraction of the limits for such an arm."""
+    min_falling_torque: float = 0.05
+    """Torque that such an arm may get in any case, as a fraction of what the current limit allows."""
+    start_inside: float = 0.95
+    """Fraction of the limits within which an arm is assumed to start that a stopped run left beyond them."""
+
+    max_full_runs: int = 6
+    """Maximum number of full runs if one exceeds a limit or does not settle; each has less torque than the last."""
+    max_unlike_runs: int = 3
+    """Maximum number of full runs that may end because one period was unlike the one before."""
+    max_settle_within: float = 0.1
+    """Largest experiment.settle_within that a repeated full run accepts."""

@@ -1,0 +1,131 @@
+"""Missed deadlines and missing replies: the exact counts and times at which they stop the arm."""
+
+from collections.abc import Callable
+
+import pytest
+
+from hil.config.schema import Config
+from hil.errors import Cause, SafetyStop
+from hil.experiment.deadlines import Deadlines
+from hil.plan.silence import Limit, is_missing_too_long, late_limit, missing_limit
+
+Arm = Callable[..., Config]
+RATE = 400
+
+
+def safety(lines: str) -> tuple[str, str]:
+    return "[experiment]\n", f"[safety]\n{lines}\n\n[experiment]\n"
+
+
+def said_by(action: Callable[[], None]) -> str:
+    with pytest.raises(SafetyStop) as stop:
+        action()
+    assert stop.value.cause is Cause.LATE
+    return str(stop.value)
+
+
+def test_deadlines_missed_in_a_row_count_by_their_number_and_by_the_time_since_the_last_command(arm: Arm) -> None:
+    deadlines = Deadlines(arm())
+    for _ in range(20):
+        deadlines.missed()  # 20 intervals of 2.5 ms are the 50 ms allowed
+    said = said_by(deadlines.missed)
+    assert "21 deadlines in a row were missed, 52 ms without a command; safety.late_time = 0.05 s allows 50 ms" in said
+    assert "watchdogs act" not in said
+    deadlines = Deadlines(arm())
+    deadlines.missed(0.0499)
+    assert "20 deadlines in a row were missed, 51 ms without" in said_by(lambda: deadlines.missed(0.051))
+
+
+def test_a_sample_on_time_begins_the_row_anew(arm: Arm) -> None:
+    deadlines = Deadlines(arm())
+    for _ in range(3):
+        for _ in range(20):
+            deadlines.missed()
+        deadlines.met()
+
+
+def test_what_the_watchdogs_did_during_a_gap(arm: Arm) -> None:
+    deadlines = Deadlines(arm())
+    deadlines.check_gap(0.0799)
+    acted = "The servos' watchdogs act after 80 ms, so the arm had no current by then."
+    said = said_by(lambda: deadlines.check_gap(0.08))
+    assert "This program stalled: 80 ms passed between two commands" in said and said.endswith(acted)
+    assert "1.5 s passed" in said_by(lambda: deadlines.check_gap(1.5))
+    assert "1.0 s passed" in said_by(lambda: deadlines.check_gap(1.0))
+    assert "999 ms passed" in said_by(lambda: deadlines.check_gap(0.999))
+    assert said_by(lambda: deadlines.missed(0.08)).endswith(acted)
+
+
+def rows_until_stop(deadlines: Deadlines, missed: int, met: int) -> int:
+    """Number of rows of missed and met deadlines until too many are missed."""
+    for row in range(200):
+        try:
+            for _ in range(missed):
+                deadlines.missed()
+            for _ in range(met):
+                deadlines.met()
+        except SafetyStop as stop:
+            assert "More than 20 % of the deadlines are missed" in str(stop) and "for 400 Hz" in str(stop)
+            return row
+    return -1
+
+
+@pytest.mark.parametrize(
+    ("missed", "met", "rows"),
+    [
+        (1, 5, -1),  # exactly a fifth
+        (1, 1, 12),  # 0.8 more each time, until 10 are reached: half of the 50 ms allowed
+        (1, 4, 46),
+        (2, 5, 9),
+        (20, 5, 9),  # of one stall only two count
+        (3, 11, -1),
+    ],
+)
+def test_which_share_of_missed_deadlines_stops(arm: Arm, missed: int, met: int, rows: int) -> None:
+    assert rows_until_stop(Deadlines(arm()), missed, met) == rows
+
+
+def test_at_slow_rates_five_count_as_too_many(arm: Arm) -> None:
+    slow = Deadlines(arm(("rate = 400.0", "rate = 50.0"), ("band = [0.5, 6.0]", "band = [0.5, 4.0]")))
+    for _ in range(6):  # 0.8 more each time
+        slow.missed(0.02)
+        slow.met()
+    slow.missed(0.02)
+    with pytest.raises(SafetyStop, match=r"More than 20 %"):
+        slow.met()
+
+
+@pytest.mark.parametrize(
+    ("lines", "missing", "late"),
+    [
+        ("", Limit(0.015, "safety.missing_time = 0.015 s"), Limit(0.05, "safety.late_time = 0.05 s")),
+        (
+            "max_missing = 3\nmax_late = 3",
+            Limit(4 / RATE, "safety.max_missing = 3"),
+            Limit(3.5 / RATE, "safety.max_late = 3"),
+        ),
+        (
+            "max_missing = 500\nlate_time = 0.1",
+            Limit(0.064, "0.8 of safety.watchdog = 0.08 s"),
+            Limit(0.064, "0.8 of safety.watchdog = 0.08 s"),
+        ),
+        (
+            "watchdog = 0.1\nmissing_time = 0.08\nmax_late = 31",
+            Limit(0.08, "safety.missing_time = 0.08 s"),
+            Limit(31.5 / RATE, "safety.max_late = 31"),
+        ),
+    ],
+)
+def test_limits_of_silence(arm: Arm, lines: str, missing: Limit, late: Limit) -> None:
+    config = arm(safety(lines)) if lines else arm()
+    for limit, wanted in ((missing_limit(config), missing), (late_limit(config), late)):
+        assert limit.seconds == pytest.approx(wanted.seconds)
+        assert limit.said == wanted.said
+
+
+@pytest.mark.parametrize(
+    ("count", "seconds", "too_long"),
+    [(1, 1.0, False), (2, 0.015, True), (2, 0.015 - 5e-7, True), (2, 0.015 - 1.5e-6, False), (9, 0.0149, False)],
+)
+def test_missing_too_long(count: int, seconds: float, too_long: bool) -> None:
+    assert is_missing_too_long(count, seconds, Limit(0.015, "")) is too_long

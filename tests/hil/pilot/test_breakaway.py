@@ -1,0 +1,191 @@
+"""Joints that friction holds get more torque from run to run, between narrow limits, up to the current limit."""
+
+from pathlib import Path
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+from hil.config.schema import Config, load_config
+from hil.dry_run.amplitude import most_torque
+from hil.errors import Cause, DidNotMove, ExperimentError, NoSafeTorque, NotSettled, SafetyStop
+from hil.pilot import full
+from hil.pilot.breakaway import broke_free, narrowed, raised
+from hil.pilot.options import PilotOptions
+from hil.pilot.search import Search
+from hil.pilot.steps import Played, Step, tells_of_the_arm
+from hil.runs.run_folder import RunFolder
+from tests.support.paths import CONFIGS
+
+OPTIONS = PilotOptions()
+SHOULDER = np.array([True, False])
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(CONFIGS / "first_time.toml")
+
+
+def test_only_joints_that_stood_still_are_raised_and_no_farther_than_their_limit() -> None:
+    torque, former, most = np.array([0.1, 0.1, 0.1]), np.array([0.1, 0.2, 0.3]), np.array([1.0, 1.0, 0.4])
+    still = np.array([False, True, True])
+    assert raised(torque, former, still, 1.6, most).tolist() == pytest.approx([0.1, 0.32, 0.4])
+
+
+def test_limits_come_close_to_where_the_joint_is(config: Config) -> None:
+    pose = np.array([-1.4, 0.1])
+    near = narrowed(config, pose, SHOULDER, OPTIONS)
+    low, high = near.joints[0].position_limit
+    full_low, full_high = config.joints[0].position_limit
+    assert full_low < low < pose[0] < high < full_high
+    assert pose[0] - low == pytest.approx(OPTIONS.breakaway_room * (pose[0] - full_low))
+    assert near.joints[1] == config.joints[1]
+
+
+def test_a_joint_at_its_limit_has_room_for_its_motion_to_be_seen_but_none_beyond_the_limit(config: Config) -> None:
+    low, _ = config.joints[0].position_limit
+    near_low, near_high = narrowed(config, np.array([low, 0.0]), SHOULDER, OPTIONS).joints[0].position_limit
+    assert near_low == low
+    assert near_high >= low + OPTIONS.min_breakaway_steps * config.joints[0].joint.servo.position_unit
+
+
+def test_passing_a_narrow_limit_is_told_from_passing_one_of_the_configuration(config: Config) -> None:
+    pose = np.array([-1.5, 0.0])
+    near = narrowed(config, pose, SHOULDER, OPTIONS)
+    beyond = near.joints[0].position_limit[1] + 0.01
+    seen = np.array([pose, [beyond, 0.3], [2.0, 1.0]])
+    assert broke_free(config, near, seen).tolist() == [True, False]
+    assert not broke_free(config, config, seen).any()
+
+
+class Held:
+    """A player of an arm whose joints move only once their torque exceeds `friction` (joints,) [N m]."""
+
+    def __init__(self, friction: list[float]) -> None:
+        self.friction = np.array(friction)
+        self.torques: list[np.ndarray] = []
+        self.configs: list[Config] = []
+
+    def play(self, config: Config, _folder: object, name: str, found: object, _arms: object) -> Played:
+        torque = found.peak_torque  # type: ignore[attr-defined]
+        self.torques.append(torque)
+        self.configs.append(config)
+        moves = torque > self.friction
+        seen = Mock(swing=np.where(moves, 0.3, 0.0), end=np.array(config.arm.rest_pose))
+        zeros = np.zeros((4, len(torque)))
+        error = None if moves.all() else DidNotMove("Elbow moved by 0.0000 rad")
+        return Played(Step(name, torque, zeros, zeros, zeros, str(error or "")), seen, "", error)
+
+    def say(self, _text: str) -> None:
+        pass
+
+
+def searched(config: Config, tmp_path: Path, player: Held) -> Search:
+    few = PilotOptions(arms=24)
+    search = Search.of(config, RunFolder.create(tmp_path / "run", config), player, few)  # type: ignore[arg-type]
+    search.belief = Mock(
+        wraps=search.belief,
+        middle=search.belief.middle,
+        parameters=search.belief.parameters,
+        after=lambda *_: search.belief,
+    )
+    return search
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.95])
+def test_the_pilot_reaches_any_friction_below_the_current_limit_in_few_runs(
+    config: Config, tmp_path: Path, share: float
+) -> None:
+    most = most_torque(config)
+    player = Held((share * most).tolist())
+    search = searched(config, tmp_path, player)
+    search._pilot()
+    assert search.moved.all()
+    assert len(player.torques) <= 12
+    ratio = np.array(player.torques[1:]) / np.array(player.torques[:-1])
+    assert np.all(ratio <= OPTIONS.breakaway_raise + 1e-9), "never much more than what did not move"
+    assert np.all(np.array(player.torques) <= most)
+
+
+def test_it_gives_up_only_at_the_current_limit(config: Config, tmp_path: Path) -> None:
+    player = Held([0.0, 1e3])
+    with pytest.raises(ExperimentError, match="Elbow did not move by 26 encoder steps"):
+        searched(config, tmp_path, player)._pilot()
+    assert player.torques[-1][1] == pytest.approx(most_torque(config)[1])
+
+
+def test_without_any_torque_that_is_safe_in_the_whole_range_it_begins_between_narrow_limits(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise NoSafeTorque("No torque was found")
+
+    player = Held((0.1 * most_torque(config)).tolist())
+    search = searched(config, tmp_path, player)
+    monkeypatch.setattr("hil.pilot.search.largest_amplitude", none)
+    search._pilot()
+    assert player.torques[0] == pytest.approx(OPTIONS.first_torque_share * most_torque(config))
+    for joint, wide in zip(player.configs[0].joints, config.joints, strict=True):
+        assert np.ptp(joint.position_limit) < 0.5 * np.ptp(wide.position_limit)
+
+
+def test_stopping_a_joint_that_broke_free_does_not_cap_the_torque(config: Config, tmp_path: Path) -> None:
+    search = searched(config, tmp_path, Held([0.0, 0.0]))
+    pose = np.array(config.arm.rest_pose)
+    near = narrowed(config, pose, SHOULDER, OPTIONS)
+    zeros, torque = np.zeros((4, 2)), np.array([0.2, 0.1])
+    peaks = np.array([pose, [near.joints[0].position_limit[1] + 0.02, 0.1], [1.0, 1.0], [0.0, 0.0]])
+    stop = SafetyStop("Shoulder is at ...", Cause.POSITION)
+    seen = Mock(swing=np.array([0.3, 0.1]), end=pose)
+    search.learn(near, Played(Step("Pilot 2", torque, zeros, zeros, peaks, str(stop)), seen, "", stop))
+    assert search.cap is None
+    search.learn(config, Played(Step("Step 3", torque, zeros, zeros, peaks, str(stop)), seen, "", stop))
+    assert search.cap == pytest.approx(OPTIONS.torque_after_limit * torque)
+
+
+@pytest.mark.parametrize(
+    ("error", "informative"),
+    [
+        (SafetyStop("unlike", Cause.UNLIKE_BEFORE), True),
+        (SafetyStop("limit", Cause.POSITION), True),
+        (NotSettled("drifts"), True),
+        (DidNotMove("stuck"), True),
+        (SafetyStop("hot", Cause.TEMPERATURE), False),
+        (SafetyStop("frozen", Cause.FROZEN), False),
+    ],
+)
+def test_which_ends_of_a_run_are_informative(error: ExperimentError, informative: bool) -> None:
+    assert tells_of_the_arm(error) is informative
+
+
+def unlike(search: Search, times: int) -> list[Played]:
+    """Full runs of which the first `times` do not repeat their motion."""
+    error = SafetyStop("Elbow does not repeat its motion", Cause.UNLIKE_BEFORE)
+    zeros = np.zeros((4, 2))
+    return [
+        Played(Step("Full run", np.array([0.3, 0.2]), zeros, zeros, zeros), None, "", error if number < times else None)
+        for number in range(times + 1)
+    ]
+
+
+def test_a_period_unlike_the_one_before_repeats_the_full_run_with_less_torque_and_other_waves(
+    config: Config, tmp_path: Path
+) -> None:
+    search = searched(config, tmp_path, Held([0.0, 0.0]))
+    found = search._with(config, search.waves(config), np.array([0.3, 0.2]))
+    search.play = Mock(side_effect=unlike(search, 1))  # type: ignore[method-assign]
+    search.run = Mock()
+    assert full._full(search, config, found).error is None
+    first, second = (call.args for call in search.play.call_args_list)
+    assert np.all(second[3].peak_torque <= OPTIONS.torque_after_unsettled * first[3].peak_torque + 1e-12)
+    assert second[0].experiment.seed != first[0].experiment.seed
+
+
+def test_motion_that_never_repeats_ends_the_identification(config: Config, tmp_path: Path) -> None:
+    search = searched(config, tmp_path, Held([0.0, 0.0]))
+    found = search._with(config, search.waves(config), np.array([0.3, 0.2]))
+    search.play = Mock(side_effect=unlike(search, 9))  # type: ignore[method-assign]
+    search.run = Mock()
+    with pytest.raises(SafetyStop, match="does not repeat"):
+        full._full(search, config, found)
+    assert search.play.call_count == OPTIONS.max_unlike_runs

@@ -1,0 +1,88 @@
+"""Recordings of a spatial arm by other tools: a stretch of motion that is no period, with its URDF."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hil as api
+from benchmarks import chain as bench
+from hil.errors import ConfigError
+from tests.support.command_line import hil
+
+SAMPLES = 2600  # of a period of 4000
+
+
+@pytest.fixture(scope="module")
+def setup() -> bench.Setup:
+    return bench.set_up(bench.BENCHES[4], 1)
+
+
+@pytest.fixture(scope="module")
+def recorded(setup: bench.Setup, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded")
+    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
+    some = slice(0, SAMPLES)
+    table = np.column_stack((np.arange(SAMPLES) / period.rate, period.position.T[some], period.torque.T[some]))
+    head = "time,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
+    np.savetxt(folder / "arm.csv", table, delimiter=",", header=head, comments="", fmt="%.9g")
+    shutil.copyfile(setup.arm.urdf, folder / "arm.urdf")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _here(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(recorded)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+
+
+def described(setup: bench.Setup, between: str, urdf: str = 'urdf = "arm.urdf"', names: int = 4) -> str:
+    joints = "".join(f'[[joints]]\nname = "{name}"\n' for name in setup.arm.joints[:names])
+    columns = '[columns]\nposition = ["q1", "q2", "q3", "q4"]\ntorque = ["tau1", "tau2", "tau3", "tau4"]\n'
+    text = f'[arm]\n{urdf}\n{joints}{columns}between = "{between}"\n[model]\nfriction = "stribeck"\ndrive = "lag"\n'
+    Path("arm.toml").write_text(text, encoding="utf-8")
+    return "arm.toml"
+
+
+def torque_error(setup: bench.Setup, found: api.Estimation) -> float:
+    value = np.array([found.parameters[name].value for name in setup.base.names])
+    other = bench.path_of(bench.BENCHES[4], setup, 201)
+    return bench.errors(setup, value, other)["torque_error_percent"]
+
+
+def test_commanded_torque_gives_the_likelihood(setup: bench.Setup, capsys: pytest.CaptureFixture[str]) -> None:
+    found = api.estimate("arm.csv", config=described(setup, "held"), out="commanded")
+    assert torque_error(setup, found) < 0.3
+    assert max(found.fit.residual_rms_ticks) < 0.32
+    assert found.verdict is not None
+    assert found.verdict.trust == "yes"
+    model = api.load_model("commanded")
+    assert model.values["lag"] == pytest.approx(1e-3, abs=1e-4)
+    assert hil("export", "commanded", "--format", "urdf", "--out", "found.urdf") == 0
+    capsys.readouterr()
+    assert hil("estimate", "commanded", "--json") == 0  # again, from what the folder keeps
+    again = json.loads(capsys.readouterr().out)
+    assert again["parameters"]["viscous_1"]["value"] == pytest.approx(found.parameters["viscous_1"].value)
+
+
+def test_measured_torque_gives_the_regression_and_says_so(setup: bench.Setup) -> None:
+    found = api.estimate("arm.csv", config=described(setup, "linear"), out="measured")
+    assert "least squares" in found.method
+    assert "nothing was simulated" in found.method
+    assert found.verdict is not None
+    assert found.verdict.trust == "with care"
+    assert any('columns.between = "held"' in said for said in found.verdict.sentences)
+    assert torque_error(setup, found) < 20.0
+
+
+@pytest.mark.parametrize(
+    ("urdf", "names", "said"),
+    [("", 4, "need arm.urdf"), ('urdf = "arm.urdf"', 3, "3 .*4 columns"), ('urdf = "absent.urdf"', 4, "absent.urdf")],
+)
+def test_what_is_missing_is_named(setup: bench.Setup, urdf: str, names: int, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        api.estimate("arm.csv", config=described(setup, "held", urdf, names), out="refused")
+    assert not Path("refused").exists()
