@@ -1,10 +1,10 @@
-"""docs/first_evening.md typed word by word against a fake arm behind a pseudo-terminal, in real time, or in virtual time.
+"""docs/first_evening.md typed word by word against a fake arm, behind a pseudo-terminal or in virtual time.
 
     python -m benchmarks.first_evening --out /tmp/evening
 
-Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`; in virtual
-time nobody moves them, and init accepts that. It fails
-if a step fails, shows a traceback, or does not name the next command, or if the arm moved for more than twelve minutes.
+Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`; in
+virtual time nobody moves them, and init accepts that. It fails if a step fails, shows a traceback, or does not name the
+next command, or if the arm moved for more than twelve minutes.
 """
 
 import argparse

@@ -2,13 +2,14 @@
 
     python -m benchmarks.wear --runs 6
 
-The arm is identified `--runs` times unchanged, and twice after each friction term of each joint has changed by 10 %, every time
-with other noise and, with --other-motion, another excitation. Every changed run is compared with every unchanged one, and the
-unchanged runs with each other.
+The arm is identified `--runs` times unchanged, and twice after each friction term of each joint has changed by 10 %.
+With --other-motion every run plays another excitation; without it, runs of the noiseless fake arms are identical.
+Every changed run is compared with every unchanged one, and the unchanged runs with each other.
 """
 
 import argparse
 import itertools
+import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import hil
 from hil.config.schema import Config, load_config
+from hil.errors import SafetyStop
 from hil.estimation.diff import Difference, diff_runs
 from tests.support.paths import CONFIGS
 
@@ -62,8 +64,20 @@ def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) ->
         seed += 1
         path = folder / f"{seed:02d}-{changed or 'same'}"
         if not (path / "result.json").is_file():
-            hil.identify(arm_after(config, changed, seed, other_motion, folder), out=path)
+            seed = _identify(config, changed, seed, other_motion, folder, path)
         yield Identified(changed, path)
+
+
+def _identify(config: Config, changed: str, seed: int, other_motion: bool, folder: Path, path: Path) -> int:
+    """Identify with this seed or the next one whose motion stays within the limits; returns the seed."""
+    for tried in range(seed, seed + 20):
+        try:
+            hil.identify(arm_after(config, changed, tried, other_motion, folder), out=path)
+        except SafetyStop:
+            shutil.rmtree(path)
+        else:
+            return tried
+    raise SystemExit(f"no motion within the limits from seed {seed} on")
 
 
 def arm_after(config: Config, changed: str, seed: int, other_motion: bool, folder: Path) -> Path:

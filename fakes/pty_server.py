@@ -238,8 +238,8 @@ def _baud_of(master: int) -> int:
 def _wake_up_in_time() -> None:
     """Request timers with microsecond resolution and real-time scheduling from Linux, for the thread that serves.
 
-    Without them each wait ends about 50 us late, and on a busy computer the servos would fall silent for many milliseconds,
-    which real ones never do.
+    Without them each wait ends about 50 us late, and on a busy computer the servos would fall silent for many
+    milliseconds, which real ones never do.
     """
     with contextlib.suppress(OSError):  # not permitted: the server then competes with all other programs
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))

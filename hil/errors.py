@@ -10,7 +10,7 @@ HilError                    exit code
 ├── SchedulerLost           1   a study's scheduler answers no more
 └── ExperimentError         1   the experiment could not be finished
     ├── SafetyStop          1   the guard stopped the arm because a limit was exceeded
-    ├── StopRequested       1   Ctrl-C, SIGTERM or SIGHUP
+    ├── StopRequested     130   Ctrl-C (143: SIGTERM, 129: SIGHUP)
     ├── NotSettled          1   the motion never became periodic
     ├── DidNotMove          1   a joint did not move: friction, or it is blocked
     ├── NoSafeTorque        1   a dry run found no torque that keeps the arm within its limits
@@ -21,6 +21,7 @@ hil.drivers.errors.DriverError  1   communication with the servos; subclasses ar
 hil.estimator.errors.EstimationError  1   the recording does not determine the parameters; subclasses there
 """
 
+import signal
 from enum import Enum
 
 
@@ -122,7 +123,11 @@ class SafetyStop(ExperimentError):
 
 
 class StopRequested(ExperimentError):
-    """A stop was requested. Example: Ctrl-C."""
+    """A stop was requested by a signal. Example: Ctrl-C."""
+
+    def __init__(self, *said: object, number: int = signal.SIGINT) -> None:
+        super().__init__(*said)
+        self.exit_code = 128 + number
 
 
 class NoSafeTorque(ExperimentError):

@@ -15,6 +15,7 @@ from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel, Geometry
 from hil.errors import ResultError
 from hil.estimator.models.terms import RIGID_BODY, base_names, extra_names
+from hil.next_step import command
 from hil.results.json_form import FormError, from_json
 from hil.results.parts import ArmFacts, ChainFacts, Quantity
 from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
@@ -25,8 +26,8 @@ def _read(path: Path) -> dict[str, Any]:
     file = _file(path)
     if path.is_dir() and not file.is_file():
         raise ResultError(
-            f"{path} has no result.json: its identification did not finish. If it has samples.npy, run "
-            f"hil estimate {path}."
+            f"{path} has no result.json: its identification did not finish. If it has samples.npy, estimate it "
+            f"first: {command('estimate', path)}"
         )
     try:
         text = file.read_text(encoding="utf-8")

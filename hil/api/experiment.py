@@ -10,7 +10,8 @@ from pathlib import Path
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.config.schema import Config, load_config
-from hil.errors import ConfigError
+from hil.errors import ConfigError, StopRequested
+from hil.estimation.after_a_stop import after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress as StreamProgress
@@ -74,7 +75,7 @@ def identify(
     def say(message: str) -> None:
         tell(Progress("experiment", message))
 
-    with _discarding(run):
+    with _discarding(run, shown):
         if checked.experiment.pilot:
             from hil.pilot import identify_in_steps
 
@@ -84,7 +85,7 @@ def identify(
             say(run_experiment(checked, run, shown, watch))
             tell(Progress("estimation", "Estimating"))
             result = estimate_run(run)
-    write_run_report(run)
+        write_run_report(run)
     log.info("%s: trust this model: %s", run.path, result.verdict.trust)
     return identification(result, run.path)
 
@@ -110,7 +111,7 @@ def record(
         )
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
-    with _discarding(run):
+    with _discarding(run, shown):
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
     tell(Progress("experiment", torque))
     return load_run(run.path)
@@ -127,15 +128,16 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
 
 
 @contextmanager
-def _discarding(run: RunFolder) -> Iterator[None]:
+def _discarding(run: RunFolder, shown: Path) -> Iterator[None]:
     """Remove the run folder if the experiment fails before the first sample, so that it does not block the next
-    attempt.
+    attempt. After a stop by the user, add to the exception what is kept and how to go on.
     """
     try:
         yield
     except BaseException as stopped:
-        if not run.discard_if_unused() and isinstance(stopped, KeyboardInterrupt):
-            stopped.add_note(f"The recording is kept. To estimate from it: hil estimate {run.path}")
+        if not run.discard_if_unused() and isinstance(stopped, KeyboardInterrupt | StopRequested):
+            for line in after_a_stop(run, shown):
+                stopped.add_note(line)
         raise
 
 

@@ -25,13 +25,17 @@ def dry_run(
 ) -> None:
     """Simulate the experiment on arms like yours; exit code 1 if it might exceed a limit."""
     from hil.api.dry_run import dry_run as simulate
-    from hil.cli.next_step import next_step
     from hil.cli.printing import result_console
     from hil.cli.terminal import Terminal
     from hil.dry_run.chain_summary import ChainDryRun, print_chain_dry_run
     from hil.dry_run.plot import draw
     from hil.dry_run.summary import print_dry_run
+    from hil.next_step import next_step
 
+    if picture is not None and not picture.absolute().parent.is_dir():
+        raise typer.BadParameter(f"--picture {picture}: the folder {picture.parent} does not exist. Create it first.")
+    if picture is not None and picture.suffix not in (".png", ".svg"):
+        raise typer.BadParameter(f"--picture {picture}: its name must end in .png or .svg.")
     with Terminal(quiet=json_only).following(config) as follow:
         rehearsal = simulate(config, result=result, arms=arms, servos=servos, on_progress=follow)
     if picture is not None:

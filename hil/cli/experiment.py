@@ -57,8 +57,8 @@ def identify(
 def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
     """Play the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
-    from hil.cli.next_step import next_step
     from hil.cli.terminal import Terminal
+    from hil.next_step import next_step
     from hil.results.json_form import to_json
 
     with Terminal(quiet=json_only).following(config) as follow:
@@ -89,6 +89,10 @@ def estimate(
         raise typer.BadParameter(str(error)) from error
     if out is not None and not elsewhere:
         raise typer.BadParameter("--out is for recordings of other tools; a run's result is written into its folder.")
+    if config is not None and not elsewhere:
+        raise typer.BadParameter(
+            "--config is for recordings of other tools; a run has its own config.toml, to be edited."
+        )
     with Terminal(quiet=json_only).following(config) as follow:
         result = estimate_arm(paths, config=config, out=out, all_samples=all_samples, on_progress=follow)
     _show(result, json_only)

@@ -18,13 +18,13 @@ def init(
     yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; accept every default.")] = False,
 ) -> None:
     """Scan the bus, ask for the rest, and write a commented TOML file. Torque stays off and no setting is changed."""
-    from hil.cli.next_step import next_step
     from hil.cli.terminal import Terminal
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
     from hil.errors import ConfigError
     from hil.export.source import write_text
+    from hil.next_step import next_step
     from hil.setup.config_template import arm_toml
     from hil.setup.interview import interview
     from hil.setup.measured_bus import measured_bus

@@ -3,12 +3,14 @@
 The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hil.cli.options import RunPath
+from hil.cli.verbosity import is_quiet
 
 
 def report(
@@ -24,7 +26,7 @@ def report(
     ] = None,
 ) -> None:
     """Write a run as one self-contained HTML page: verdict, parameters, figures."""
-    from hil.cli.next_step import next_step
+    from hil.next_step import next_step
     from hil.report.pictures import save_pictures
     from hil.report.run_data import RunData
 
@@ -33,7 +35,8 @@ def report(
     for kind, folder in (("png", png), ("svg", svg)):
         if folder is not None and data is not None:
             print(f"{len(save_pictures(data, folder, kind))} figures in {folder}")
-    print(next_step("export", run, "--format", "mjcf"))
+    if not is_quiet():  # on standard error, so that the page's path stays alone on standard output
+        print(next_step("export", run, "--format", "mjcf"), file=sys.stderr)
 
 
 def export(

@@ -6,7 +6,6 @@ only the result on standard output and errors on standard error.
 
 import inspect
 import logging
-import sys
 from collections.abc import Callable
 from functools import wraps
 from typing import Annotated, Any
@@ -14,9 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from hil.cli.output import readable_output
-
-STOPPED = 130
-"""Exit code after Ctrl-C when no arm was moving, as is usual in shells."""
+from hil.cli.stopped import stopped_by_signals
 
 _Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Show log messages; -vv for details.")
@@ -32,12 +29,8 @@ def with_verbosity(command: Callable[..., None]) -> Callable[..., None]:
         if verbose and quiet:
             raise typer.BadParameter("give either --verbose or --quiet, not both.")
         _set_up(verbose, quiet)
-        try:
-            with readable_output():
-                command(*args, **options)
-        except KeyboardInterrupt as stopped:  # before or after the motion; during it, the stream handles Ctrl-C
-            print("\n".join(["hil: Stopped by Ctrl-C.", *getattr(stopped, "__notes__", [])]), file=sys.stderr)
-            raise typer.Exit(STOPPED) from None
+        with stopped_by_signals(), readable_output():
+            command(*args, **options)
 
     own = inspect.signature(command)
     more = [

@@ -1,6 +1,7 @@
 """From the run folder of a spatial arm to its result: both estimation stages and validation on a held-out path."""
 
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from hil.config.chain import described_arm
 from hil.config.schema import Config
+from hil.errors import RecordingCutShort
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
@@ -43,9 +45,10 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     model = estimate.model
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if HELD_OUT in facts.segments:
-        other = settled_period(config, facts, samples, HELD_OUT)
-        predicted = predict(model, estimate.parameters, other)
-        played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
+        with suppress(RecordingCutShort):  # stopped in the held-out part: what was finished is estimated
+            other = settled_period(config, facts, samples, HELD_OUT)
+            predicted = predict(model, estimate.parameters, other)
+            played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     over_floor = estimate.residual_steps / QUANTISATION_FLOOR_TICKS
     seconds = round(time.perf_counter() - started, 3)

@@ -1,7 +1,7 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), the friction of each joint also as a
-whole (hil.estimation.friction_change), and Holm's step-down correction
+Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), the friction of each joint
+also as a whole (hil.estimation.friction_change), and Holm's step-down correction
 keeps the probability of any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of
 Statistics 6 (1979) 65). A change must also be larger than `least_share` of the parameter's scale: standard errors cover
 noise only, and two runs of an arm with some unmodelled friction differ by a little more.
@@ -52,8 +52,8 @@ class Change:
 class Difference:
     """The changes from one run to another.
 
-    only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction term
-    alone that two runs like these show with a probability of 95 % [% of its value before].
+    only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction
+    term alone that two runs like these show with a probability of 95 % [% of its value before].
     """
 
     before: str

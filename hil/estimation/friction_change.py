@@ -8,8 +8,8 @@ one term alone    Did only term i change? The most powerful test is z_i = (S^-1 
                   (S^-1 d)_i / (S^-1)_ii is the change that it would have to be (generalised least squares).
 several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
 
-The covariances are marginal ones: changes of inertia, gravity or another joint do not count. Friction itself does not repeat
-exactly from run to run, which no covariance of a single run contains: `repeatability` is added to S.
+The covariances are marginal ones: changes of inertia, gravity or another joint do not count. Friction itself does
+not repeat exactly from run to run, which no covariance of a single run contains: `repeatability` is added to S.
 """
 
 import math
@@ -26,8 +26,8 @@ from hil.results.parts import Covariance
 
 Array = NDArray[np.float64]
 
-KINDS = ("viscous", "coulomb", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
-"""Terms of friction in motion. What shapes it near standstill is not tested, only allowed to vary."""
+KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
+"""Terms of friction in motion, and the width of its step, which is known together with the rise."""
 REPEATABILITY = 0.005
 """Standard deviation of a friction parameter from run to run of an unchanged arm, relative to its value."""
 
@@ -36,10 +36,10 @@ REPEATABILITY = 0.005
 class FrictionChange:
     """The friction of one joint in two runs.
 
-    term: the one whose change alone explains the difference best. before, after: its values if nothing else in the joint's
-    friction changed; std: standard error of that change [unit of the term]. z: change in standard errors. p: probability of a
-    difference like this in an unchanged joint, whatever term it shows in. stds: standard error of the change of each term
-    alone [unit of the term].
+    term: the one whose change alone explains the difference best. before, after: its values if nothing else in the
+    joint's friction changed. std: standard error of that change [unit of the term]. z: change in standard errors.
+    p: probability of a difference like this in an unchanged joint, whatever term it shows in. stds: standard error of
+    the change of each term alone [unit of the term].
     """
 
     joint: int

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.errors import RecordingCutShort
 from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
@@ -53,7 +54,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     samples = load_samples(run.samples_path, len(config.joints))
     started = time.perf_counter()
     period = settled_period(config, facts, samples, IDENTIFY)
-    other = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
+    other, cut_short = _held_out(config, facts, samples)
     between = None if other is None else _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
     recorded = period
     estimate, choice = _estimate(config, period, other, between, run.load_starts(), executor)
@@ -78,7 +79,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     checks = Checks(
         describe_validation(validation, held_out),
         describe_verdict(judge(estimate, validation, evidence)),
-        tuple(warnings_of(config, facts, samples, period)),
+        (*warnings_of(config, facts, samples, period), *cut_short),
         None if choice is None else describe_choice(choice),
     )
     seconds = round(time.perf_counter() - started, 3)
@@ -97,6 +98,19 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     save_periods(run.path, played)
     run.write_result(result)
     return result
+
+
+def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[SettledPeriod | None, list[str]]:
+    """The settled period of the held-out multisine, if there is one, and a warning if the run was stopped before it."""
+    if HELD_OUT not in facts.segments:
+        return None, []
+    try:
+        return settled_period(config, facts, samples, HELD_OUT), []
+    except RecordingCutShort:
+        return None, [
+            "The recording ends before the held-out motion settled: that the model predicts another motion is not "
+            "checked. Identify again for that."
+        ]
 
 
 def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:

@@ -232,7 +232,10 @@ class Guard:
         if len(self._missing) == 1 or not all(self._missing):
             return "Check its cable and its supply."
         # With Fast Sync Read a servo that is silent also hides those that would answer after it.
-        return "No servo was heard: check the adapter, the cables and the supply."
+        return (
+            "No servo was heard: check the adapter, the cables and the supply, and whether other programs keep this "
+            "computer busy."
+        )
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
         self._stop(

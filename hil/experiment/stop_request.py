@@ -69,7 +69,7 @@ class StopRequest:
 
     def check(self) -> None:
         if self._received is not None:
-            raise StopRequested(self._said())
+            raise self._stop()
 
     @property
     def insisted(self) -> bool:
@@ -79,7 +79,7 @@ class StopRequest:
     def check_again(self, asked: int) -> None:
         """Raise StopRequested when more than `asked` signals have come."""
         if self._count > asked:
-            raise StopRequested(self._said())
+            raise self._stop()
 
     @property
     def count(self) -> int:
@@ -90,9 +90,9 @@ class StopRequest:
         self._count += 1
         self._received = signal.Signals(number)
         if not self._armed:
-            raise StopRequested(self._said())
+            raise self._stop()
 
-    def _said(self) -> str:
+    def _stop(self) -> StopRequested:
         assert self._received is not None
         name = "Ctrl-C" if self._received == signal.SIGINT else self._received.name
-        return f"Stopped by {name}."
+        return StopRequested(f"Stopped by {name}.", number=self._received)

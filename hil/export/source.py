@@ -55,6 +55,10 @@ class Source:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file completely or not at all. Raises RunFolderError."""
+    if path.is_dir():
+        raise RunFolderError(f"{path} is a folder: give the name of the file to write.")
+    if not path.parent.is_dir():
+        raise RunFolderError(f"{path} cannot be written: the folder {path.parent} does not exist. Create it first.")
     temporary = path.with_name(path.name + ".partial")
     try:
         temporary.write_text(text, encoding="utf-8")

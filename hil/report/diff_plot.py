@@ -29,7 +29,9 @@ def save_diff_plot(difference: Difference, path: Path) -> None:
     axes.set_xlabel("change, % of the earlier value, with 95 % interval; red: significant")
     try:
         figure.savefig(path, dpi=150)
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+    except ValueError as error:  # an extension that matplotlib does not know
         raise RunFolderError(f"{path} cannot be written: {error}.") from error
 
 

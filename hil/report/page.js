@@ -1,5 +1,6 @@
 "use strict";
-// Hover reads a chart's curves at the pointer; dragging across zooms in time; double-click or the button goes back.
+// Hover reads a chart's curves at the pointer; dragging across zooms in time, dragging with Shift or the wheel with Shift moves
+// along it; double-click or a button goes back, another one saves the chart as it is shown.
 (() => {
   const SVG = "http://www.w3.org/2000/svg";
   const text = (value) => Number(value.toPrecision(4)).toString().replace("-", "\u2212");
@@ -30,7 +31,8 @@
     const originalAxis = axis.innerHTML;
     const figure = svg.parentNode;
     let shown = [xStart, xEnd]; // the part of the plot, in its own pixels, that fills the chart
-    let from = null;
+    let from = null; // where a part to be shown was begun
+    let held = null; // where the plot is held to be moved
     let chosen = null;
     let curves = null;
 
@@ -106,8 +108,38 @@
       figure.append(back);
     }
 
+    function move(pixels) {
+      const width = shown[1] - shown[0];
+      const low = Math.min(xEnd - width, Math.max(xStart, shown[0] - (pixels * width) / (xEnd - xStart)));
+      show(low, low + width);
+    }
+
+    const save = document.createElement("button");
+    save.className = "save";
+    save.textContent = "Save";
+    save.title = "Save this chart as SVG";
+    save.onclick = () => {
+      clear();
+      const link = document.createElement("a");
+      link.download = `${figure.id.replace("figure-", "")}.svg`;
+      link.href = URL.createObjectURL(new Blob([new XMLSerializer().serializeToString(svg)], { type: "image/svg+xml" }));
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    };
+    if (svg.getBoundingClientRect().width) figure.append(save);
+
+    svg.addEventListener("wheel", (event) => {
+      if (!event.shiftKey) return; // the page scrolls
+      event.preventDefault();
+      move(-(event.deltaX || event.deltaY));
+    }, { passive: false });
     svg.addEventListener("pointermove", (event) => {
       hover(event);
+      if (held !== null) {
+        const across = pointer(event)[0];
+        move(across - held);
+        held = across;
+      }
       if (from === null) return;
       const to = Math.min(xEnd, Math.max(xStart, pointer(event)[0]));
       chosen ??= element("rect", { class: "chosen", y: yEnd, height: yStart - yEnd }, svg);
@@ -117,7 +149,8 @@
     svg.addEventListener("pointerdown", (event) => {
       const [across] = pointer(event);
       if (event.pointerType === "mouse" && across >= xStart && across <= xEnd) {
-        from = across;
+        if (event.shiftKey) held = across;
+        else from = across;
         svg.setPointerCapture(event.pointerId);
         event.preventDefault();
       } else hover(event);
@@ -127,7 +160,7 @@
         const to = Math.min(xEnd, Math.max(xStart, pointer(event)[0]));
         if (Math.abs(to - from) > 8) show(inPlot(Math.min(from, to)), inPlot(Math.max(from, to)));
       }
-      from = null;
+      from = held = null;
       chosen?.remove();
       chosen = null;
     });

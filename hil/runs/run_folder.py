@@ -140,6 +140,11 @@ class RunFolder:
     def open(cls, path: Path) -> "RunFolder":
         """Open the folder of a run. Raises RunFolderError."""
         run = cls(path)
+        if path.is_file():
+            raise RunFolderError(
+                f"{path} is a file: give the folder of a run. Recordings that hil estimate reads are CSV, Parquet, "
+                "MCAP and ROS 2 bags."
+            )
         if (path / "recordings.npz").is_file():
             raise RunFolderError(
                 f"{path} is an estimate from another tool's recording; this command needs a run of hil identify or hil "

@@ -43,8 +43,8 @@ class JointAnswers:
 class MeasuredBus:
     """What was measured on the bus.
 
-    rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: how data are exchanged
-    at that rate.
+    rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: how data are
+    exchanged at that rate.
     """
 
     rate: float

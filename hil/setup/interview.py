@@ -1,4 +1,4 @@
-"""The questions of `hil init`: it reads what it can from the bus and asks for the rest. Nothing is written to a servo."""
+"""The questions of `hil init`, which reads what it can from the bus. Nothing is written to a servo."""
 
 import math
 from collections.abc import Callable, Sequence

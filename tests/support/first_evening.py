@@ -1,7 +1,7 @@
 """A person who types docs/first_evening.md word by word: commands are taken from the page, questions are answered.
 
-The arm is a fake one behind a pseudo-terminal, its joints are moved with `hil hand`, and every command is a process of its
-own on a terminal, as on the evening. Only the name of the serial port is replaced.
+The arm is a fake one behind a pseudo-terminal, its joints are moved with `hil hand`, and every command is a process
+of its own on a terminal, as on the evening. Only the name of the serial port is replaced.
 """
 
 import contextlib
@@ -104,7 +104,7 @@ class Person:
         if "change Return Delay Time" in question:
             return "y"
         by_hand = "://" not in self.port
-        joint = 1 if "elbow" in question.split(" to ")[0] else 0
+        joint = 1 if "elbow" in question.split(" to ", maxsplit=1)[0] else 0
         if "counter-clockwise" in question and by_hand:
             self._hand(f"{joint + 1}:to={self.rest[joint] + 0.4:.3f},duration=0.5")
             time.sleep(1.0)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.cli.next_step import next_step
+from hil.next_step import next_step
 from hil.setup.preflight import Finding, Level
 from hil.setup.scan import Found, Heard
 from hil.setup.servo_settings import Change

@@ -171,7 +171,7 @@ def test_a_killed_process_leaves_its_samples_on_file(arm_file: ArmFile, tmp_path
     assert (kept["time_after_read"] > kept["time_before_write"]).all()
 
 
-def test_sigterm_ends_in_a_message_and_exit_code_1(arm_file: ArmFile, tmp_path: Path) -> None:
+def test_sigterm_ends_in_a_message_and_exit_code_143(arm_file: ArmFile, tmp_path: Path) -> None:
     path = arm_file(*LONG)
     command = [sys.executable, "-m", "hil", "identify", str(path), "--out", "run"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
@@ -184,7 +184,7 @@ def test_sigterm_ends_in_a_message_and_exit_code_1(arm_file: ArmFile, tmp_path: 
         process.send_signal(signal.SIGTERM)
         assert process.stderr is not None
         message = process.stderr.read()
-        assert process.wait() == 1
+        assert process.wait() == 143
     assert "Stopped by SIGTERM." in message
     assert "Torque is off on all 2 servos, read back." in message
     assert "Traceback" not in message

@@ -76,7 +76,11 @@ def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
     ("missing", "said"),
     [
         ((False, True), "Check its cable and its supply."),
-        ((True, True), "No servo was heard: check the adapter, the cables and the supply."),
+        (
+            (True, True),
+            "No servo was heard: check the adapter, the cables and the supply, and whether other programs "
+            "keep this computer busy.",
+        ),
     ],
 )
 def test_silence_of_all_servos_points_to_what_they_share(arm: Arm, missing: tuple[bool, bool], said: str) -> None:

@@ -51,6 +51,12 @@ addEventListener("load", () => {
   seen.before = ticks();
   at("pointerdown", 0.5); at("pointermove", 0.6); at("pointerup", 0.6);
   seen.zoomed = ticks();
+  const drag = (type, part) => svg.dispatchEvent(new PointerEvent(type, { shiftKey: true,
+    clientX: box.left + part * box.width, clientY: box.top + 0.5 * box.height, pointerType: "mouse", pointerId: 1 }));
+  drag("pointerdown", 0.5); drag("pointermove", 0.3); drag("pointerup", 0.3);
+  seen.panned = ticks();
+  HTMLAnchorElement.prototype.click = function () { seen.saved = [this.download, this.href.slice(0, 5)]; };
+  svg.closest("figure").querySelector(".save").click();
   document.querySelector(".back").click();
   seen.after = ticks();
   const note = document.createElement("pre");
@@ -93,3 +99,5 @@ def test_a_visit(identified: Path, width: int) -> None:
     assert all(drawn > 0.5 * min(width, 600) for _, drawn in seen["figures"])
     assert "measured: " in seen["reading"] and "predicted: " in seen["reading"]
     assert seen["zoomed"] != seen["before"] == seen["after"]
+    assert seen["panned"] not in (seen["zoomed"], seen["before"])
+    assert seen["saved"][0].startswith("position") and seen["saved"][1] == "blob:"

@@ -1,0 +1,57 @@
+"""Ctrl-C, SIGTERM and SIGHUP while no arm moves: a message, the next command, and exit code 128 plus the signal's
+number.
+
+While an arm may move, hil.experiment.stop_request handles them; the exit codes are the same.
+"""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+import typer
+
+from hil.next_step import next_step
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP, raised like Ctrl-C so that everything is cleaned up in the same way."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+@contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Turn a signal in the block into a message and an exit code."""
+    former = _catch() if threading.current_thread() is threading.main_thread() else {}
+    try:
+        yield
+    except KeyboardInterrupt as stopped:
+        number = stopped.number if isinstance(stopped, Terminated) else signal.SIGINT
+        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        print("\n".join([f"hil: Stopped by {name}.", *how_to_go_on(stopped)]), file=sys.stderr)
+        raise typer.Exit(128 + number) from None
+    finally:
+        for each, handler in former.items():
+            signal.signal(each, handler)
+
+
+def how_to_go_on(stopped: BaseException) -> list[str]:
+    """The notes of what was stopped; if they name no next command, it is the same command again."""
+    notes = list(getattr(stopped, "__notes__", []))
+    return notes if any("hil " in note for note in notes) else [*notes, next_step(*sys.argv[1:])]
+
+
+def _catch() -> dict[signal.Signals, Any]:
+    """Catch signals that would end the program without a word; leaves those that are handled or ignored (nohup)."""
+    caught = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
+    return {each: signal.signal(each, _raise) for each in caught}
+
+
+def _raise(number: int, _frame: FrameType | None) -> None:
+    raise Terminated(number)

@@ -1,0 +1,48 @@
+"""What a run that was stopped by its user still holds, and the command that goes on from there."""
+
+from pathlib import Path
+
+from hil.errors import HilError
+from hil.estimation.settled_period import settled_period
+from hil.next_step import next_step
+from hil.plan.plan import IDENTIFY
+from hil.runs.recording import load_samples
+from hil.runs.run_folder import RunFolder
+
+
+def after_a_stop(run: RunFolder, shown: Path) -> list[str]:
+    """Sentences about what is kept; the last one is the next command.
+
+    shown: the configuration's path as the user wrote it.
+    """
+    if run.result_path.is_file():
+        return ["The result is kept; the report is missing.", next_step("report", run.path)]
+    if can_be_estimated(run.path):
+        return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
+    steps = [step for step in _steps(run.path) if can_be_estimated(step)]
+    if steps:
+        return [
+            f"The recording of {steps[-1].name} is kept; its motion was smaller than the limits allow. The estimate is "
+            "rougher than that of a finished run.",
+            next_step("estimate", steps[-1]),
+        ]
+    return [f"What was recorded until then is kept in {run.path}; no period had settled.", next_step("identify", shown)]
+
+
+def can_be_estimated(path: Path) -> bool:
+    """Whether a folder holds a settled period of the motion to be fitted."""
+    try:
+        run = RunFolder.open(path)
+        config, facts = run.load_config(), run.load_facts()
+        if IDENTIFY not in facts.segments:
+            return False
+        settled_period(config, facts, load_samples(run.samples_path, len(config.joints)), IDENTIFY)
+    except (HilError, ValueError):
+        return False
+    return True
+
+
+def _steps(path: Path) -> list[Path]:
+    """Folders of the runs before the last one, oldest first."""
+    found = [each.parent for each in path.glob("*/samples.npy")]
+    return sorted(found, key=lambda folder: (folder / "samples.npy").stat().st_mtime)
