@@ -9,6 +9,7 @@ next command, or if the arm moved for more than twelve minutes.
 
 import argparse
 import contextlib
+import json
 import shlex
 import tempfile
 import tomllib
@@ -30,6 +31,7 @@ def main() -> None:
     parser.add_argument(
         "--patient", action="store_true", help="after init, let servos be silent for 90 ms: for a computer that is busy"
     )
+    parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     folder = chosen.out or Path(tempfile.mkdtemp(prefix="evening-"))
     folder.mkdir(parents=True, exist_ok=chosen.out is None)
@@ -37,15 +39,20 @@ def main() -> None:
     link = folder / "port"
     with contextlib.nullcontext() if chosen.virtual else fake_arm(chosen.arm, link):
         person = Person(folder, f"fake://{chosen.arm.resolve()}" if chosen.virtual else str(link))
-        done = evening(person, commands, _edited(folder) if chosen.patient else _tell)
+        done = evening(person, commands, _edited(folder) if chosen.patient else _noted if chosen.json else _tell)
     faults = faults_of(done, commands)
+    moved = None
     if (folder / "first_run").is_dir():
         rate = tomllib.loads((folder / "my_arm.toml").read_text(encoding="utf-8"))["experiment"]["rate"]
         moved = arm_seconds(folder / "first_run", rate)
-        print(f"arm time {moved:.0f} s at {rate:g} Hz")
+        if not chosen.json:
+            print(f"arm time {moved:.0f} s at {rate:g} Hz")
         if moved > MOST_ARM_S:
             faults.append(f"the arm moved for {moved:.0f} s, at most {MOST_ARM_S:.0f} s are asked")
-    print("\n".join(faults) or f"All {len(done)} commands worked, each named the next.")
+    if chosen.json:
+        print(json.dumps({"commands": len(done), "faults": faults, "arm_seconds": moved}))
+    else:
+        print("\n".join(faults) or f"All {len(done)} commands worked, each named the next.")
     raise SystemExit(bool(faults))
 
 
@@ -59,6 +66,10 @@ def _edited(folder: Path) -> Callable[[Typed], None]:
             file.write_text(file.read_text(encoding="utf-8") + "missing_time = 0.09\n", encoding="utf-8")
 
     return tell
+
+
+def _noted(_: Typed) -> None:
+    """Reports nothing: the figures come at the end."""
 
 
 def _tell(typed: Typed) -> None:

@@ -9,6 +9,7 @@ Every changed run is compared with every unchanged one, and the unchanged runs w
 
 import argparse
 import itertools
+import json
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -40,20 +41,27 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=6, help="runs of the unchanged arm")
     parser.add_argument("--other-motion", action="store_true", help="another excitation in every run")
     parser.add_argument("--out", type=Path, help="folder for the runs; existing ones are used again")
+    parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     folder = chosen.out or Path(tempfile.mkdtemp(prefix="wear-"))
     found = list(identify_all(load_config(chosen.arm), chosen.runs, chosen.other_motion, folder))
     unchanged = [run for run in found if not run.changed]
     alarms = [diff_runs(a.path, b.path) for a, b in itertools.permutations(unchanged, 2)]
     false = [each for each in alarms if each.changed]
-    print(f"unchanged: {len(false)} of {len(alarms)} pairs show a change")
-    for each in false:
-        print("   ", ", ".join(f"{change.name} {change.z:+.1f}" for change in each.changed))
+    figures: dict[str, dict[str, float]] = {"unchanged": {"pairs": len(alarms), "false_alarms": len(false)}}
+    if not chosen.json:
+        print(f"unchanged: {len(false)} of {len(alarms)} pairs show a change")
+        for each in false:
+            print("   ", ", ".join(f"{change.name} {change.z:+.1f}" for change in each.changed))
     for name in sorted({run.changed for run in found} - {""}):
         pairs = [diff_runs(a.path, b.path) for a in unchanged for b in found if b.changed == name]
         seen = sum(in_its_joint(each, name) for each in pairs)
         least = sorted(each.detectable.get(name, float("nan")) for each in pairs)[len(pairs) // 2]
-        print(f"{name:16s} {seen} of {len(pairs)} found; detectable from {least:.2g} %")
+        figures[name] = {"pairs": len(pairs), "found": seen, "detectable_percent": least}
+        if not chosen.json:
+            print(f"{name:16s} {seen} of {len(pairs)} found; detectable from {least:.2g} %")
+    if chosen.json:
+        print(json.dumps(figures))
 
 
 def identify_all(config: Config, runs: int, other_motion: bool, folder: Path) -> Iterator[Identified]:

@@ -92,6 +92,7 @@ class Guard:
         self._interval = 1.0 / rate if interval is None else interval
         self._missing_limit = missing_limit(config)
         self._deadlines = Deadlines(config)
+        self._was_late = False
         self._following = [
             None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
             for joint, peak in zip(config.joints, planned or _planned(config), strict=True)
@@ -207,6 +208,8 @@ class Guard:
     def _count_missing(self, index: int, error: int, now: float) -> None:
         if self._missing[index] == 0 and self._position[index] is None:
             self._seen_at[index] = now
+        if not any(self._missing):
+            self._was_late = self._deadlines.were_missed  # silent servos make the program late themselves
         self._missing[index] += 1
         seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
         allowed, said = self._missing_limit
@@ -232,10 +235,10 @@ class Guard:
         if len(self._missing) == 1 or not all(self._missing):
             return "Check its cable and its supply."
         # With Fast Sync Read a servo that is silent also hides those that would answer after it.
-        return (
-            "No servo was heard: check the adapter, the cables and the supply, and whether other programs keep this "
-            "computer busy."
-        )
+        shared = "No servo was heard: check the adapter, the cables and the supply"
+        if self._was_late:
+            return f"{shared}, and whether other programs keep this computer busy: deadlines were missed before."
+        return f"{shared}."
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
         self._stop(

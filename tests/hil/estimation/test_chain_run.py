@@ -180,7 +180,6 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
         ("swing = [0.9", "swing = [3.9", "outside its position_limit"),
         ("speed = [4.8", "speed = [48.0", "velocity_limit"),
         ("[experiment]", "[experiment]\npilot = true", "the path is found"),
-        ('friction = "stribeck"', 'friction = "auto"', "only for planar arms so far"),
         ('drive = "lag"', 'drive = "lag"\nripple = true', "model.ripple = true"),
         ("[stabiliser]", "[stabilizer]", "stabili"),
         ('urdf = "open_manipulator_x_like.urdf"\nrest', 'urdf = "none.urdf"\nrest', "cannot be read"),

@@ -279,7 +279,7 @@ def test_a_signal_cuts_torque_although_something_hangs(tmp_path: Path, what: Hun
     assert ending.goals <= MOST_COMMANDS
     assert any("Torque is off on all 2 servos, read back." in each for each in ending.events)
     name = "Ctrl-C" if number == signal.SIGINT else number.name
-    assert f"Stopped by {name}." in ending.said and ending.code == 1
+    assert f"Stopped by {name}." in ending.said and ending.code == 128 + number
 
 
 def test_a_program_that_was_stopped_does_not_blame_the_arm(tmp_path: Path) -> None:
