@@ -17,7 +17,7 @@ PARTS = 2
 
 NAMED = 0.95
 
-REFUSED = re.compile(r"fake_inverted at 20 Hz .* rate = 20 is too low for the stabiliser", re.DOTALL)
+REFUSED = re.compile(r"fake_inverted at 20 Hz .*experiment\.rate = 20 is too low for the stabiliser", re.DOTALL)
 """A software spring that acts 75 ms late cannot hold an arm upright."""
 
 UNSAFE = 0.02
