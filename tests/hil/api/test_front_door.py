@@ -124,8 +124,8 @@ def test_a_callback_that_raises_disturbs_nothing(arm_file: ArmFile, caplog: pyte
 def test_a_dry_run_foretells(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
     base = (("rest_pose = ", "link_lengths = [0.12, 0.10]\nrest_pose = "),)
     path = arm_file(*base)
-    rehearsal = hil.dry_run(path, arms=8)
-    code = command("dry-run", path, "--arms", "8", "--json")
+    rehearsal = hil.dry_run(path, arms=20)
+    code = command("dry-run", path, "--arms", "20", "--json")
     assert json.loads(capsys.readouterr().out) == rehearsal.to_json()
     assert code == (0 if rehearsal.is_safe else 1)
     assert 0.0 <= rehearsal.stop_chance <= 1.0 and min(rehearsal.largest_peak_torque) > 0.0

@@ -69,7 +69,7 @@ def test_a_name_that_is_markup_is_a_name(
     assert hil("identify", path, "--out", run) == 0
     assert hil("check", path) == 0
     if name == "[/red]":
-        assert hil("dry-run", path, "--arms", 6) in (0, 1)
+        assert hil("dry-run", path, "--arms", 20) in (0, 1)
     said = capsys.readouterr().out
     assert "inertia_2" in said and name in said
     assert hil("export", run, "--format", "urdf", "--format", "mjcf") == 0

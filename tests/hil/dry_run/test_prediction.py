@@ -102,9 +102,9 @@ def test_the_verdict_is_the_exit_code(
     arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], peak: str, code: int
 ) -> None:
     path = arm_file(KNOWN, ("[0.80, 0.42]", peak), ("seed = 1\n", "seed = 1\nheld_out = false\n"))
-    assert hil("dry-run", path, "--arms", "12", "--json") == code
+    assert hil("dry-run", path, "--arms", "20", "--json") == code
     said: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert said["safe"] is (code == 0) and said["arms"] == 12
+    assert said["safe"] is (code == 0) and said["arms"] == 20
     elbow = said["asked"]["joints"]["elbow"]
     assert set(elbow) == {"lowest position", "highest position", "velocity", "current", "torque", "power"}
     assert elbow["velocity"]["limit"] == 20.0 and elbow["velocity"]["unit"] == "rad/s"
@@ -115,7 +115,7 @@ def test_a_table_for_a_person_with_what_the_servos_say(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "120")
     path = arm_file(KNOWN, ("[0.80, 0.42]", "[0.20, 0.10]"), ("seed = 1\n", "seed = 1\nheld_out = false\n"))
-    assert hil("dry-run", path, "--arms", "8", "--servos") == 0
+    assert hil("dry-run", path, "--arms", "20", "--servos") == 0
     said = capsys.readouterr().out
     for part in (
         "SAFE",
