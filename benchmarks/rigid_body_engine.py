@@ -25,7 +25,8 @@ from benchmarks.machine import machine
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import RecordingError
 from hil.estimator.excitation.multisine import design_multisine, zippered_lines
-from hil.estimator.selection.settled import Choice, choose
+from hil.estimator.selection.settled import choose
+from hil.estimator.selection.trial import Choice
 from hil.fakes.plants.arm import Arm, base_parameters
 from tests.support.recorded_arm import BAND, COMMAND_TO_SAMPLE, CURRENT_STEP, DRIVES, LINKS, PERIOD, RATE, SERVO, STEP
 

@@ -6,10 +6,9 @@ meaningless terms would. Without another motion, the Bayesian information criter
 Statistics 6 (1978) 461), with the number of samples reduced according to the residual's correlation.
 """
 
-import time
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -17,90 +16,19 @@ from scipy.stats import chi2
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
-from hil.estimator.errors import ConvergenceError, PeriodicityError
-from hil.estimator.fit.stage2 import Near
-from hil.estimator.identify import Estimate, identify
+from hil.estimator.errors import ConvergenceError
+from hil.estimator.identify import Estimate
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
-from hil.estimator.options import IntegrationOptions, LikelihoodOptions, MinimiserOptions, SelectionOptions
+from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
 from hil.estimator.selection.drift import Drift, friction_change
-from hil.estimator.selection.other_period import predict_period, relative_error
 from hil.estimator.selection.steadied import steadied
+from hil.estimator.selection.trial import Choice, Fitting, Trial
 
 DEFAULTS = SelectionOptions()
-THOROUGH = LikelihoodOptions()
-QUICK = LikelihoodOptions(
-    minimiser=MinimiserOptions(max_iterations=25, unfinished=1.0),
-    integration=IntegrationOptions(max_substeps=16),
-    coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
-)
-"""With these limits, bristles that become extremely stiff do not take many substeps without benefit."""
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 """Terms that vanish smoothly, so that including them costs a fit little."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One model and its performance."""
-
-    model: Model
-    estimate: Estimate | None
-    """Result of the fit; None if the fit or the prediction did not converge."""
-    held_out: Array | None
-    """RMS error of the free prediction relative to the motion's RMS (joints,)."""
-    score: float
-    """RMS error of the free prediction in units of the noise; without a held-out motion, the equivalent criterion."""
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The models tried, in order, and the chosen one."""
-
-    trials: tuple[Trial, ...]
-    chosen: Trial
-    period: SettledPeriod
-    """The first period as it was fitted: corrected for a change of friction, if one was seen."""
-    drift: Drift | None = None
-    """The change of friction for which it was corrected."""
-
-    @property
-    def estimate(self) -> Estimate:
-        """The estimate of the chosen model."""
-        if self.chosen.estimate is None:
-            raise ConvergenceError(f"{self.chosen.model.description} did not converge to full precision")
-        return self.chosen.estimate
-
-    @property
-    def plainest(self) -> Trial:
-        """The trial with the fewest parameters among those that could be fitted."""
-        return min((each for each in self.trials if each.estimate is not None), key=lambda each: len(each.model.names))
-
-    @property
-    def gained(self) -> float:
-        """Ratio of the simplest model's error to the chosen one's."""
-        return self.plainest.score / self.chosen.score
-
-    @property
-    def cost(self) -> float:
-        """Increase of the base parameters' standard errors due to the added terms (geometric mean of ratios).
-
-        The reference is the standard errors if the terms that the simplest model lacks were known.
-        """
-        estimate = self.estimate
-        std = estimate.std
-        seen = np.isfinite(std) & (std > 0.0)
-        added = seen & [name not in self.plainest.model.names for name in estimate.names]
-        base = seen & [name in estimate.model.base_names for name in estimate.names]
-        if not added.any():
-            return 1.0
-        correlation = np.where(np.outer(seen, seen), estimate.covariance, 0.0) / np.outer(
-            np.where(seen, std, 1.0), np.where(seen, std, 1.0)
-        )
-        across = correlation[np.ix_(added, base)]
-        told = np.sum(across * (np.linalg.pinv(correlation[np.ix_(added, added)]) @ across), axis=0)
-        return float(np.exp(-0.5 * np.mean(np.log1p(-np.clip(told, 0.0, 1.0 - 1e-9)))))
 
 
 def choose(
@@ -152,44 +80,6 @@ def choose(
     finally:
         search.end()
     return Choice(tuple(search.trials), search.judged(pruned), search.period, search.drift)
-
-
-@dataclass(frozen=True)
-class Fitting:
-    """The data for fitting models to one set of periods, in a form that can be passed to another process."""
-
-    periods: Sequence[SettledPeriod]
-    held_out: SettledPeriod | None
-    starts: Sequence[Mapping[str, float]]
-    drift: Drift | None = None
-    """Change of friction from the periods to `held_out`, for which both are corrected."""
-
-    def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
-        """Fit `model` from the result of `near`, using `values` for what it lacks, or from scratch.
-
-        Raises ConvergenceError.
-        """
-        started = time.perf_counter()
-        place = None
-        if near is not None and near.estimate is not None:
-            place = Near({**near.estimate.parameters, **values}, near.estimate.start)
-        options = QUICK if coarse and "presliding" in model.options else THOROUGH
-        estimate = identify(self.periods, model, starts=self.starts, near=place, coarse=coarse, options=options)
-        relative, score = self._predicted(estimate)
-        return Trial(model, estimate, relative, score, time.perf_counter() - started)
-
-    def _predicted(self, estimate: Estimate) -> tuple[Array | None, float]:
-        other = self.held_out
-        if other is None:
-            return None, _criterion(estimate, self.periods)
-        try:
-            later = estimate if self.drift is None else self.drift.at_the_later(estimate)
-            predicted = predict_period(later, other)
-        except PeriodicityError:
-            return None, np.inf
-        return relative_error(other, predicted), float(
-            np.sqrt(np.nanmean(((other.position - predicted) / other.noise[:, None]) ** 2))
-        )
 
 
 class Selection:
@@ -478,11 +368,3 @@ def _tested(model: Model, plainer: Model) -> list[str]:
     """
     lacking = [name for name in model.names if name not in plainer.names]
     return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "stribeck_velocity")]
-
-
-def _criterion(estimate: Estimate, periods: Sequence[SettledPeriod]) -> float:
-    """Return exp(BIC / 2n) of the residual in units of the noise, comparable to a prediction error."""
-    noise = periods[0].noise
-    size = np.nanmean((estimate.residual / noise[:, None]) ** 2)
-    samples = sum(period.valid.sum() for period in periods) / estimate.correlation_time
-    return float(np.sqrt(size) * np.exp(0.5 * len(estimate.names) * np.log(samples) / samples))

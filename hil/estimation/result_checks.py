@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.estimator.selection import distortion, settled, unsettled, validation, verdict
+from hil.estimator.selection import distortion, trial, unsettled, validation, verdict
 from hil.results.parts import (
     Confounded,
     Levels,
@@ -62,7 +62,7 @@ def describe_verdict(judged: verdict.Verdict) -> Verdict:
     return Verdict(judged.trust, judged.weakest, tuple(judged.sentences))
 
 
-def describe_choice(choice: settled.Choice) -> ModelChoice:
+def describe_choice(choice: trial.Choice) -> ModelChoice:
     """Convert the choice among friction models, with its gain and cost."""
     return ModelChoice(
         chosen=choice.chosen.model.description,
@@ -81,11 +81,11 @@ def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
     )
 
 
-def _tried(trial: settled.Trial | unsettled.SegmentTrial) -> TriedModel:
+def _tried(tried: trial.Trial | unsettled.SegmentTrial) -> TriedModel:
     return TriedModel(
-        model=trial.model.description,
-        parameters=len(trial.model.names),
-        held_out_rms=_listed(trial.held_out),
-        score=trial.score if np.isfinite(trial.score) else None,
-        seconds=round(trial.seconds, 3),
+        model=tried.model.description,
+        parameters=len(tried.model.names),
+        held_out_rms=_listed(tried.held_out),
+        score=tried.score if np.isfinite(tried.score) else None,
+        seconds=round(tried.seconds, 3),
     )

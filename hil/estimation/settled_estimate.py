@@ -25,8 +25,9 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
 from hil.estimator.selection.drift import drifting, friction_change
 from hil.estimator.selection.other_period import predict_period
-from hil.estimator.selection.settled import Choice, choose
+from hil.estimator.selection.settled import choose
 from hil.estimator.selection.steadied import steadied
+from hil.estimator.selection.trial import Choice
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
 from hil.estimator.simulation.back_emf import neglected
