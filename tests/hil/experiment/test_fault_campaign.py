@@ -33,6 +33,7 @@ def chosen() -> list[Setting]:
     return [each for each in settings() if each.rate != RATES[-1] or names().index(each.name) % EVERY_THIRD == 0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", range(PARTS))
 def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
     outcomes, left_out = campaign(chosen()[part::PARTS], INJECTIONS // PARTS, jobs=1, period=PERIOD_S, even=False)

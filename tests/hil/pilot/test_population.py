@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.population import figures, study
 
 SEEDS = [7, 12, 13, 15, 29, 30, 31, 34]
@@ -9,6 +11,7 @@ SEEDS = [7, 12, 13, 15, 29, 30, 31, 34]
 """
 
 
+@pytest.mark.long
 def test_eight_arms_that_nobody_chose_their_torque_for(tmp_path: Path) -> None:
     outcomes = study(SEEDS, jobs=2, keep=tmp_path, quick=True)
     measured = figures(outcomes)
