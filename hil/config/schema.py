@@ -272,8 +272,9 @@ def load_config(path: Path) -> Config:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         if path.is_dir():
             within = next(iter(sorted(path.glob("*.toml"))), None)
-            reason = "it is a folder" + ("" if within is None else f", which holds {within.name}")
-        raise ConfigError(f"{path}: cannot be read: {reason}.{meant(path)}") from error
+            reason = "it is a folder" + ("" if within is None else f"; did you mean {within}?")
+        end = "" if reason.endswith("?") else f".{meant(path)}"
+        raise ConfigError(f"{path}: cannot be read: {reason}{end}") from error
     return parse_config(text, path)
 
 

@@ -104,7 +104,7 @@ def test_an_absent_file_and_one_that_is_no_text(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match=r"binary\.toml: cannot be read: it is not UTF-8"):
         load_config(binary)
-    with pytest.raises(ConfigError, match=r"cannot be read: it is a folder, which holds binary\.toml\."):
+    with pytest.raises(ConfigError, match=r"cannot be read: it is a folder; did you mean .*binary\.toml\?$"):
         load_config(tmp_path)
 
 
