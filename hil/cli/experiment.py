@@ -103,7 +103,7 @@ def _show(result: "Identification | Estimation", json_only: bool) -> None:
         print(strict_json.dumps(result.to_json()))
         return
     from hil.api.run import Identification
-    from hil.cli.printing import result_console
+    from hil.cli.views.printing import result_console
     from hil.cli.views.result_table import print_result, print_shooting_result
     from hil.runs.run_folder import RunFolder
 

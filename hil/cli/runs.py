@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 if TYPE_CHECKING:
-    from hil.estimation.diff import Difference
+    from hil.estimation.changes.diff import Difference
     from hil.runs.collection import RunSummary
 
 
@@ -38,7 +38,7 @@ def _print_runs(found: "list[RunSummary]") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from hil.cli.printing import natural_width, print_table, result_console, say
+    from hil.cli.views.printing import natural_width, print_table, result_console, say
 
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for heading in ("run", "arm", "when", "verdict", "residual", "name, note"):
@@ -83,7 +83,7 @@ def diff(
     json_only: Json = False,
 ) -> None:
     """Compare two runs of an arm and test which parameters changed significantly, for example from gearbox wear."""
-    from hil.estimation.diff import diff_runs
+    from hil.estimation.changes.diff import diff_runs
 
     difference = diff_runs(before, after)
     if png is not None:
@@ -102,7 +102,7 @@ def _print_difference(difference: "Difference") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from hil.cli.printing import print_table, result_console, say
+    from hil.cli.views.printing import print_table, result_console, say
 
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("parameter", no_wrap=True)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hil.errors import MissingExtra, RunFolderError
-from hil.estimation.diff import Change, Difference
+from hil.estimation.changes.diff import Change, Difference
 
 _SHOWN_PERCENT = 100.0
 _WIDTH_OF_95 = 1.96

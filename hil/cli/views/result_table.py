@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.cli.printing import print_table, say
+from hil.cli.views.printing import print_table, say
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said

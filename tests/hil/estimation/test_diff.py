@@ -8,8 +8,8 @@ import pytest
 
 from hil.arm_model import ArmModel, JointFacts
 from hil.errors import ResultError
-from hil.estimation.diff import diff_models, diff_runs
-from hil.estimation.friction_change import REPEATABILITY, friction_changes
+from hil.estimation.changes.diff import diff_models, diff_runs
+from hil.estimation.changes.friction_change import REPEATABILITY, friction_changes
 from hil.results.parts import Covariance
 
 FACTS = JointFacts("shoulder", "XM430-W350", "current", 1.8, 0.1, 1.2, (-3.0, 0.5), 10.0)
@@ -63,7 +63,7 @@ def test_terms_of_one_model_alone_are_named() -> None:
 
 def test_arms_of_other_joint_count_are_refused(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
     one = replace(MODEL, joints=(FACTS,))
-    monkeypatch.setattr("hil.estimation.diff.read_model", lambda path: one if "one" in str(path) else MODEL)
+    monkeypatch.setattr("hil.estimation.changes.diff.read_model", lambda path: one if "one" in str(path) else MODEL)
     with pytest.raises(ResultError, match="one has 1 joints and two 2"):
         diff_runs("one", "two")  # type: ignore[arg-type]
 

@@ -11,15 +11,18 @@ import argparse
 import itertools
 import json
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
 import hil
 from hil.config.schema import Config, load_config
 from hil.errors import SafetyStop
-from hil.estimation.diff import Difference, diff_runs
+from hil.estimation.changes.diff import Difference, diff_runs
 from tests.support.paths import CONFIGS
 
 TERMS = ("viscous", "coulomb", "stribeck_rise")

@@ -11,10 +11,13 @@ import argparse
 import contextlib
 import json
 import shlex
+import sys
 import tempfile
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from tests.support.first_evening import Person, Typed, arm_seconds, commands_of, evening, fake_arm, faults_of
 from tests.support.paths import CONFIGS

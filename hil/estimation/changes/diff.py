@@ -1,7 +1,7 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
 Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), the friction of each joint
-also as a whole (hil.estimation.friction_change), and Holm's step-down correction
+also as a whole (hil.estimation.changes.friction_change), and Holm's step-down correction
 keeps the probability of any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of
 Statistics 6 (1979) 65). A change must also be larger than `least_share` of the parameter's scale: standard errors cover
 noise only, and two runs of an arm with some unmodelled friction differ by a little more.
@@ -16,7 +16,7 @@ from typing import Any
 
 from hil.arm_model import ArmModel
 from hil.errors import ResultError
-from hil.estimation.friction_change import FrictionChange, friction_changes
+from hil.estimation.changes.friction_change import FrictionChange, friction_changes
 from hil.model_file import read_model, read_result
 from hil.results.parts import Covariance
 

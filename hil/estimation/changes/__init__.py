@@ -1,0 +1,1 @@
+"""Comparison of two identifications of one arm: parameters and friction."""
