@@ -40,6 +40,8 @@ def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Arra
         share, blocking = _share_until_bound(step, direction, least, most)
         step = np.clip(step + share * direction, least, most)
         if blocking is not None:
+            # Exactly: a rounding error below the upper bound would count as the lower one when it is to be released.
+            step[blocking] = most[blocking] if direction[blocking] > 0.0 else least[blocking]
             free[blocking] = False
             continue
         released = _wrongly_held(slope + matrix @ step, step, most, movable & ~free, TOLERANCE * np.abs(slope).max())

@@ -1,7 +1,7 @@
 """The bounded step minimises the quadratic function within its bounds."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
@@ -13,8 +13,9 @@ def value(matrix: np.ndarray, slope: np.ndarray, step: np.ndarray) -> float:
     return float(step @ matrix @ step / 2 + slope @ step)
 
 
+@example(9314195, 2, 3.138671875)  # a bound that is reached with a rounding error
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.floats(0.0, 5.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_matches_scipy_within_bounds_even_in_narrow_valleys(seed: int, size: int, decades: float) -> None:
     random = np.random.default_rng(seed)
     axes = np.linalg.qr(random.standard_normal((size, size)))[0]
