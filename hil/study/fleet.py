@@ -104,8 +104,8 @@ def _fleet(kind: str, table: pa.Table) -> Fleet:
 
 def _deviations(away: Floats, spread: float, std: Floats) -> Floats:
     scale = np.hypot(spread, np.nan_to_num(std, nan=0.0))
-    same = np.where(away == 0.0, 0.0, np.copysign(np.inf, away))
-    return np.asarray(np.divide(away, scale, out=same, where=scale > 0.0))
+    exact = np.where(np.isnan(away) | (away == 0.0), away, np.copysign(np.inf, away))
+    return np.asarray(np.divide(away, scale, out=exact, where=scale > 0.0))
 
 
 def _is_value(name: str) -> bool:

@@ -259,3 +259,10 @@ def test_what_is_wrong_in_vary_is_named_without_the_schema_s_own_words(
     with pytest.raises(ConfigError, match=message) as caught:
         load_study(path)
     assert "union[" not in str(caught.value) and "~" not in str(caught.value)
+
+
+def test_an_arm_without_a_parameter_is_no_outlier_in_it() -> None:
+    values = [0.05] * 5 + [None]
+    columns = {"recording": list("abcdef"), "parameters.load_1.value": values, "parameters.viscous_1.value": [0.1] * 6}
+    (found,) = fleets(pa.table(columns))
+    assert not found.unlike and np.isnan(found.arms[5].deviations[0])
