@@ -21,8 +21,9 @@ limits          what `hil init` writes: 30 % of stall current or voltage, 10 rad
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,13 +59,10 @@ def draw(seed: int) -> DrawnArm:
     random = np.random.default_rng((13, seed))
     joints = 1 if random.random() < 0.3 else 2
     models = _models(random, joints)
-    orientation = str(random.choice(list(ORIENTATIONS), p=list(ORIENTATIONS.values())))
-    tilt = DEGREE * random.uniform(10, 60) if orientation == "tilted" else math.pi / 2 * (orientation == "flat")
-    rest = {"flat": 0.0, "upright": math.pi / 2}.get(orientation, -math.pi / 2)
-    weight = 0.0 if orientation == "flat" else STANDARD_GRAVITY * math.cos(tilt)
+    orientation, tilt, rest, weight = stance(random, ORIENTATIONS, (10, 60))
     while True:
         links = _links(random, models)
-        if _holding_torque(links, models) <= MOST_GRAVITY * _stall(models[0]):
+        if _holding_torque(links, models) <= MOST_GRAVITY * stall_torque(models[0]):
             break
     richer = _richer(random)
     scale = random.uniform(0.88, 1.12, joints)
@@ -73,18 +71,8 @@ def draw(seed: int) -> DrawnArm:
     drives = [drive | warming for drive in drives]
     zeros = random.uniform(1, 2, joints) * random.choice((-1, 1), joints) * DEGREE
     start = _start(random, rest, links, drives, weight)
-    answers = tuple(
-        JointAnswers(
-            ("shoulder", "elbow")[i],
-            i + 1,
-            model.name,
-            2048 + round(zeros[i] / model.position_unit),
-            rest if i == 0 else 0.0,
-            swing=float(random.uniform(60, 120)) * DEGREE,
-            length=round(links[i]["length"], 3),
-        )
-        for i, model in enumerate(models)
-    )
+    counts = [2048 + round(zero / model.position_unit) for zero, model in zip(zeros, models, strict=True)]
+    answers = joint_answers(random, models, links, counts, rest)
     head = f"Arm {seed} of the population."
     gravity = 0.0 if orientation == "flat" else round(weight, 3)
     text = arm_toml(ArmAnswers("fake://", 1_000_000, answers, gravity, head))
@@ -101,14 +89,57 @@ def _models(random: np.random.Generator, joints: int) -> list[ServoModel]:
     return [servo_model(name) for name in (first, second)[:joints]]
 
 
-def _stall(model: ServoModel) -> float:
-    return sorted(stall.torque for stall in model.stalls)[len(model.stalls) // 2]
+class Stance(NamedTuple):
+    """How an arm is mounted.
+
+    tilt: of its plane from the vertical [rad]. rest: rest angle of joint 1 [rad]. weight: gravity in the plane [m/s^2].
+    """
+
+    orientation: str
+    tilt: float
+    rest: float
+    weight: float
+
+
+def stance(random: np.random.Generator, shares: Mapping[str, float], degrees: tuple[float, float]) -> Stance:
+    """Draw how an arm is mounted, from the `shares` of orientations; a tilted one by `degrees` (lowest, highest)."""
+    orientation = str(random.choice(list(shares), p=list(shares.values())))
+    tilt = DEGREE * random.uniform(*degrees) if orientation == "tilted" else math.pi / 2 * (orientation == "flat")
+    rest = {"flat": 0.0, "upright": math.pi / 2}.get(orientation, -math.pi / 2)
+    return Stance(orientation, tilt, rest, 0.0 if orientation == "flat" else STANDARD_GRAVITY * math.cos(tilt))
+
+
+def joint_answers(
+    random: np.random.Generator,
+    models: Sequence[ServoModel],
+    links: Sequence[Mapping[str, float]],
+    counts: Sequence[int],
+    rest: float,
+) -> tuple[JointAnswers, ...]:
+    """Return what a person would answer to `hil init`; counts: what each encoder reads at its joint's zero [steps]."""
+    return tuple(
+        JointAnswers(
+            ("shoulder", "elbow")[i],
+            i + 1,
+            model.name,
+            counts[i],
+            rest if i == 0 else 0.0,
+            swing=float(random.uniform(60, 120)) * DEGREE,
+            length=round(links[i]["length"], 3),
+        )
+        for i, model in enumerate(models)
+    )
+
+
+def stall_torque(model: ServoModel) -> float:
+    """Stall torque at the middle of the voltages for which it is published [N m]."""
+    return sorted(each.torque for each in model.stalls)[len(model.stalls) // 2]
 
 
 def _links(random: np.random.Generator, models: list[ServoModel]) -> list[dict[str, float]]:
     links = []
     for model in models:
-        size = (_stall(model) / REFERENCE_STALL) ** 0.4
+        size = (stall_torque(model) / REFERENCE_STALL) ** 0.4
         length = size * random.uniform(0.08, 0.20)
         mass = length * size * math.exp(random.uniform(math.log(0.5), math.log(2.2)))
         centre = length * random.uniform(0.4, 0.9)
@@ -139,7 +170,7 @@ def _richer(random: np.random.Generator) -> list[str]:
 
 
 def _drive(random: np.random.Generator, model: ServoModel, factor: float, richer: list[str]) -> dict[str, Any]:
-    stall, family = _stall(model), model.name.split("-")[0]
+    stall, family = stall_torque(model), model.name.split("-")[0]
     most = 0.07 if model.name in SMALL else 0.03
     coulomb = stall * math.exp(random.uniform(math.log(0.008), math.log(most)))
     facts = load_model(model.name)

@@ -25,7 +25,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drawn_arms.population_arms import DEGREE, REFERENCE_STALL, SERVO_MASS, DrawnArm
+from benchmarks.drawn_arms.population_arms import (
+    DEGREE,
+    REFERENCE_STALL,
+    SERVO_MASS,
+    DrawnArm,
+    joint_answers,
+    stall_torque,
+    stance,
+)
 from hil.drivers.servo_model import Mode, ServoModel, servo_model
 from hil.fakes.servo.registers import load_model
 from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers, arm_toml
@@ -43,10 +51,7 @@ def draw(seed: int) -> DrawnArm:
     random = np.random.default_rng((29, seed))
     joints = 1 if random.random() < 0.3 else 2
     models = _models(random, joints)
-    orientation = str(random.choice(list(ORIENTATIONS), p=list(ORIENTATIONS.values())))
-    tilt = DEGREE * random.uniform(20, 70) if orientation == "tilted" else math.pi / 2 * (orientation == "flat")
-    rest = {"flat": 0.0, "upright": math.pi / 2}.get(orientation, -math.pi / 2)
-    weight = 0.0 if orientation == "flat" else STANDARD_GRAVITY * math.cos(tilt)
+    orientation, tilt, rest, weight = stance(random, ORIENTATIONS, (20, 70))
     links = _links(random, models)
     while not _is_light(links, models):
         links = _links(random, models)
@@ -61,18 +66,8 @@ def draw(seed: int) -> DrawnArm:
     encoders, kinds = _encoders(random, joints)
     counts = random.integers(600, TURN - 600, joints)
     zeros = random.uniform(-2.5, 2.5, joints) * DEGREE
-    answers = tuple(
-        JointAnswers(
-            ("shoulder", "elbow")[i],
-            i + 1,
-            model.name,
-            int(counts[i]) + round(zeros[i] / model.position_unit),
-            rest if i == 0 else 0.0,
-            swing=float(random.uniform(60, 120)) * DEGREE,
-            length=round(links[i]["length"], 3),
-        )
-        for i, model in enumerate(models)
-    )
+    at_zero = [int(counts[i]) + round(zeros[i] / model.position_unit) for i, model in enumerate(models)]
+    answers = joint_answers(random, models, links, at_zero, rest)
     start = [rest * (i == 0) + _held(random, drives[i], links, models, i, weight) for i in range(joints)]
     text = arm_toml(ArmAnswers("fake://", 1_000_000, answers, round(weight, 3), f"Arm {seed} of the others."))
     text = _other_experiment(random, text, answers)
@@ -88,16 +83,12 @@ def _models(random: np.random.Generator, joints: int) -> list[ServoModel]:
     return [servo_model(name) for name in (first, second)[:joints]]
 
 
-def _stall(model: ServoModel) -> float:
-    return sorted(stall.torque for stall in model.stalls)[len(model.stalls) // 2]
-
-
 def _links(random: np.random.Generator, models: list[ServoModel]) -> list[dict[str, float]]:
     ratio = math.exp(random.uniform(math.log(0.3), math.log(3.0)))
     first = math.exp(random.uniform(math.log(0.06), math.log(0.25)))
     links = []
     for model, bare in zip(models, (first, first * ratio), strict=False):
-        size = (_stall(model) / REFERENCE_STALL) ** 0.4
+        size = (stall_torque(model) / REFERENCE_STALL) ** 0.4
         length = min(max(size * bare, 0.02), 0.4)
         mass = length * size * random.uniform(0.3, 1.5)
         payload = mass * random.uniform(0.0, 1.0) * (random.random() < 0.5)
@@ -119,7 +110,7 @@ def _moment(links: list[dict[str, float]], models: list[ServoModel], joint: int)
 
 def _is_light(links: list[dict[str, float]], models: list[ServoModel]) -> bool:
     each = zip(range(len(links)), models, strict=True)
-    return all(STANDARD_GRAVITY * _moment(links, models, i) <= MOST_GRAVITY * _stall(model) for i, model in each)
+    return all(STANDARD_GRAVITY * _moment(links, models, i) <= MOST_GRAVITY * stall_torque(model) for i, model in each)
 
 
 def _mass(model: ServoModel) -> float:
@@ -130,7 +121,7 @@ def _drive(random: np.random.Generator, model: ServoModel, factor: float, richer
     def evenly(low: float, high: float) -> float:
         return math.exp(random.uniform(math.log(low), math.log(high)))
 
-    stall, coulomb = _stall(model), _stall(model) * evenly(0.005, 0.07)
+    stall, coulomb = stall_torque(model), stall_torque(model) * evenly(0.005, 0.07)
     pwm = model.default_mode is Mode.PWM
     constant = model.torque_per_ampere.value
     if pwm:
