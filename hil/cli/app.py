@@ -14,9 +14,9 @@ import typer
 from hil import __version__
 from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
 from hil.cli.errors import exit_code, message
+from hil.cli.stopped import same_again
 from hil.cli.verbosity import with_verbosity
 from hil.errors import StopRequested
-from hil.next_step import next_step
 
 app = typer.Typer(
     name="hil",
@@ -105,7 +105,8 @@ def main() -> NoReturn:
         if code is None:
             raise
         print(message(error), file=sys.stderr)
-        if isinstance(error, StopRequested) and not any("hil " in note for note in getattr(error, "__notes__", [])):
-            print(next_step(*sys.argv[1:]), file=sys.stderr)
+        if isinstance(error, StopRequested):
+            for line in same_again(error):
+                print(line, file=sys.stderr)
         sys.exit(code)
     sys.exit(0)

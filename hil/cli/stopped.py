@@ -42,9 +42,14 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def how_to_go_on(stopped: BaseException) -> list[str]:
-    """The notes of what was stopped; if they name no next command, it is the same command again."""
-    notes = list(getattr(stopped, "__notes__", []))
-    return notes if any("hil " in note for note in notes) else [*notes, next_step(*sys.argv[1:])]
+    """The notes of what was stopped, and the next command."""
+    return [*getattr(stopped, "__notes__", []), *same_again(stopped)]
+
+
+def same_again(stopped: BaseException) -> list[str]:
+    """The same command as the next one, if the notes of what was stopped name none."""
+    notes = getattr(stopped, "__notes__", [])
+    return [] if any("hil " in note for note in notes) else [next_step(*sys.argv[1:])]
 
 
 def _catch() -> dict[signal.Signals, Any]:
