@@ -53,8 +53,9 @@ from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
-from hil.estimator.chain.simulation.prediction import predict, relative_error
+from hil.estimator.chain.simulation.prediction import predict
 from hil.estimator.data.recording import Recording
+from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
 from hil.estimator.simulation.closed_loop import Feedback, Stabilised
@@ -236,7 +237,7 @@ def classic(setup: Setup, period: SettledPeriod, held_out: SettledPeriod, path: 
 def foretold(model: ChainModel, parameters: dict[str, float], held_out: SettledPeriod) -> float | None:
     """Error of the free prediction [%], worst joint; None if the simulation with these parameters diverges."""
     try:
-        return 100 * float(relative_error(held_out, predict(model, parameters, held_out)).max())
+        return 100 * float(relative_error(held_out.position, predict(model, parameters, held_out)).max())
     except PeriodicityError:
         return None
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hil.estimator.models.friction import direction, dry_level, viscous
+
 Array = NDArray[np.float64]
 
 _CHUNK = 16384  # samples per block, chosen so that temporaries stay in the processor's cache
@@ -178,10 +180,7 @@ class ArmModel:
         return np.stack((p["gravity_1"] * np.cos(shoulder) + second, second))
 
     def _viscous(self, joint: int, v: Array) -> Array:
-        """Viscous friction [N m], including its dependence on direction where that was identified."""
-        moving = self.values[f"viscous_{joint}"] * v
-        asymmetry = self.values.get(f"viscous_asymmetry_{joint}", 0.0)
-        return np.asarray(moving + asymmetry * v * self._step(joint, v)) if asymmetry else moving
+        return viscous(self.values, joint, v, self._step(joint, v))
 
     def _ripple(self, joint: int, q: Array) -> Array:
         """Ratio of motor torque to nominal torque at the angles q [rad]."""
@@ -190,15 +189,10 @@ class ArmModel:
         return np.asarray(1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles))
 
     def _step(self, joint: int, v: Array) -> Array:
-        width = self.values.get(f"coulomb_width_{joint}", 0.0)
-        return np.asarray(np.tanh(v / width) if width > 0 else np.sign(v))
+        return direction(v, self.values.get(f"coulomb_width_{joint}", 0.0))
 
-    def _level(self, joint: int, v: Array) -> Array | float:
-        level = self.values[f"coulomb_{joint}"]
-        rise = self.values.get(f"stribeck_rise_{joint}", 0.0)
-        if not rise:
-            return level
-        return np.asarray(level * (1 + rise * np.exp(-((v / self.values[f"stribeck_velocity_{joint}"]) ** 2))))
+    def _level(self, joint: int, v: Array) -> Array:
+        return dry_level(self.values, joint, v)
 
     def _load_friction(self, dq: Array, torque: Array) -> Array:
         loads = [self.values.get(f"load_{joint}", 0.0) for joint in range(1, len(self.joints) + 1)]

@@ -22,11 +22,11 @@ import numpy as np
 from benchmarks.effects.backlash import GROUPS
 from benchmarks.effects.elastic_slip import SlippingMotor
 from benchmarks.machine import machine
+from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.identify import identify, predict
 from hil.estimator.models.model import Model
-from hil.estimator.selection.other_period import relative_error
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.motor import Motor
 from tests.support.recorded_arm import record, servo_arm, wave
@@ -48,7 +48,7 @@ def figures(arm: Arm, period: SettledPeriod, held_out: SettledPeriod, presliding
     truth = base_parameters(arm)
     errors = {name: abs(found.parameters[name] / true - 1.0) for name, true in truth.items()}
     worst = [max(error for name, error in errors.items() if name.split("_")[0] in kinds) for kinds in GROUPS.values()]
-    held = float(relative_error(held_out, predicted).max())
+    held = float(relative_error(held_out.position, predicted).max())
     return dict(zip(keys, (*worst, held, float(found.residual_steps.max())), strict=True))
 
 

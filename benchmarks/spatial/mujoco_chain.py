@@ -8,7 +8,6 @@ period's Fourier lines, an initial guess as good as ours, its own optimiser with
 integration steps per sample.
 """
 
-import importlib
 import io
 import time
 from contextlib import redirect_stdout
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hil.errors import MissingExtra
+from hil.estimation.mujoco_peer import import_mujoco
 from hil.estimator.chain.fit.stage1 import fit_lines
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -43,13 +42,7 @@ def fit_chain_with_mujoco(
 
     described: all parameters of the description (11 joints,) [SI]. Raises MissingExtra without mujoco[sysid].
     """
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-        sysid: Any = importlib.import_module("mujoco.sysid")
-    except ImportError as error:
-        raise MissingExtra("mujoco.sysid is not installed: pip install 'hil[peers]'.") from error
-    if not hasattr(sysid, "optimize"):
-        raise MissingExtra("mujoco is installed without its sysid extra: pip install 'hil[peers]'.")
+    mujoco, sysid = import_mujoco()
     joints = base.chain.joints
     links = described.reshape(joints, -1)[:, :10]
     spec = mujoco.MjSpec.from_string(_xml(period, base, links))

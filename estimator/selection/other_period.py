@@ -60,10 +60,3 @@ def _held(physics: Physics, other: SettledPeriod, stabiliser: Stabilised, start:
         position, state = stabiliser.continued(physics, state, other.rate, other.command_to_sample)
         periods.append(position)
     return periods
-
-
-def relative_error(period: SettledPeriod, predicted: Array) -> Array:
-    """Return the RMS of measured minus predicted position relative to that of the motion about its mean (joints,)."""
-    motion = period.position - np.nanmean(period.position, axis=1, keepdims=True)
-    error: Array = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1) / np.nanmean(motion**2, axis=1))
-    return error

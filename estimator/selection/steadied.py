@@ -14,6 +14,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
+from hil.estimator.models.friction import direction, dry_level, viscous
 from hil.estimator.selection.drift import Drift
 
 LEAST_WIDTH = 0.01  # rad/s: width of the Coulomb step for models without one, such as bristles
@@ -24,15 +25,11 @@ def friction_torque(period: SettledPeriod, estimate: Estimate) -> Array:
     lines = lines_of(period.filled())
     velocity = motion_of(lines, cut_off(lines), period.fundamental, period.samples).velocity
     friction = np.empty_like(velocity)
-    for joint, v in enumerate(velocity):
-
-        def of(name: str, absent: float = 0.0, joint: int = joint) -> float:
-            return estimate.parameters.get(f"{name}_{joint + 1}", absent)
-
-        bump = np.exp(-np.minimum((v / of("stribeck_velocity", 1.0)) ** 2, 50.0))
-        level = of("coulomb") * (1.0 + of("stribeck_rise") * bump) + of("load") * np.abs(period.torque[joint])
-        bend = np.tanh(v / max(of("coulomb_width", LEAST_WIDTH), 1e-4))
-        friction[joint] = of("viscous") * v + of("viscous_asymmetry") * v * bend + level * bend
+    values = estimate.parameters
+    for joint, v in enumerate(velocity, start=1):
+        step = direction(v, max(values.get(f"coulomb_width_{joint}", LEAST_WIDTH), 1e-4))
+        load = values.get(f"load_{joint}", 0.0) * np.abs(period.torque[joint - 1])
+        friction[joint - 1] = viscous(values, joint, v, step) + (dry_level(values, joint, v) + load) * step
     return friction
 
 

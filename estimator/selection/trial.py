@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError, PeriodicityError
 from hil.estimator.fit.stage2 import Near
@@ -14,7 +15,7 @@ from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.model import Model
 from hil.estimator.options import IntegrationOptions, LikelihoodOptions, MinimiserOptions
 from hil.estimator.selection.drift import Drift
-from hil.estimator.selection.other_period import predict_period, relative_error
+from hil.estimator.selection.other_period import predict_period
 
 THOROUGH = LikelihoodOptions()
 QUICK = LikelihoodOptions(
@@ -121,7 +122,7 @@ class Fitting:
             predicted = predict_period(later, other)
         except PeriodicityError:
             return None, np.inf
-        return relative_error(other, predicted), float(
+        return relative_error(other.position, predicted), float(
             np.sqrt(np.nanmean(((other.position - predicted) / other.noise[:, None]) ** 2))
         )
 

@@ -28,11 +28,8 @@ WITHIN = 0.5  # relative error of the initial guess
 BOUNDS = (0.02, 20.0)  # relative to `centre`; offsets may have either sign
 
 
-def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float, seed: int) -> Peer:
-    """Fit with mujoco.sysid, starting from values drawn within 50 % of `centre` (base parameters by name [SI]).
-
-    `length`: of link 1 [m]. `gravity`: [m/s^2]. Raises MissingExtra without mujoco[sysid].
-    """
+def import_mujoco() -> tuple[Any, Any]:
+    """Return the modules mujoco and mujoco.sysid. Raises MissingExtra."""
     try:
         mujoco: Any = importlib.import_module("mujoco")
         sysid: Any = importlib.import_module("mujoco.sysid")
@@ -40,6 +37,15 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
         raise MissingExtra("mujoco.sysid is not installed: pip install 'hil[peers]'.") from error
     if not hasattr(sysid, "optimize"):
         raise MissingExtra("mujoco is installed without its sysid extra: pip install 'hil[peers]'.")
+    return mujoco, sysid
+
+
+def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float, seed: int) -> Peer:
+    """Fit with mujoco.sysid, starting from values drawn within 50 % of `centre` (base parameters by name [SI]).
+
+    `length`: of link 1 [m]. `gravity`: [m/s^2]. Raises MissingExtra without mujoco[sysid].
+    """
+    mujoco, sysid = import_mujoco()
     linear = fit_lines(period)
     arm = _Arm.of(centre, period.joints, length, gravity)
     spec = mujoco.MjSpec.from_string(_xml(arm, 1.0 / (STEPS * period.rate)))

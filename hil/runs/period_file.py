@@ -1,7 +1,7 @@
 """period.npz: each multisine's settled period as measured and as predicted, for figures and other tools.
 
 Arrays are named ROLE_torque, ROLE_position, ROLE_predicted, ROLE_rate. ROLE is "identify" for the fitted multisine, and
-"held_out" for the one that was predicted from rest without using its measurement.
+"held_out" for the one that was not fitted: it is predicted from the state one period earlier, or from rest.
 """
 
 from collections.abc import Mapping
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import RunFolderError
+from hil.estimator.data.relative_error import relative_error
 from hil.runs.file_size import check_archive
 
 FILE_NAME = "period.npz"
@@ -40,8 +41,7 @@ class PlayedPeriod:
     @property
     def relative_error(self) -> NDArray[np.float64]:
         """RMS prediction error relative to the RMS of the motion about its mean (joints,)."""
-        motion = self.position - np.nanmean(self.position, axis=1, keepdims=True)
-        return np.asarray(np.sqrt(np.nanmean(self.error**2, axis=1) / np.nanmean(motion**2, axis=1)))
+        return relative_error(self.position, self.predicted)
 
 
 def save_periods(run: Path, periods: Mapping[str, PlayedPeriod]) -> None:

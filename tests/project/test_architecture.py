@@ -140,7 +140,7 @@ assert load_model("XD430-T210").operating_modes
 def test_a_friction_term_as_described(copy: Path) -> None:
     """The new term has correct derivatives, is identified from a simulated arm, and is known everywhere."""
     touched = follow(copy, "A friction term")
-    equations = {"estimator/simulation/arm.py", "estimator/simulation/sensitivity.py", "hil/arm_model.py"}
+    equations = {"estimator/simulation/arm.py", "estimator/simulation/sensitivity.py", "estimator/models/friction.py"}
     assert touched == {"estimator/models/terms.py", *equations, "hil/config/experiment.py"}
     run(copy, FRICTION)
 

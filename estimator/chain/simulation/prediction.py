@@ -60,10 +60,3 @@ def _commands(period: SettledPeriod) -> tuple[Array, Feedback]:
             feedback.stiffness, feedback.damping, feedback.pose, np.full(period.joints, NEVER)
         )
     return period.stabiliser.excitation, period.stabiliser.feedback
-
-
-def relative_error(period: SettledPeriod, predicted: Array) -> Array:
-    """Return the RMS of measured minus predicted position relative to that of the motion (joints,)."""
-    error = np.sqrt(np.nanmean((period.position - predicted) ** 2, axis=1))
-    moved: Array = error / period.filled().std(axis=1)
-    return moved

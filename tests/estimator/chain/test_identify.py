@@ -11,10 +11,11 @@ from hil.estimator.chain.fit.regression import fit_filtered
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import scale_precision
-from hil.estimator.chain.simulation.prediction import predict, relative_error
+from hil.estimator.chain.simulation.prediction import predict
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS
 from hil.estimator.data.recording import Recording
+from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ModelError
 
@@ -66,7 +67,7 @@ def test_intervals_hold_the_truth(setup: bench.Setup, estimate: ChainEstimate) -
 
 def test_it_foretells_a_motion_that_it_never_saw(setup: bench.Setup, estimate: ChainEstimate) -> None:
     other = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 201))
-    assert relative_error(other, predict(estimate.model, estimate.parameters, other)).max() < 0.005
+    assert relative_error(other.position, predict(estimate.model, estimate.parameters, other)).max() < 0.005
 
 
 def test_missing_samples_cost_little(setup: bench.Setup, period: SettledPeriod, estimate: ChainEstimate) -> None:

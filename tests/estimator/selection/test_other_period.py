@@ -6,10 +6,11 @@ from typing import cast
 
 import numpy as np
 
+from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
-from hil.estimator.selection.other_period import predict_period, relative_error
+from hil.estimator.selection.other_period import predict_period
 from hil.estimator.simulation.closed_loop import Feedback, Stabilised, respond, resting
 from tests.support.recorded_arm import RATE, STEP, wave
 
@@ -50,20 +51,20 @@ def second_period(feedback: Feedback, offset: float, error: float = 0.0) -> Sett
 
 def test_what_is_left_of_a_transient_is_predicted() -> None:
     other = second_period(Feedback.none(1), 0.2)
-    settled = relative_error(other, predict_period(estimate(ARM), replace(other, before=None)))
-    found = relative_error(other, predict_period(estimate(ARM), other))
+    settled = relative_error(other.position, predict_period(estimate(ARM), replace(other, before=None)))
+    found = relative_error(other.position, predict_period(estimate(ARM), other))
     assert found[0] < 0.01 < settled[0]
 
 
 def test_so_it_is_with_a_stabiliser() -> None:
     feedback = Feedback(np.array([0.3]), np.array([0.002]), POSE, np.array([5.0]))
     other = second_period(feedback, 0.4)
-    settled = relative_error(other, predict_period(estimate(ARM), replace(other, before=None)))
-    found = relative_error(other, predict_period(estimate(ARM), other))
+    settled = relative_error(other.position, predict_period(estimate(ARM), replace(other, before=None)))
+    found = relative_error(other.position, predict_period(estimate(ARM), other))
     assert found[0] < 0.01 and found[0] < 0.5 * settled[0]
 
 
 def test_the_start_is_what_the_encoder_read() -> None:
     other = second_period(Feedback.none(1), 0.2, error=0.02)
     bent = estimate({**ARM, "encoder_sin_once_1": 0.02})
-    assert relative_error(other, predict_period(bent, other))[0] < 0.01
+    assert relative_error(other.position, predict_period(bent, other))[0] < 0.01
