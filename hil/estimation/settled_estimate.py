@@ -23,7 +23,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
-from hil.estimator.selection.drift import drifting, friction_change
+from hil.estimator.selection.drift import Drift, drifting, friction_change
 from hil.estimator.selection.other_period import predict_period
 from hil.estimator.selection.settled import choose
 from hil.estimator.selection.steadied import steadied
@@ -57,21 +57,18 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     period = settled_period(config, facts, samples, IDENTIFY)
     other, cut_short = _held_out(config, facts, samples)
     between = None if other is None else _mean_time(facts, samples, HELD_OUT) - _mean_time(facts, samples, IDENTIFY)
-    recorded = period
     estimate, choice = _estimate(config, period, other, between, run.load_starts(), executor)
-    period = recorded if choice is None else choice.period
+    played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+    period = period if choice is None else choice.period
+    is_corrected = choice is not None and choice.drift is not None
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=_with_neglected(considered(period, estimate), estimate))
     drift = None if other is None or between is None else friction_change(other, estimate, between)
     if drift is not None:
-        left = drift if choice is None or choice.drift is None else drift.after_correction()
+        left = drift.after_correction() if is_corrected else drift
         estimate = replace(estimate, covariance=drifting(period, estimate, left))
-    played = {IDENTIFY: PlayedPeriod(recorded.rate, recorded.torque, recorded.position, estimate.position)}
-    if other is not None:
-        later = estimate if drift is None or not drift.is_seen else drift.at_the_later(estimate)
-        changes = choice is not None and choice.drift is not None and drift is not None
-        predicted = predict_period(later, steadied(other, later, drift) if changes and drift is not None else other)
-        played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
+    if other is not None and drift is not None:
+        played[HELD_OUT] = _predicted(estimate, other, drift, is_corrected)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     validation = validate(period, estimate)
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
@@ -112,6 +109,13 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
             "The recording ends before the held-out motion settled: that the model predicts another motion is not "
             "checked. Identify again for that."
         ]
+
+
+def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift, is_corrected: bool) -> PlayedPeriod:
+    """Predict the held-out period under the friction of its time, within it too if the fitted one `is_corrected`."""
+    later = drift.at_the_later(estimate) if drift.is_seen else estimate
+    predicted = predict_period(later, steadied(other, later, drift) if is_corrected else other)
+    return PlayedPeriod(other.rate, other.torque, other.position, predicted)
 
 
 def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:
