@@ -24,9 +24,10 @@ def parameters_of(result: Result) -> Section:
     tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]
     if result.extra:
         tables.append(_table(result.extra, {}, {}, "Additional model terms"))
+    left_out = ", and small effects that the model leaves out and the motion cannot rule out"
     words = (
-        "The interval covers the noise of this recording. It includes neither the error of the torque "
-        "constants, with which all values of a joint scale, nor model error.",
+        f"The interval covers the noise of this recording{left_out if result.chain is None else ''}. It includes "
+        "neither the error of the torque constants, with which all values of a joint scale, nor other model errors.",
     )
     return Section("parameters", "Parameters", words, tuple(tables))
 
