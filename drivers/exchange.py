@@ -124,6 +124,11 @@ class Exchange:
         """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
         return self._port.wire_time(max(self._bytes(read) for read in self._reads))
 
+    @property
+    def patience(self) -> float:
+        """Longest time that a cycle waits for replies [s]."""
+        return max(self._timeouts)
+
     def read_status_next(self) -> None:
         """Read the status in the next cycle instead of when its turn comes."""
         if self._status_every < _NEVER:

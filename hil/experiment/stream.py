@@ -83,7 +83,13 @@ class Stream:
         self._left_by_a_run = has_moved()
         self._turns = bus.exchanges_per_sample
         self._apart = 1 / plan.rate / self._turns
-        self._guard = Guard(config, planned, interval=self._apart, left_by_a_run=self._left_by_a_run)
+        self._guard = Guard(
+            config,
+            planned,
+            interval=self._apart,
+            patience=bus.prepared.patience,
+            left_by_a_run=self._left_by_a_run,
+        )
         self._model: ModelWatch | ChainWatch = (
             ModelWatch(config, planned, arms, self._apart)
             if not isinstance(arms, ChainArms) and not config.is_chain

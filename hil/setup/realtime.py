@@ -19,6 +19,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
 
+from hil.drivers.clock import Clock, WallClock
+
 PRIORITY = 20
 """Priority for SCHED_FIFO (1 to 99): above ordinary tasks, below the kernel threads (50) that serve the serial port."""
 
@@ -43,6 +45,16 @@ def real_time() -> Iterator[list[Granted]]:
     """Request all settings. Yields the list of settings and whether each was granted."""
     with ExitStack() as undo:
         yield [step(undo) for step in (_fifo, _own_core, _lock_memory, _timer_slack, _no_collection, _short_turns)]
+
+
+@contextmanager
+def on_time(clock: Clock) -> Iterator[list[Granted]]:
+    """`real_time` for exchanges on the wall clock; on a virtual clock nothing can be late, and nothing is requested."""
+    if isinstance(clock, WallClock):
+        with real_time() as granted:
+            yield granted
+    else:
+        yield []
 
 
 def _fifo(undo: ExitStack) -> Granted:

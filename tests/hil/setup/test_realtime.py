@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from hil.experiment.realtime import real_time
+from hil.setup.realtime import real_time
 
 
 def settings() -> tuple[object, ...]:
