@@ -93,8 +93,8 @@ class Guard:
         self._work = Work(config) if config.stabiliser is None else None
         self._interval = 1.0 / rate if interval is None else interval
         self._silence = Silence(config, self._interval, patience)
+        self._patience = patience or float("inf")
         self._deadlines = Deadlines(config)
-        self._was_late = False
         self._following = [
             None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
             for joint, peak in zip(config.joints, planned or _planned(config), strict=True)
@@ -119,6 +119,10 @@ class Guard:
         """The goals that the servos have now [A or V]: `clamp` goes on from there."""
         self._commands.holding(goals)
 
+    def woke_up(self, now: float, late: float) -> None:
+        """Record that this program woke up at `now` [s], `late` [s] after it wanted to: the computer may be busy."""
+        self._silence.woke_up(now, late)
+
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._deadlines.missed(seconds)
@@ -132,6 +136,7 @@ class Guard:
         took = state.time_after_read - now
         self._deadlines.check_gap(max(watchdog_gap, took))
         self._silence.ask(now)
+        self._silence.woke_up(now, took - self._patience)
         self._shortest = shortest = min(self._shortest, took)
         self._unsure = took - shortest
         if not between:
@@ -142,7 +147,7 @@ class Guard:
                     index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
                 )
             if state.missing[index]:
-                self._count_missing(index, state.error[index], now)
+                self._count_missing(index, state.error[index], now, alone=not all(state.missing))
             else:
                 self._look_at_joint(index, limits, state, now)
         if state.apart is not None and (turned := self._apart.look(state.apart)) is not None:
@@ -208,15 +213,13 @@ class Guard:
                     "is allowed. Let the arm come to rest; check for a draught, a dragging cable or a hand.",
                 )
 
-    def _count_missing(self, index: int, error: int, now: float) -> None:
+    def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
         if self._missing[index] == 0 and self._position[index] is None:
             self._seen_at[index] = now
-        if not any(self._missing):
-            self._was_late = self._deadlines.were_missed  # silent servos make the program late themselves
         # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
         # was damaged.
         refused = bool(error) and error != StatusError.CRC
-        too_long = self._silence.missed(index, now, refused=refused)
+        too_long = self._silence.missed(index, now, refused=refused, alone=alone)
         if too_long is None:
             return
         if error:
@@ -237,11 +240,8 @@ class Guard:
             return "Check its cable and its supply."
         # With Fast Sync Read a servo that is silent also hides those that would answer after it.
         shared = "No servo was heard: check the adapter, the cables and the supply"
-        if self._was_late:
-            return (
-                f"{shared}, and whether other programs keep this computer busy: deadlines were missed before. If they "
-                "do, close them, or raise safety.missing_time."
-            )
+        if self._silence.is_busy:
+            return f"{shared}, and whether other programs keep this computer busy: this program was late just before."
         return f"{shared}."
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:

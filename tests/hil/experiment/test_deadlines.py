@@ -137,14 +137,14 @@ def test_missing_too_long(count: int, seconds: float, too_long: bool) -> None:
     assert is_missing_too_long(count, seconds, Limit(0.015, "")) is too_long
 
 
-def asked(silence: Silence, times: Sequence[float], *, refused: bool = False) -> list[str | None]:
+def asked(silence: Silence, times: Sequence[float], *, refused: bool = False, alone: bool = True) -> list[str | None]:
     """What is said about one joint that replies to the first exchange and to no other."""
     silence.ask(0.0)
     silence.heard(0, 0.0)
     said = []
     for now in times:
         silence.ask(now)
-        said.append(silence.missed(0, now, refused=refused))
+        said.append(silence.missed(0, now, refused=refused, alone=alone))
     return said
 
 
@@ -169,6 +169,28 @@ def test_but_nobody_stays_blind_for_longer_than_deadlines_may_be_missed(arm: Arm
 def test_waiting_for_a_slow_adapter_is_listening(arm: Arm) -> None:
     assert asked(Silence(arm(), 1 / RATE), [0.0075, 0.015])[-1] is None
     assert asked(Silence(arm(), 1 / RATE, patience=0.0075), [0.0075, 0.015])[-1] is not None
+
+
+@pytest.mark.parametrize(
+    ("late", "alone", "replies"),
+    [(0.0, False, 6), (0.0009, False, 6), (0.001, False, 20), (0.001, True, 6)],
+)
+def test_while_this_program_is_late_silence_of_all_may_be_the_computers(
+    arm: Arm, late: float, alone: bool, replies: int
+) -> None:
+    silence = Silence(arm(), 1 / RATE)
+    silence.woke_up(0.0, late)
+    said = asked(silence, [n / RATE for n in range(1, 30)], alone=alone)
+    assert said.index(next(filter(None, said))) == replies - 1
+
+
+def test_a_computer_is_busy_for_a_while_only(arm: Arm) -> None:
+    silence = Silence(arm(), 1 / RATE)
+    silence.woke_up(0.0, 0.003)
+    silence.ask(1.99)
+    assert silence.is_busy
+    silence.ask(2.01)
+    assert not silence.is_busy
 
 
 def test_one_refusal_is_enough_after_the_time_allowed(arm: Arm) -> None:
