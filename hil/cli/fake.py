@@ -1,5 +1,6 @@
 """`hil fake`: serve a fake arm on a pseudo-terminal until stopped, or describe a file's fake arm."""
 
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from hil.fakes.plants.plant import PlantError
 from hil.fakes.pty_server import Counts, LinkError, PtyServer
 from hil.fakes.remote_hand import NoHand, ask_hand
 
+_STATUS_EVERY_S = 0.5
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -67,10 +69,11 @@ def serve_fake(
         former = {number: signal.signal(number, lambda *_: server.stop()) for number in _SIGNALS}
         try:
             print(link or server.path, flush=True)
-            status = _Status(sys.stderr.isatty())
-            server.serve(None if quiet else status.show, watch_every_s=0.5 if sys.stderr.isatty() else 10.0)
+            on_terminal = sys.stderr.isatty()
+            server.serve(_Status().show if on_terminal and not quiet else None, watch_every_s=_STATUS_EVERY_S)
             if not quiet:
-                status.end(server.counts)
+                start = "\n" if on_terminal else ""
+                print(f"{start}{server.counts.packets} packets, {_totals(server.counts)}", file=sys.stderr)
         except (LinkError, PlantError) as error:
             raise ConfigError(str(error)) from error
         finally:
@@ -79,22 +82,19 @@ def serve_fake(
 
 
 class _Status:
-    """One status line about the server, updated in place on a terminal."""
+    """One status line about the server, updated in place on a terminal; a file gets only the totals at the end."""
 
-    def __init__(self, on_terminal: bool) -> None:
-        self._on_terminal = on_terminal
+    def __init__(self) -> None:
         self._packets = 0
 
     def show(self, counts: Counts) -> None:
-        seconds = 0.5 if self._on_terminal else 10.0
-        rate = (counts.packets - self._packets) / seconds
+        rate = (counts.packets - self._packets) / _STATUS_EVERY_S
         self._packets = counts.packets
-        text = f"{rate:7.0f} packets/s, {_totals(counts)}"
-        print(f"\r\x1b[K{text}" if self._on_terminal else text, end="" if self._on_terminal else "\n", file=sys.stderr)
+        text = f"{rate:.0f} packets/s, {_totals(counts)}"
+        # A line that wraps could not be updated in place.
+        columns = shutil.get_terminal_size().columns - 1
+        print(f"\r\x1b[K{text if len(text) <= columns else text[: columns - 1] + '…'}", end="", file=sys.stderr)
         sys.stderr.flush()
-
-    def end(self, counts: Counts) -> None:
-        print(f"{chr(10) if self._on_terminal else ''}{counts.packets} packets, {_totals(counts)}", file=sys.stderr)
 
 
 def _totals(counts: Counts) -> str:
