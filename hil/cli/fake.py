@@ -12,6 +12,8 @@ from hil.fakes.description import DescriptionError, FakeArm, load_fake
 from hil.fakes.plants.plant import PlantError
 from hil.fakes.pty_server import Counts, LinkError, PtyServer
 from hil.fakes.remote_hand import NoHand, ask_hand
+from hil.next_step import command
+from hil.printing import result_console, say
 
 _STATUS_EVERY_S = 0.5
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -21,17 +23,21 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
     """Print what the file's [fake] table describes. Raises ConfigError."""
     fake = _load(config, faults, moves, seed)
     count = max(fake.joints) + 1
+    console = result_console()
     for servo, joint in zip(fake.servos, fake.joints, strict=True):
         moved = f", joint {joint + 1}" if count < len(fake.servos) else ""
-        print(f"ID {servo.id}: {servo.model}, firmware {servo.firmware}, {servo.baud} baud{moved}")
-    print(f"plant: {fake.plant or f'arm of {count} joint(s)'}; seed {fake.seed}")
+        say(console, f"ID {servo.id}: {servo.model}, firmware {servo.firmware}, {servo.baud} baud{moved}")
+    say(console, f"plant: {fake.plant or f'arm of {count} joint(s)'}; seed {fake.seed}")
     for fault in fake.faults:
-        print(f"fault: {fault.kind} at {fault.at:g} s for {fault.duration:g} s, probability {fault.probability:g}")
+        say(
+            console,
+            f"fault: {fault.kind} at {fault.at:g} s for {fault.duration:g} s, probability {fault.probability:g}",
+        )
     for move in fake.moves:
         end = f"{move.to:g} rad" if move.to is not None else f"{move.ticks} ticks"
-        print(f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
-    print(f"\nServe it to any program: hil fake {config} --pty")
-    print(f'In Python with pyserial: hil.fakes.register(), then serial_for_url("fake://{config}")')
+        say(console, f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
+    print(f"\nServe it to any program: {command('fake', config, '--pty')}")
+    say(console, f'In Python with pyserial: hil.fakes.register(), then serial_for_url("fake://{config}")')
 
 
 def list_faults() -> None:
