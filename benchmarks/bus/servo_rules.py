@@ -128,8 +128,8 @@ class Rules:
         if row is None or wrong:
             return wrong
         value = int.from_bytes(data, "little", signed=(row.low or 0) < 0)
-        if address == OPERATING_MODE and value != self.held.get(address):
-            self._forget(FORGOTTEN_WITH_MODE)
+        if address == OPERATING_MODE:
+            self._switch_mode(value)
         if address in (36, 38, 44):
             self._forget((100, 102, 104))
         if address == TORQUE_ENABLE:
@@ -141,6 +141,14 @@ class Rules:
             return {FINE, DATA_LIMIT, DATA_RANGE}
         self.held[address] = value
         return {FINE}
+
+    def _switch_mode(self, mode: int) -> None:
+        """Switching resets gains to those of the mode, the profile to 0, goals to their limits."""
+        before = self.held.get(OPERATING_MODE)
+        self._forget(FORGOTTEN_WITH_MODE)
+        if before is not None and before != mode:  # whether the same mode again is a switch, nobody says
+            self.held |= {108: 0, 112: 0}
+            self.held |= {goal: self.held[limit] for goal, limit in ((100, 36), (102, 38)) if limit in self.held}
 
     def _wrong(self, address: int, data: bytes) -> set[int]:
         """Every reason to refuse a write of one register; which of several is answered, no manual says."""
@@ -183,8 +191,7 @@ class Rules:
         self.held = before
         if errors == {FINE}:
             self.waiting = address, data
-        elif FINE in errors:
-            self.waiting = None
+        elif FINE in errors:  # the caller knows which
             self._forget([address])
         return errors
 
