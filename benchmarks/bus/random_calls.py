@@ -12,7 +12,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from random import Random
@@ -149,8 +149,8 @@ class Client:
             if row.address in HARMLESS:
                 value = row.initial or 0
         else:
-            value = self.random.getrandbits(8 * row.size)
-            if row.address in HARMLESS and value <= high:
+            value = self.random.choice((high + 1, low - 1, self.random.getrandbits(8 * row.size)))
+            if row.address in HARMLESS and low <= value <= high:
                 value = high + 1
         return (value % (1 << 8 * row.size)).to_bytes(row.size, "little")
 
@@ -285,25 +285,32 @@ class Client:
         self.compare(f"sync_read {row.address} fast={fast}", result, result == 0)
         for servo_id, rules in self.servos.items() if result == 0 else ():
             own = rules.rows[row.address]
-            value = group.getData(servo_id, row.address, row.size) if row.size in (1, 2, 4) else 0
-            data = value.to_bytes(row.size, "little")
+            data = self._grouped(group, servo_id, row)
             self._told(servo_id, own, data, (result, 0), "sync_read_data")
+
+    def _grouped(self, group: Any, servo_id: int, row: Row) -> bytes:
+        """A register as the SDK keeps it from a grouped read; none where the answer had no data."""
+        try:
+            return int(group.getData(servo_id, row.address, row.size)).to_bytes(row.size, "little")
+        except IndexError:
+            return b""
 
     def bulk_read(self) -> None:
         group = sdk.GroupBulkRead(self.port, self.handler)
         rows = {servo_id: self._row(servo_id, writable=False) for servo_id in self.servos}
         for servo_id, row in rows.items():
             group.addParam(servo_id, row.address, row.size)
-        fast = self.random.random() < 0.5
+        fast = self.random.random() < 0.5 and not self._confusing(rows)
         result = self.ask(group.fastBulkRead if fast else group.txRxPacket)
         self.compare(f"bulk_read fast={fast}", result, result == 0)
         for servo_id, row in rows.items() if result == 0 else ():
-            try:
-                data = group.getData(servo_id, row.address, row.size).to_bytes(row.size, "little")
-            except IndexError:  # the SDK's own error where an answer had no data
-                self.compare(f"bulk_read_data {servo_id} {row.address} fast={fast}", "no data", False)
-                continue
+            data = self._grouped(group, servo_id, row)
             self._told(servo_id, row, data, (result, 0), "bulk_read_data")
+
+    def _confusing(self, rows: Mapping[int, Row]) -> bool:
+        """Whether dynamixel_sdk 4.1 misreads a Fast Bulk Read, since it finds an ID in any byte of the request."""
+        sent = [byte for servo_id, row in rows.items() for byte in (servo_id, row.address, 0, row.size, 0)]
+        return any(sent.index(servo_id) % 5 for servo_id in rows)
 
     def indirect(self) -> None:
         """Map a register to indirect addresses, and read and write it through the indirect data."""
