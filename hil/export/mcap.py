@@ -5,10 +5,10 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hil import __version__, strict_json
+from hil import __version__
 from hil.errors import ExportError, RunFolderError
 from hil.export.columns import COLUMN_UNITS
-from hil.export.source import Source
+from hil.export.source import Recorded
 
 _WHOLE = ("phase", "segment", "period", "error", "missing")
 _TIMES = ("deadline", "time_before_write", "time_after_read")
@@ -19,7 +19,7 @@ _PER_JOINT = (
 )
 
 
-def export_mcap(source: Source, path: Path) -> list[str]:
+def export_mcap(source: Recorded, path: Path) -> list[str]:
     """Write `path`. Each message is stamped with its sample's deadline relative to the start of the run. Needs mcap."""
     try:
         from mcap.writer import CompressionType, Writer
@@ -36,9 +36,9 @@ def export_mcap(source: Source, path: Path) -> list[str]:
     return []
 
 
-def _write(writer: Any, source: Source) -> None:
+def _write(writer: Any, source: Recorded) -> None:
     schema = writer.register_schema(name="hil.Sample", encoding="jsonschema", data=json.dumps(_schema()).encode())
-    topics = [f"/{joint.name}" for joint in source.model.joints]
+    topics = [f"/{name}" for name in source.joints]
     channels = [writer.register_channel(topic=topic, message_encoding="json", schema_id=schema) for topic in topics]
     samples = source.samples
     start = int(source.started * 1e9)
@@ -51,10 +51,11 @@ def _write(writer: Any, source: Source) -> None:
             message = shared | {name: _number(columns[name][row][joint]) for name in _PER_JOINT}
             data = json.dumps(message, allow_nan=False).encode()
             writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, data=data, sequence=row)
-    result = strict_json.dumps(source.result.to_json(), indent=2).encode()
-    writer.add_attachment(
-        create_time=start, log_time=start, name="result.json", media_type="application/json", data=result
-    )
+    if source.result is not None:
+        result = source.result_json.encode()
+        writer.add_attachment(
+            create_time=start, log_time=start, name="result.json", media_type="application/json", data=result
+        )
 
 
 def _number(value: float) -> float | None:
