@@ -135,7 +135,7 @@ class Selection:
             unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
         smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
         self._begin(model.having(*unknown), coarse=True)
-        self._begin(smooth)
+        self._begin(smooth, coarse=True)
         self._begin(smooth.having("presliding"), coarse=True)
         plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
@@ -143,9 +143,9 @@ class Selection:
             return self._steadied(plain) or plain
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
-            best = self._steadied(self._better(self._try_or_none(smooth, plain), plain))
+            best = self._steadied(self._better(self._try_or_none(smooth, plain, coarse=True), plain))
         if best is None or self._left(best) > self._options.presliding_residual**2:
-            best = self._better(self._try_or_none(smooth), best)
+            best = self._better(self._try_or_none(smooth, coarse=True), best)
         if best is None:
             raise ConvergenceError("no friction model could be fitted: check the recording, or lower the torque")
         if self._left(best) > self._options.presliding_residual**2:
@@ -153,7 +153,7 @@ class Selection:
         for near in self._closest():
             if not self._is_explained(best):
                 best = self._better(self._with_ripple(near), best) or best
-        best = self._steadied(best) or best
+        best = self._converged(self._steadied(best) or best)
         return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
 
     def _closest(self) -> list[Trial]:
@@ -215,8 +215,14 @@ class Selection:
         known = ripple_cycles(self._periods[0], best.estimate, self._options.ripple_cycles)
         for each in candidates(self._periods[0], best.estimate, known):
             if each.part == "ripple" and each.evidence > self._options.ripple_evidence:
-                return self._better(self._try_or_none(each.model, best, each.values), best) or best
+                return self._better(self._try_or_none(each.model, best, each.values, coarse=True), best) or best
         return best
+
+    def _converged(self, trial: Trial) -> Trial:
+        """Return a fit with full precision: while models are compared, those that leave much do not get it."""
+        if not trial.coarse or self._is_explained(trial):
+            return trial
+        return self._better(self._try_or_none(trial.model, trial), trial) or trial
 
     def _reshaped(self, best: Trial) -> Trial:
         """Refit the model from other widths of each joint's Coulomb step, since there are local minima."""
