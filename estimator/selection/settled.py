@@ -23,6 +23,7 @@ from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_o
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
 from hil.estimator.selection.drift import Drift, friction_change
+from hil.estimator.selection.restarts import restarts
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
 
@@ -153,8 +154,9 @@ class Selection:
         for near in self._closest():
             if not self._is_explained(best):
                 best = self._better(self._with_ripple(near), best) or best
-        best = self._converged(self._steadied(best) or best)
-        return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
+        best = self._steadied(best) or best
+        again = self._restarted(best)
+        return self._converged(best if again is best else self._steadied(again) or again)
 
     def _closest(self) -> list[Trial]:
         """Return the trials that explain most, with and without presliding, the best first.
@@ -224,14 +226,20 @@ class Selection:
             return trial
         return self._better(self._try_or_none(trial.model, trial), trial) or trial
 
-    def _reshaped(self, best: Trial) -> Trial:
-        """Refit the model from other widths of each joint's Coulomb step, since there are local minima."""
-        for joint in range(1, best.model.joints + 1):
-            for width in self._options.initial_widths:
-                name = f"coulomb_width_{joint}"
-                if best.estimate is None or self._is_explained(best) or name not in best.estimate.names:
-                    return best
-                best = self._better(self._try_or_none(best.model, best, {name: width}), best) or best
+    def _restarted(self, best: Trial) -> Trial:
+        """Refit the model from other initial guesses while it does not explain the motion of every joint."""
+        left = self._options.max_restarts
+        while best.estimate is not None:
+            for values in restarts(self.period, best.estimate, self._options):
+                left -= 1
+                again = self._better(self._try_or_none(best.model, best, values, coarse=True), best)
+                if left <= 0 or (again is not None and again is not best):
+                    break
+            else:
+                return best
+            best = again or best
+            if left <= 0:
+                break
         return best
 
     def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:
