@@ -128,18 +128,20 @@ class Guard:
         """
         now = state.time_before_write
         took = state.time_after_read - now
-        self._deadlines.check_gap(max(watchdog_gap, took))
-        self._shortest = shortest = min(self._shortest, took)
-        self._unsure = took - shortest
+        self._deadlines.check_gap(watchdog_gap if watchdog_gap > took else took)
+        if took < self._shortest:
+            self._shortest = took
+        self._unsure = took - self._shortest
         if not between:
             self._deadlines.met()
+        missing, error = state.missing, state.error
         for index, limits in enumerate(self._limits):
-            if state.error[index] & ALERT:
+            if error[index] & ALERT:
                 self._stop(
                     index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
                 )
-            if state.missing[index]:
-                self._count_missing(index, state.error[index], now)
+            if missing[index]:
+                self._count_missing(index, error[index], now)
             else:
                 self._look_at_joint(index, limits, state, now)
         if state.apart is not None and (turned := self._apart.look(state.apart)) is not None:
@@ -161,7 +163,10 @@ class Guard:
         interval = self._interval
         elapsed = now - self._seen_at[index]
         # A punctual sample after a late one still represents a whole interval.
-        seconds = max(elapsed, interval * (1 + self._missing[index]))
+        missed = self._missing[index]
+        seconds = interval * (1 + missed)
+        if elapsed > seconds:
+            seconds = elapsed
         former = self._position[index]
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
@@ -173,8 +178,8 @@ class Guard:
             self._too_fast(index, velocity)
         self._position[index] = position
         self._seen_at[index] = now
-        missed = self._missing[index]
-        self._missing[index] = 0
+        if missed:
+            self._missing[index] = 0
         following = self._following[index]
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
             self._not_followed(index, off)

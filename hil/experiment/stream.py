@@ -232,9 +232,10 @@ class Stream:
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
-        for state in self._between_samples():
-            self._look(state, phase, between=True)
-            self._stop.check()
+        if self._turns > 1:
+            for state in self._between_samples():
+                self._look(state, phase, between=True)
+                self._stop.check()
         self._deadline, now, late = self._ticks.wait()
         if late:
             # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
