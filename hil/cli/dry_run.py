@@ -26,11 +26,11 @@ def dry_run(
     """Simulate the experiment on arms like yours; exit code 1 if it might exceed a limit."""
     from hil.api.dry_run import dry_run as simulate
     from hil.cli.terminal import Terminal
-    from hil.cli.views.printing import result_console
     from hil.dry_run.chain_summary import ChainDryRun, print_chain_dry_run
     from hil.dry_run.plot import draw
     from hil.dry_run.summary import print_dry_run
     from hil.next_step import next_step
+    from hil.printing import result_console
 
     if picture is not None and not picture.absolute().parent.is_dir():
         raise typer.BadParameter(f"--picture {picture}: the folder {picture.parent} does not exist. Create it first.")

@@ -13,6 +13,7 @@ from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.stopping_distance import Stopping, Way
+from hil.printing import print_fitting, say
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,9 @@ def _ways_json(ways: dict[Way, NDArray[np.float64]]) -> dict[str, list[float]]:
 def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
     """Print the table and the verdict."""
     shown = run.largest.prediction if run.asked is None else run.asked
-    console.print(_table(config, shown, run))
+    print_fitting(console, _table(config, shown, run))
     for line in (*run.servos, *_lines(config, shown, run)):
-        console.print(line, soft_wrap=not console.is_terminal, markup=False)
+        say(console, line)
 
 
 def settling_text(config: Config, prediction: Prediction) -> str:

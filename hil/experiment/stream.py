@@ -83,7 +83,13 @@ class Stream:
         self._left_by_a_run = has_moved()
         self._turns = bus.exchanges_per_sample
         self._apart = 1 / plan.rate / self._turns
-        self._guard = Guard(config, planned, interval=self._apart, left_by_a_run=self._left_by_a_run)
+        self._guard = Guard(
+            config,
+            planned,
+            interval=self._apart,
+            patience=bus.prepared.patience,
+            left_by_a_run=self._left_by_a_run,
+        )
         self._model: ModelWatch | ChainWatch = (
             ModelWatch(config, planned, arms, self._apart)
             if not isinstance(arms, ChainArms) and not config.is_chain
@@ -106,6 +112,7 @@ class Stream:
         self._deadline: float | None = None
         self._takes = 0.0
         self._sent_at: float | None = None
+        self._awake_at = float("-inf")
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._interval)
@@ -232,10 +239,13 @@ class Stream:
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
-        for state in self._between_samples():
-            self._look(state, phase, between=True)
-            self._stop.check()
+        if self._turns > 1:
+            for state in self._between_samples():
+                self._look(state, phase, between=True)
+                self._stop.check()
         self._deadline, now, late = self._ticks.wait()
+        self._guard.woke_up(now, now - max(self._deadline, self._awake_at))
+        self._awake_at = now
         if late:
             # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
             state = missed(self._goal, now)
@@ -243,7 +253,7 @@ class Stream:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._sampled)
             self._goal = self._guard.clamp(wanted)
             self._sampled = state = self._bus.exchange(self._goal)
-            self._sent_at = state.time_before_write
+            self._sent_at, self._awake_at = state.time_before_write, state.time_after_read
         deadline = self._deadline
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
@@ -272,7 +282,7 @@ class Stream:
             now = self._clock.now()
             if now - due < self._apart and now + self._takes < following:
                 state = self._bus.exchange(self._goal, between=True)
-                self._sent_at = state.time_before_write
+                self._sent_at, self._awake_at = state.time_before_write, state.time_after_read
                 self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
                 yield state
 
