@@ -6,9 +6,9 @@ f the fit absorbs the fraction h(f) of the noise, the leverage of its Jacobian, 
 the noise times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for model errors,
 which are slow, it is far above that of white noise. Since short recordings have few degrees of freedom, each level is
 shrunk towards the mean level of all joints, and that towards white noise. The level also stands for frequencies at
-which the fit absorbs nearly all noise, so that none can be seen: the observer holds the slow part of the rounding errors
-back, so that there is not more of it than at the frequencies above. The covariance is the sandwich N^-1 S N^-1, where S
-sums the information of each frequency times the noise there.
+which the fit absorbs nearly all noise, so that none can be seen: the observer suppresses the slow part of the rounding
+errors, so that there is not more of it than at the frequencies above. The covariance is the sandwich N^-1 S N^-1,
+where S sums the information of each frequency times the noise there.
 """
 
 from collections.abc import Iterator, Sequence
