@@ -35,6 +35,8 @@ class Minimum:
     """The sum of squares at the minimum."""
     iterations: int
     """Number of points at which it was evaluated."""
+    stalled: bool = False
+    """Whether it was accepted because no damping gave the decrease that the normal equations predict."""
 
 
 Evaluate = Callable[[Array], Quadratic]
@@ -93,7 +95,7 @@ def minimise(
         found, damping = trials.improve(damping, options)
         evaluations += trials.evaluations
         if found is None:
-            return Minimum(x, here, evaluations)
+            return Minimum(x, here, evaluations, stalled=damping >= options.max_damping)
         gained = here.cost - found[1].cost
         x, here = found
         if gained < ftol * here.cost:
