@@ -1,5 +1,6 @@
 """Whether an arm has settled: the difference between successive periods of a periodic experiment."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -63,7 +64,7 @@ def periods_of_drift(differences: Sequence[float], within: float) -> int | None:
     falling = list(differences[1:])
     if len(falling) < 2 or not all(math.isfinite(each) and each > 0.0 for each in falling):
         return None
-    if any(later > EVEN * former for former, later in zip(falling[:-1], falling[1:], strict=True)):
+    if any(later > EVEN * former for former, later in itertools.pairwise(falling)):
         return None
     ratio = (falling[-1] / falling[0]) ** (1.0 / (len(falling) - 1))
     if not SLOWLY[0] <= ratio <= SLOWLY[1]:
