@@ -90,14 +90,15 @@ class Guard:
         count = len(config.joints)
         self._safety = safety
         self._commands = CommandLimits(config)
-        self._work = Work(config) if config.stabiliser is None else None
+        planned = planned or _planned(config)
+        self._work = Work(config, planned) if config.stabiliser is None else None
         self._interval = 1.0 / rate if interval is None else interval
         self._silence = Silence(config, self._interval, patience)
         self._patience = patience or float("inf")
         self._deadlines = Deadlines(config)
         self._following = [
             None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
-            for joint, peak in zip(config.joints, planned or _planned(config), strict=True)
+            for joint, peak in zip(config.joints, planned, strict=True)
         ]
         self._apart = Apart()
         self._consistency = [Consistency() for _ in config.joints]

@@ -8,6 +8,7 @@ ones match, the remaining periods to be recorded, and a ramp out; then no curren
 of a stop allows it, the arm is braked before `run` raises; the caller that switched torque on switches it off.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
+from hil.estimator.data.periodicity import periods_of_drift
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.lowering import Lowering, may_lower
@@ -175,9 +177,11 @@ class Stream:
         repetition = self._repetition
         self._play_period(segment, 0)
         self._check_motion(repetition.moved)
+        differences = []
         for period in range(1, self._plan.max_settling_periods + 1):
             self._play_period(segment, period)
             difference = repetition.difference
+            differences.append(difference)
             if difference <= self._plan.settle_within:
                 self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
                 for further in range(1, self._plan.periods):
@@ -189,8 +193,19 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. Check for play, a "
-            "dragging cable or a slipping joint; or raise max_settling_periods."
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. "
+            + self._advice(differences, samples)
+        )
+
+    def _advice(self, differences: Sequence[float], samples: int) -> str:
+        """What to do about periods of `samples` samples that differ from each other by `differences`."""
+        further = periods_of_drift(differences, self._plan.settle_within)
+        if further is None:
+            return "Check for play, a dragging cable or a slipping joint; or raise max_settling_periods."
+        seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
+        return (
+            f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "
+            f"while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
