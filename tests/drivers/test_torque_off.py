@@ -64,11 +64,11 @@ def test_all_are_told_twice_at_once_and_each_is_polled_once() -> None:
 def test_a_servo_that_does_not_answer_is_told_again_left_to_its_watchdog_and_polled_longer() -> None:
     bench = Bench(first=[NoReply("nothing")])
     assert bench.cut() == (tuple(JOINTS), ())
-    quiet = 0.006 + WATCHDOG_S + 0.025  # the watchdog counts in steps of 20 ms
+    quiet = 0.002 + WATCHDOG_S + 0.025  # the watchdog counts in steps of 20 ms
     assert bench.sent == [
         *((who, 0.0) for who in (ALL, FIRST, ALL, SECOND)),
-        (ALL, 0.003),
-        (ALL, 0.006),
+        (ALL, 0.001),
+        (ALL, 0.002),
         (ALL, quiet),
         (FIRST, quiet),
     ]
