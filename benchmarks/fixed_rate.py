@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.machine import machine
 from hil.drivers.clock import WallClock
 from hil.drivers.rate import FixedRate
-from hil.experiment.realtime import real_time
+from hil.setup.realtime import real_time
 
 STALL_PERIODS = 10.5
 STALL_MISSES = 9

@@ -224,7 +224,13 @@ class ServoBus:
         return all(_knows_fast_sync_read(joint, servo) for joint, servo in self._servos.items())
 
     def make_exchange(
-        self, *, fast: bool, one_write: bool, slow_every: int | None = None, status: bool = True
+        self,
+        *,
+        fast: bool,
+        one_write: bool,
+        slow_every: int | None = None,
+        status: bool = True,
+        patience: float = 0.0,
     ) -> Exchange:
         """Return an exchange with these servos, after reading their Return Delay Times.
 
@@ -232,6 +238,7 @@ class ServoBus:
         one_write: send the goals and the read request in one write instead of two.
         slow_every: cycles between two slow reads; by default `BusConfig.slow_every`.
         status: read the servos' status periodically, if there is time.
+        patience: shortest time to wait for replies before they count as lost [s].
         """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
@@ -254,6 +261,7 @@ class ServoBus:
             status=span,
             status_every=status_every,
             interval=self.config.interval / every,
+            patience=patience,
         )
 
     def _cadence(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[int, Spans | None, int]:

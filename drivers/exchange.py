@@ -63,6 +63,7 @@ class Exchange:
     slow_every: number of cycles between two slow spans.
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
+    patience: shortest time to wait for replies [s]; by default, as long as wire, servos and adapter may take.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Exchange:
         status: Span | Sequence[Span] | None = None,
         status_every: int = 20,
         interval: float = 0.0,
+        patience: float = 0.0,
     ) -> None:
         goals = (goal,) * len(ids) if isinstance(goal, Register) else tuple(goal)
         for register in goals:
@@ -99,7 +101,7 @@ class Exchange:
         every = [*spans] if status is None else [*spans, status]
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self._slow_spans = len(spans) - 1
-        least = min(PATIENCE_SHARE * interval, MOST_PATIENCE_S)
+        least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
         self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
         self._soonest = [0.5 * port.wire_time(self._bytes(read)) for read in self._reads]
         self._doubts = _DOUBTS
@@ -123,6 +125,11 @@ class Exchange:
     def longest(self) -> float:
         """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
         return self._port.wire_time(max(self._bytes(read) for read in self._reads))
+
+    @property
+    def patience(self) -> float:
+        """Longest time that a cycle waits for replies [s]."""
+        return max(self._timeouts)
 
     def read_status_next(self) -> None:
         """Read the status in the next cycle instead of when its turn comes."""

@@ -4,7 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hil.drivers.clock import Clock
 from hil.drivers.packet import MAX_ID
@@ -20,17 +20,15 @@ from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import EmulatedServo
-from hil.toml_errors import describe
+from hil.toml_errors import Described, describe
 
 
 class DescriptionError(ValueError):
     """The [fake] table is unreadable or invalid. The message names the file, the key, the value and what is allowed."""
 
 
-class FakeServo(BaseModel):
+class FakeServo(Described):
     """One servo as delivered to the bus: set up for its arm, powered, torque off."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
@@ -63,7 +61,7 @@ class FakeServo(BaseModel):
     overload: Annotated[Overload | None, Field(description="when it shuts down on overload; never by default")] = None
     registers: Annotated[
         dict[str, int], Field(description="other EEPROM registers with values different from the factory defaults")
-    ] = {}
+    ] = {}  # noqa: RUF012  # pydantic copies it
 
     @field_validator("model")
     @classmethod
@@ -99,10 +97,8 @@ class FakeServo(BaseModel):
         return self
 
 
-class FakeArm(BaseModel):
+class FakeArm(Described):
     """The whole [fake] table: an adapter, the servos on its bus, and the arm that they move."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     seed: Annotated[int, Field(ge=0, description="random seed of noise and faults")] = 0
     adapter_latency_us: Annotated[
@@ -118,7 +114,7 @@ class FakeArm(BaseModel):
         str | None,
         Field(description='"module:factory" of a custom mechanism, instead of arm; see hil.fakes.plants.plant'),
     ] = None
-    plant_options: Annotated[dict[str, Any], Field(description="arguments of the factory")] = {}
+    plant_options: Annotated[dict[str, Any], Field(description="arguments of the factory")] = {}  # noqa: RUF012
     supply: Annotated[Supply | None, Field(description="resistance of the supply; none by default")] = None
     faults: Annotated[tuple[Fault, ...], Field(strict=False, description="faults to inject")] = ()
     moves: Annotated[

@@ -7,6 +7,7 @@ terminal; replugging creates a new terminal, to which the symbolic link then poi
 import contextlib
 import ctypes
 import fcntl
+import gc
 import os
 import pty
 import select
@@ -26,7 +27,8 @@ OVERRUN_S = 1e-3
 """A reply delivered later than this after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""If computing the arm takes this much longer than the time simulated, the excess is lost [s]."""
+"""If computing the arm takes this much longer than the time simulated, twice in a row, the excess is lost [s]: after a
+single stall of the computer the arm catches up instead."""
 
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks faults, watchdogs and whether to stop [s]."""
@@ -116,8 +118,11 @@ class PtyServer:
     def serve(self, watch: Callable[[Counts], None] | None = None, watch_every_s: float = 0.5) -> None:
         """Serve until stopped. `watch` is called periodically with the statistics."""
         _wake_up_in_time()
+        gc.collect()
+        gc.freeze()  # otherwise a full collection goes through everything imported, for 10 ms and more
         now = self._clock.now
         next_watch = now() + watch_every_s
+        behind = 0.0
         while not self._stopped:
             due = self.bus.next_reply_by
             wait = min(due - now(), LONGEST_SLEEP_S)
@@ -141,7 +146,9 @@ class PtyServer:
                 # On a machine too slow for the arm the delay would keep growing, so the arm's time slows down instead.
                 taken = time.monotonic() - began
                 lived = self.bus.advanced_to - reached
-                self._clock.lost_s += max(0.0, taken - lived - TOO_SLOW_S)
+                excess = taken - lived
+                self._clock.lost_s += max(0.0, min(excess, behind) - TOO_SLOW_S)
+                behind = excess
             if watch is not None and now() >= next_watch:
                 watch(self.counts)
                 next_watch = now() + watch_every_s

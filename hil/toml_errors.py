@@ -1,11 +1,11 @@
-"""Error messages for TOML files: key, value, and what is allowed."""
+"""Error messages for TOML files, and for the same tables written in Python: key, value, and what is allowed."""
 
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 UNSAID = "~"
 """Prefix of alternatives that pydantic adds to a location although they do not appear in the file."""
@@ -22,6 +22,36 @@ _EXPECTED = {
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
 }
+
+
+class _PlainErrors(type(BaseModel)):  # type: ignore[misc]  # pydantic's metaclass has no public name
+    """Raises what `describe` says when an instance is created in Python, instead of pydantic's own text.
+
+    Tables that are read from a file are not created by a call, so that their errors keep their place in the file.
+    """
+
+    def __call__(cls, *values: Any, **keys: Any) -> Any:
+        if values:
+            known = ", ".join(cls.model_fields)
+            raise TypeError(f"{cls.__name__} takes keywords: {known}; not {_shown(values[0])} without one.")
+        try:
+            return super().__call__(**keys)
+        except ValidationError as error:
+            raise ValueError(describe(error, cls.__name__, cls)) from None
+
+
+if TYPE_CHECKING:
+    _Table = BaseModel
+else:
+
+    class _Table(BaseModel, metaclass=_PlainErrors):
+        """What `Described` is at run time; type checkers do not follow a metaclass without a name."""
+
+
+class Described(_Table):
+    """An immutable table of a TOML file that may also be created in Python, where errors are plain ValueErrors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 def describe(error: ValidationError, path: Path | str, root: type[BaseModel], table: str = "") -> str:
@@ -72,11 +102,11 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
         # The message about a whole table already names its keys.
         about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
         return f"{about}: {context['error']}" if key else str(context["error"])
-    message = _EXPECTED.get(kind) or _constraint(kind, context) or str(detail["msg"])
+    message = _EXPECTED.get(kind) or _constraint(kind, context, detail["input"]) or str(detail["msg"])
     return f"{key} = {_shown(detail['input'])}: {message}"
 
 
-def _constraint(kind: str, context: dict[str, Any]) -> str | None:
+def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None:
     match kind:
         case "greater_than":
             return f"must be greater than {context['gt']}"
@@ -88,6 +118,10 @@ def _constraint(kind: str, context: dict[str, Any]) -> str | None:
             return f"must be at most {context['le']}"
         case "multiple_of":
             return f"must be a multiple of {context['multiple_of']}"
+        case "enum":
+            known = context["expected"].replace(" or ", ", ")
+            near = difflib.get_close_matches(repr(value), known.split(", "), n=1)
+            return f"did you mean {near[0]}? Known: {known}" if near else f"must be one of {known}"
         case "literal_error":
             return f"must be one of {context['expected']}"
         case "string_too_short":

@@ -16,7 +16,9 @@ from enum import StrEnum
 from random import Random
 from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
+
+from hil.toml_errors import Described
 
 
 class FaultKind(StrEnum):
@@ -94,10 +96,8 @@ INSTRUCTION_FAULTS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_
 _LEAST_REPEAT_S = 1e-3
 
 
-class Fault(BaseModel):
+class Fault(Described):
     """One injected fault, immutable. `servo` is a bus ID at the time the fault begins; None means all servos."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     kind: Annotated[FaultKind, Field(strict=False, description="what goes wrong; see FAULTS")]
     at: Annotated[

@@ -16,19 +16,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from hil.fakes.bus.joints import Joints
 from hil.fakes.plants.plant import CanBeHeld, Plant, PlantError
+from hil.toml_errors import Described
 
 _PULL_S = 0.01
 """Time constant with which the hand corrects the joint's deviation from the planned path [s]."""
 
 
-class Move(BaseModel):
+class Move(Described):
     """One movement of the hand, after which it holds the joint for `hold` seconds, indefinitely by default."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     servo: Annotated[int, Field(ge=0, le=252, description="bus ID of a servo of the joint")]
     to: Annotated[float | None, Field(allow_inf_nan=False, description="joint angle at the end [rad]")] = None

@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hil.fakes.servo.servo import EmulatedServo
+from hil.toml_errors import Described
 
 
-class Supply(BaseModel):
+class Supply(Described):
     """Cable and power supply. The no-load voltage is each servo's `input_voltage_v`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     resistance_ohm: Annotated[float, Field(ge=0, le=100, description="resistance of supply and cable [ohm]")]
     brownout_v: Annotated[float, Field(ge=0, le=100, description="voltage below which a servo reboots [V]")] = 0.0

@@ -3,17 +3,17 @@
 import math
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from hil.toml_errors import Described
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class Link(BaseModel):
+class Link(Described):
     """One rigid link, without the servo bodies."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     length: Positive = Field(description="distance from its joint to the next joint [m]")
     mass: NotNegative = Field(description="mass [kg]")
@@ -21,10 +21,8 @@ class Link(BaseModel):
     inertia: NotNegative = Field(description="inertia about its centre of mass [kg m^2]")
 
 
-class Drive(BaseModel):
+class Drive(Described):
     """One servo: body, rotor and gears, current loop, friction."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     mass: NotNegative = Field(description="mass of the servo's body, which is located at its joint [kg]")
     rotor_inertia: NotNegative = Field(description="inertia of the rotor on the motor side of the gears [kg m^2]")
@@ -115,10 +113,8 @@ class Drive(BaseModel):
         return self
 
 
-class Arm(BaseModel):
+class Arm(Described):
     """A planar arm of one or two joints; joint 1 is measured from the horizontal, joint 2 from link 1."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     gravity: NotNegative = Field(9.81, description="acceleration of gravity; 0 for a horizontal arm [m/s^2]")
     tilt: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)] = Field(

@@ -4,12 +4,13 @@ from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from hil.description.arm import ArmDescription, Body
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.fakes.plants.arm import Drive, Finite, NotNegative, Positive
+from hil.toml_errors import Described
 
 MOST_JOINTS = 7
 PLANAR_ONLY = (
@@ -18,10 +19,8 @@ PLANAR_ONLY = (
 )
 
 
-class ChainArm(BaseModel):
+class ChainArm(Described):
     """A serial arm of up to seven joints in space. The servos' bodies are part of the URDF's links."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     urdf: str = Field(description="file with the links; a relative path is relative to the TOML file")
     joints: tuple[str, ...] = Field(

@@ -8,9 +8,10 @@ import math
 from random import Random
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from hil.fakes.servo.registers import TICKS_PER_TURN
+from hil.toml_errors import Described
 
 Ticks = Annotated[float, Field(ge=0, le=TICKS_PER_TURN / 4)]
 Phase = Annotated[float, Field(ge=-math.tau, le=math.tau)]
@@ -18,14 +19,12 @@ Phase = Annotated[float, Field(ge=-math.tau, le=math.tau)]
 _TURN_PER_TICK = math.tau / TICKS_PER_TURN
 
 
-class Encoder(BaseModel):
+class Encoder(Described):
     """Errors of Present Position in encoder steps (ticks) before rounding; none by default.
 
     At the encoder angle t [rad] the reading is too high by once_ticks sin(t + once_phase) + twice_ticks sin(2 t +
     twice_phase).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     noise_ticks: Ticks = Field(0.0, description="standard deviation of white noise [ticks]")
     once_ticks: Ticks = Field(0.0, description="amplitude of the error with one period per turn [ticks]")

@@ -7,13 +7,13 @@ while the current is lower.
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from hil.toml_errors import Described
 
 
-class Thermal(BaseModel):
+class Thermal(Described):
     """A single thermal mass, heated by the motor's I^2 R and cooled by the surroundings."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     resistance_k_w: Annotated[
         float, Field(gt=0, allow_inf_nan=False, description="thermal resistance from motor to surroundings [K/W]")
@@ -22,10 +22,8 @@ class Thermal(BaseModel):
     ambient_c: Annotated[float, Field(ge=-40, le=100, description="temperature of the surroundings [C]")] = 25.0
 
 
-class Overload(BaseModel):
+class Overload(Described):
     """Shutdown after too long a time at a high current."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     current_a: Annotated[
         float, Field(gt=0, allow_inf_nan=False, description="motor current above which the timer runs [A]")

@@ -103,8 +103,8 @@ def _show(result: "Identification | Estimation", json_only: bool) -> None:
         print(strict_json.dumps(result.to_json()))
         return
     from hil.api.run import Identification
-    from hil.cli.views.printing import result_console
     from hil.cli.views.result_table import print_result, print_shooting_result
+    from hil.printing import result_console
     from hil.runs.run_folder import RunFolder
 
     if isinstance(result, Identification):

@@ -1,5 +1,6 @@
 """`hil fake`: serve a fake arm on a pseudo-terminal until stopped, or describe a file's fake arm."""
 
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -11,7 +12,10 @@ from hil.fakes.description import DescriptionError, FakeArm, load_fake
 from hil.fakes.plants.plant import PlantError
 from hil.fakes.pty_server import Counts, LinkError, PtyServer
 from hil.fakes.remote_hand import NoHand, ask_hand
+from hil.next_step import command
+from hil.printing import result_console, say
 
+_STATUS_EVERY_S = 0.5
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -19,17 +23,21 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
     """Print what the file's [fake] table describes. Raises ConfigError."""
     fake = _load(config, faults, moves, seed)
     count = max(fake.joints) + 1
+    console = result_console()
     for servo, joint in zip(fake.servos, fake.joints, strict=True):
         moved = f", joint {joint + 1}" if count < len(fake.servos) else ""
-        print(f"ID {servo.id}: {servo.model}, firmware {servo.firmware}, {servo.baud} baud{moved}")
-    print(f"plant: {fake.plant or f'arm of {count} joint(s)'}; seed {fake.seed}")
+        say(console, f"ID {servo.id}: {servo.model}, firmware {servo.firmware}, {servo.baud} baud{moved}")
+    say(console, f"plant: {fake.plant or f'arm of {count} joint(s)'}; seed {fake.seed}")
     for fault in fake.faults:
-        print(f"fault: {fault.kind} at {fault.at:g} s for {fault.duration:g} s, probability {fault.probability:g}")
+        say(
+            console,
+            f"fault: {fault.kind} at {fault.at:g} s for {fault.duration:g} s, probability {fault.probability:g}",
+        )
     for move in fake.moves:
         end = f"{move.to:g} rad" if move.to is not None else f"{move.ticks} ticks"
-        print(f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
-    print(f"\nServe it to any program: hil fake {config} --pty")
-    print(f'In Python with pyserial: hil.fakes.register(), then serial_for_url("fake://{config}")')
+        say(console, f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
+    print(f"\nServe it to any program: {command('fake', config, '--pty')}")
+    say(console, f'In Python with pyserial: hil.fakes.register(), then serial_for_url("fake://{config}")')
 
 
 def list_faults() -> None:
@@ -67,10 +75,11 @@ def serve_fake(
         former = {number: signal.signal(number, lambda *_: server.stop()) for number in _SIGNALS}
         try:
             print(link or server.path, flush=True)
-            status = _Status(sys.stderr.isatty())
-            server.serve(None if quiet else status.show, watch_every_s=0.5 if sys.stderr.isatty() else 10.0)
+            on_terminal = sys.stderr.isatty()
+            server.serve(_Status().show if on_terminal and not quiet else None, watch_every_s=_STATUS_EVERY_S)
             if not quiet:
-                status.end(server.counts)
+                start = "\n" if on_terminal else ""
+                print(f"{start}{server.counts.packets} packets, {_totals(server.counts)}", file=sys.stderr)
         except (LinkError, PlantError) as error:
             raise ConfigError(str(error)) from error
         finally:
@@ -79,22 +88,19 @@ def serve_fake(
 
 
 class _Status:
-    """One status line about the server, updated in place on a terminal."""
+    """One status line about the server, updated in place on a terminal; a file gets only the totals at the end."""
 
-    def __init__(self, on_terminal: bool) -> None:
-        self._on_terminal = on_terminal
+    def __init__(self) -> None:
         self._packets = 0
 
     def show(self, counts: Counts) -> None:
-        seconds = 0.5 if self._on_terminal else 10.0
-        rate = (counts.packets - self._packets) / seconds
+        rate = (counts.packets - self._packets) / _STATUS_EVERY_S
         self._packets = counts.packets
-        text = f"{rate:7.0f} packets/s, {_totals(counts)}"
-        print(f"\r\x1b[K{text}" if self._on_terminal else text, end="" if self._on_terminal else "\n", file=sys.stderr)
+        text = f"{rate:.0f} packets/s, {_totals(counts)}"
+        # A line that wraps could not be updated in place.
+        columns = shutil.get_terminal_size().columns - 1
+        print(f"\r\x1b[K{text if len(text) <= columns else text[: columns - 1] + '…'}", end="", file=sys.stderr)
         sys.stderr.flush()
-
-    def end(self, counts: Counts) -> None:
-        print(f"{chr(10) if self._on_terminal else ''}{counts.packets} packets, {_totals(counts)}", file=sys.stderr)
 
 
 def _totals(counts: Counts) -> str:

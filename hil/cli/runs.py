@@ -38,7 +38,7 @@ def _print_runs(found: "list[RunSummary]") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from hil.cli.views.printing import natural_width, print_table, result_console, say
+    from hil.printing import natural_width, print_table, result_console, say
 
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for heading in ("run", "arm", "when", "verdict", "residual", "name, note"):
@@ -102,7 +102,7 @@ def _print_difference(difference: "Difference") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from hil.cli.views.printing import print_table, result_console, say
+    from hil.printing import print_table, result_console, say
 
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("parameter", no_wrap=True)

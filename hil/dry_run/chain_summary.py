@@ -13,6 +13,7 @@ from hil.dry_run.chain_prediction import ChainPrediction
 from hil.dry_run.chain_stop import ChainStops
 from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction, quantities_of
 from hil.dry_run.summary import joints_json
+from hil.printing import print_fitting, say
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,9 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
 
 def print_chain_dry_run(run: ChainDryRun, console: Console) -> None:
     """Print the table and the verdict."""
-    console.print(_table(run))
-    for line in (*run.servos, *_lines(run)):
-        console.print(line, soft_wrap=True, markup=False)
+    print_fitting(console, _table(run))
+    for line in (*run.servos, *chain_dry_run_lines(run)):
+        say(console, line)
 
 
 def _table(run: ChainDryRun) -> Table:
@@ -132,7 +133,8 @@ def _table(run: ChainDryRun) -> Table:
     return table
 
 
-def _lines(run: ChainDryRun) -> list[str]:
+def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
+    """Explain the result in sentences, the verdict last."""
     fall, lowering, why = run.stops.fall, run.stops.lowering, unsafe(run.config, run.foreseen)
     hit = "nothing within 1.5 s" if fall.hits is None else f"{fall.hits[0]} hits {fall.hits[1]}"
     lines = [

@@ -13,6 +13,7 @@ from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.stopping_distance import Stopping, Way
+from hil.printing import print_fitting, say
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,9 @@ def _ways_json(ways: dict[Way, NDArray[np.float64]]) -> dict[str, list[float]]:
 def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
     """Print the table and the verdict."""
     shown = run.largest.prediction if run.asked is None else run.asked
-    console.print(_table(config, shown, run))
-    for line in (*run.servos, *_lines(config, shown, run)):
-        console.print(line, soft_wrap=not console.is_terminal, markup=False)
+    print_fitting(console, _table(config, shown, run))
+    for line in (*run.servos, *dry_run_lines(config, shown, run)):
+        say(console, line)
 
 
 def settling_text(config: Config, prediction: Prediction) -> str:
@@ -120,7 +121,8 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
     return table
 
 
-def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
+def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
+    """Explain the result in sentences, the verdict last."""
     torque = ", ".join(f"{value:.2f}" for value in run.largest.peak_torque)
     planned, passed = run.stopping.planned, run.stopping.passed
     stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])

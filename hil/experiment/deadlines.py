@@ -26,13 +26,10 @@ class Deadlines:
         self._most_often = max(_OFTEN_LATE, 0.5 * self._limit.seconds / self._interval)
         self._in_a_row = 0
         self._often = 0.0
-        self.were_missed = False
-        """Whether any deadline was missed since the start: this computer may be busy."""
 
     def missed(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command."""
         self._in_a_row += 1
-        self.were_missed = True
         if self._in_a_row <= _OF_ONE_STALL:
             self._often += 1.0
         seconds = max(seconds, self._in_a_row * self._interval)

@@ -21,9 +21,9 @@ from hil.experiment.command_limits import CommandLimits
 from hil.experiment.consistency import Consistency
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.following import Following, Unfollowed
+from hil.experiment.silence import Silence
 from hil.experiment.status_check import StatusCheck
 from hil.experiment.work import Work
-from hil.plan.silence import is_missing_too_long, missing_limit
 
 JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
@@ -58,7 +58,8 @@ class Guard:
 
     planned: largest planned goal of each joint [A, or V under PWM]; by default, from the configuration.
 
-    interval: time between two exchanges [s]; by default, that between two samples.
+    interval: time between two exchanges [s]; by default, that between two samples. patience: how long an exchange waits
+    for missing replies [s].
 
     left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
     have come to rest a little beyond it: a joint found there may move back in, and no farther out.
@@ -70,6 +71,7 @@ class Guard:
         planned: Sequence[float] | None = None,
         *,
         interval: float | None = None,
+        patience: float = 0.0,
         left_by_a_run: bool = False,
     ) -> None:
         rate = config.experiment.rate
@@ -91,9 +93,9 @@ class Guard:
         planned = planned or _planned(config)
         self._work = Work(config, planned) if config.stabiliser is None else None
         self._interval = 1.0 / rate if interval is None else interval
-        self._missing_limit = missing_limit(config)
+        self._silence = Silence(config, self._interval, patience)
+        self._patience = patience or float("inf")
         self._deadlines = Deadlines(config)
-        self._was_late = False
         self._following = [
             None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
             for joint, peak in zip(config.joints, planned, strict=True)
@@ -103,7 +105,7 @@ class Guard:
         self._status = StatusCheck(config)
         self._position: list[float | None] = [None] * count
         self._seen_at = [0.0] * count
-        self._missing = [0] * count
+        self._missing = self._silence.counts
         self._resting: tuple[float, ...] | None = None
         self._may_start_outside = left_by_a_run
         self._found_outside: dict[int, float] = {}
@@ -118,6 +120,10 @@ class Guard:
         """The goals that the servos have now [A or V]: `clamp` goes on from there."""
         self._commands.holding(goals)
 
+    def woke_up(self, now: float, late: float) -> None:
+        """Record that this program woke up at `now` [s], `late` [s] after it wanted to: the computer may be busy."""
+        self._silence.woke_up(now, late)
+
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._deadlines.missed(seconds)
@@ -129,18 +135,22 @@ class Guard:
         """
         now = state.time_before_write
         took = state.time_after_read - now
-        self._deadlines.check_gap(max(watchdog_gap, took))
-        self._shortest = shortest = min(self._shortest, took)
-        self._unsure = took - shortest
+        self._deadlines.check_gap(watchdog_gap if watchdog_gap > took else took)
+        self._silence.ask(now)
+        self._silence.woke_up(now, took - self._patience)
+        if took < self._shortest:
+            self._shortest = took
+        self._unsure = took - self._shortest
         if not between:
             self._deadlines.met()
+        missing, error = state.missing, state.error
         for index, limits in enumerate(self._limits):
-            if state.error[index] & ALERT:
+            if error[index] & ALERT:
                 self._stop(
                     index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
                 )
-            if state.missing[index]:
-                self._count_missing(index, state.error[index], now)
+            if missing[index]:
+                self._count_missing(index, error[index], now, alone=not all(missing))
             else:
                 self._look_at_joint(index, limits, state, now)
         if state.apart is not None and (turned := self._apart.look(state.apart)) is not None:
@@ -162,7 +172,10 @@ class Guard:
         interval = self._interval
         elapsed = now - self._seen_at[index]
         # A punctual sample after a late one still represents a whole interval.
-        seconds = max(elapsed, interval * (1 + self._missing[index]))
+        missed = self._missing[index]
+        seconds = interval * (1 + missed)
+        if elapsed > seconds:
+            seconds = elapsed
         former = self._position[index]
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
@@ -174,8 +187,7 @@ class Guard:
             self._too_fast(index, velocity)
         self._position[index] = position
         self._seen_at[index] = now
-        missed = self._missing[index]
-        self._missing[index] = 0
+        self._silence.heard(index, now)
         following = self._following[index]
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
             self._not_followed(index, off)
@@ -206,39 +218,35 @@ class Guard:
                     "is allowed. Let the arm come to rest; check for a draught, a dragging cable or a hand.",
                 )
 
-    def _count_missing(self, index: int, error: int, now: float) -> None:
+    def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
         if self._missing[index] == 0 and self._position[index] is None:
             self._seen_at[index] = now
-        if not any(self._missing):
-            self._was_late = self._deadlines.were_missed  # silent servos make the program late themselves
-        self._missing[index] += 1
-        seconds = max(now - self._seen_at[index], self._missing[index] * self._interval)
-        allowed, said = self._missing_limit
         # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
         # was damaged.
         refused = bool(error) and error != StatusError.CRC
-        if is_missing_too_long(self._missing[index] + refused, seconds, self._missing_limit):
-            if error:
-                self._stop(
-                    index,
-                    Cause.MISSING,
-                    f"answers with error {error} instead of its state for {1e3 * seconds:.0f} ms: it refuses "
-                    "reads. Power-cycle it.",
-                )
+        too_long = self._silence.missed(index, now, refused=refused, alone=alone)
+        if too_long is None:
+            return
+        if error:
             self._stop(
                 index,
                 Cause.MISSING,
-                f"missed {self._missing[index]} replies in a row; its last reply was {1e3 * seconds:.0f} ms ago; "
-                f"{said} allows {1e3 * allowed:.0f} ms. {self._silence_remedy()}",
+                f"answers with error {error} instead of its state; its last state was {too_long}. It refuses reads: "
+                "power-cycle it.",
             )
+        self._stop(
+            index,
+            Cause.MISSING,
+            f"missed {self._missing[index]} replies in a row; its last reply was {too_long}. {self._silence_remedy()}",
+        )
 
     def _silence_remedy(self) -> str:
         if len(self._missing) == 1 or not all(self._missing):
             return "Check its cable and its supply."
         # With Fast Sync Read a servo that is silent also hides those that would answer after it.
         shared = "No servo was heard: check the adapter, the cables and the supply"
-        if self._was_late:
-            return f"{shared}, and whether other programs keep this computer busy: deadlines were missed before."
+        if self._silence.is_busy:
+            return f"{shared}, and whether other programs keep this computer busy: this program was late just before."
         return f"{shared}."
 
     def _jumped(self, index: int, moved: float, most: float) -> NoReturn:

@@ -15,7 +15,6 @@ from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.guard import MOST_OUTSIDE_RAD
-from hil.experiment.realtime import real_time
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
@@ -26,6 +25,7 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
+from hil.setup.realtime import on_time
 from hil.setup.servo_session import has_moved, servo_session
 
 _LAST_SAMPLES = 100
@@ -117,8 +117,10 @@ def _play(
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event."""
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     try:
-        # In this order, because _on_time takes longer than the watchdog's timeout.
-        with _on_time(bus.port.clock, note), bus.torque(config.safety.watchdog):
+        # In this order, because on_time takes longer than the watchdog's timeout.
+        with on_time(bus.port.clock) as granted, bus.torque(config.safety.watchdog):
+            if granted:
+                note("; ".join(map(str, granted)))
             note(f"torque on, watchdog {config.safety.watchdog:g} s")
             stream.run()
     except BaseException as error:
@@ -155,17 +157,6 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
         yield shown.put
     finally:
         shown.close(_PATIENCE_S)
-
-
-@contextmanager
-def _on_time(clock: Clock, note: Note) -> Iterator[None]:
-    """Apply real-time settings while the stream runs on the wall clock; a virtual clock needs none."""
-    if not isinstance(clock, WallClock):
-        yield
-        return
-    with real_time() as granted:
-        note("; ".join(map(str, granted)))
-        yield
 
 
 def _check_rate(config: Config, bus: ServoBus) -> None:

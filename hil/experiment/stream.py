@@ -8,6 +8,7 @@ ones match, the remaining periods to be recorded, and a ramp out; then no curren
 of a stop allows it, the arm is braked before `run` raises; the caller that switched torque on switches it off.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
+from hil.estimator.data.periodicity import periods_of_drift
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.lowering import Lowering, may_lower
@@ -83,7 +85,13 @@ class Stream:
         self._left_by_a_run = has_moved()
         self._turns = bus.exchanges_per_sample
         self._apart = 1 / plan.rate / self._turns
-        self._guard = Guard(config, planned, interval=self._apart, left_by_a_run=self._left_by_a_run)
+        self._guard = Guard(
+            config,
+            planned,
+            interval=self._apart,
+            patience=bus.prepared.patience,
+            left_by_a_run=self._left_by_a_run,
+        )
         self._model: ModelWatch | ChainWatch = (
             ModelWatch(config, planned, arms, self._apart)
             if not isinstance(arms, ChainArms) and not config.is_chain
@@ -106,6 +114,7 @@ class Stream:
         self._deadline: float | None = None
         self._takes = 0.0
         self._sent_at: float | None = None
+        self._awake_at = float("-inf")
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._interval)
@@ -168,9 +177,11 @@ class Stream:
         repetition = self._repetition
         self._play_period(segment, 0)
         self._check_motion(repetition.moved)
+        differences = []
         for period in range(1, self._plan.max_settling_periods + 1):
             self._play_period(segment, period)
             difference = repetition.difference
+            differences.append(difference)
             if difference <= self._plan.settle_within:
                 self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
                 for further in range(1, self._plan.periods):
@@ -182,8 +193,19 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. Check for play, a "
-            "dragging cable or a slipping joint; or raise max_settling_periods."
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. "
+            + self._advice(differences, samples)
+        )
+
+    def _advice(self, differences: Sequence[float], samples: int) -> str:
+        """What to do about periods of `samples` samples that differ from each other by `differences`."""
+        further = periods_of_drift(differences, self._plan.settle_within)
+        if further is None:
+            return "Check for play, a dragging cable or a slipping joint; or raise max_settling_periods."
+        seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
+        return (
+            f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "
+            f"while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
@@ -232,10 +254,13 @@ class Stream:
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
-        for state in self._between_samples():
-            self._look(state, phase, between=True)
-            self._stop.check()
+        if self._turns > 1:
+            for state in self._between_samples():
+                self._look(state, phase, between=True)
+                self._stop.check()
         self._deadline, now, late = self._ticks.wait()
+        self._guard.woke_up(now, now - max(self._deadline, self._awake_at))
+        self._awake_at = now
         if late:
             # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
             state = missed(self._goal, now)
@@ -243,7 +268,7 @@ class Stream:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._sampled)
             self._goal = self._guard.clamp(wanted)
             self._sampled = state = self._bus.exchange(self._goal)
-            self._sent_at = state.time_before_write
+            self._sent_at, self._awake_at = state.time_before_write, state.time_after_read
         deadline = self._deadline
         self._recorder.keep(deadline, phase, self._segment, period, state)
         self._index += 1
@@ -272,7 +297,7 @@ class Stream:
             now = self._clock.now()
             if now - due < self._apart and now + self._takes < following:
                 state = self._bus.exchange(self._goal, between=True)
-                self._sent_at = state.time_before_write
+                self._sent_at, self._awake_at = state.time_before_write, state.time_after_read
                 self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
                 yield state
 

@@ -23,6 +23,7 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
+from hil.pilot.punctual import punctual
 from hil.pilot.steps import Say, Step, tells_of_the_arm
 from hil.plan.plan import Plan
 from hil.results.result import SettledResult
@@ -123,7 +124,13 @@ class ChainSearch:
         """
         error = None
         try:
-            self.torque = run_experiment(config, folder, self.shown_path, self.watch, found.plan, self.belief.arms)
+            self.torque = punctual(
+                lambda: run_experiment(config, folder, self.shown_path, self.watch, found.plan, self.belief.arms),
+                config,
+                folder,
+                name,
+                self.say,
+            )
         except ExperimentError as stopped:
             if not tells_of_the_arm(stopped):
                 raise

@@ -15,6 +15,7 @@ from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetySto
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
 from hil.pilot.belief import MOVED_STEPS
+from hil.pilot.punctual import punctual
 from hil.pilot.seen import Seen, seen_of
 from hil.results.parts import PlayedStep
 from hil.runs.recording import load_samples
@@ -107,12 +108,18 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
-        Raises what a run raises, except errors that are informative about the arm: limit exceeded, no motion, no steady
-        motion, a period unlike the one before.
+        A run that is stopped because this computer was late is repeated. Raises what a run raises, except errors that
+        are informative about the arm: limit exceeded, no motion, no steady motion, a period unlike the one before.
         """
         torque, error = "", None
         try:
-            torque = run_experiment(config, folder, self.shown_path, self.watch, found.plan, arms)
+            torque = punctual(
+                lambda: run_experiment(config, folder, self.shown_path, self.watch, found.plan, arms),
+                config,
+                folder,
+                name,
+                self.say,
+            )
         except ExperimentError as stopped:
             if not (tells_of_the_arm(stopped) or _stood_still(config, folder, stopped)):
                 raise

@@ -368,8 +368,9 @@ def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
         return
     for mode in report.modes:
         yield Finding(Level.OK if mode.sound else Level.WARNING, "bus", mode.name, str(mode))
-    level = Level.STOP if report.fix else Level.OK
-    yield Finding(level, "bus", "rate", f"{config.experiment.rate:g} Hz wanted, {report.found}", report.fix)
+    level = Level.STOP if report.fix else Level.WARNING if report.delayed else Level.OK
+    found = f"{config.experiment.rate:g} Hz wanted, {report.found}"
+    yield Finding(level, "bus", "rate", found, report.fix or report.delayed)
 
 
 def _port(config: Config) -> str:

@@ -3,13 +3,13 @@
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.description.motion import moves
+from hil.printing import print_fitting, result_console
 from hil.setup.by_hand import Moved, Pose
 
 
@@ -24,8 +24,8 @@ def print_pose(config: Config, pose: Pose) -> None:
         name, angle = escape(joint.name), pose.angles[index]
         cells = f"{angle:+.3f}", f"{np.degrees(angle):+.1f}", f"{low:g} to {high:g}"
         table.add_row(name, str(joint.id), *cells, moves(arm, angles, index))
-    console = Console(highlight=False)
-    console.print(table)
+    console = result_console()
+    print_fitting(console, table)
     x, y, z = pose.end
     console.print(f"The end link's centre of mass is at x {x:+.3f}, y {y:+.3f}, z {z:+.3f} m from the base.")
     console.print("Does the arm stand like that? If not: zero_ticks, direction or the description is wrong.")
@@ -34,7 +34,7 @@ def print_pose(config: Config, pose: Pose) -> None:
 def print_moved(moved: Moved) -> None:
     """One joint's outcome."""
     style = "green" if moved.well else "red"
-    Console(highlight=False).print(f"[{style}]{'as it should' if moved.well else 'WRONG'}[/]: {escape(moved.found)}.")
+    result_console().print(f"[{style}]{'as it should' if moved.well else 'WRONG'}[/]: {escape(moved.found)}.")
 
 
 def pose_values(config: Config, pose: Pose) -> dict[str, Any]:

@@ -7,12 +7,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.cli.views.printing import print_table, say
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.estimator.models.terms import TERMS, joint_of, kind_of, term_of
 from hil.next_step import command, next_step
+from hil.printing import print_table, say
 from hil.results.parts import Quantity
 from hil.results.result import SettledResult, ShootingResult
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from hil.next_step import next_step
+from hil.printing import print_fitting, result_console, say, say_behind
 from hil.setup.preflight import Finding, Level
 from hil.setup.scan import Found, Heard
 from hil.setup.servo_settings import Change
@@ -39,7 +39,7 @@ def scanned(heard: Sequence[Heard]) -> dict[str, Any]:
 
 
 def print_scan(heard: Sequence[Heard], port: str) -> None:
-    console = Console(highlight=False)
+    console = result_console()
     table = Table(title=f"Servos on {escape(port)}", title_justify="left")
     for heading in ("baud", "ID", "model", "firmware", "supply V", "C", "trouble"):
         table.add_column(heading)
@@ -52,7 +52,7 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
             table.add_row(*cells)
     servos = [servo for each in heard for servo in each.servos]
     if servos:
-        console.print(table)
+        print_fitting(console, table)
     else:
         console.print("No servo answered. Is the bus powered? A U2D2 does not supply power.")
     for each in heard:
@@ -61,7 +61,7 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
     if len({servo.baud for servo in servos}) > 1:
         console.print("All servos of an arm must use the same baud rate: see hil setup --help.")
     if servos:
-        console.print(_after_scan(servos, port), markup=False, soft_wrap=True)
+        print(_after_scan(servos, port))
 
 
 def _after_scan(servos: Sequence[Found], port: str) -> str:
@@ -77,24 +77,23 @@ def _after_scan(servos: Sequence[Found], port: str) -> str:
 
 def print_findings(findings: Sequence[Finding], config: Path) -> None:
     """Print one line per finding, with its fix below it, and whether an experiment can start."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = result_console()
     former = None
     for finding in findings:
         if finding.where != former:
-            console.print(f"[bold]{escape(finding.where)}[/bold]")
+            console.print(f"[bold]{escape(finding.where)}[/bold]", soft_wrap=True)
             former = finding.where
         style = _STYLES[finding.level]
-        level = f"[{style}]{finding.level:>8}[/{style}]"
-        console.print(f"{level}  {escape(finding.what)}: {escape(finding.found)}")
+        say_behind(console, f"{finding.level:>8}  ", f"{finding.what}: {finding.found}", style)
         if finding.fix:
-            console.print(f"          {escape(finding.fix)}")
+            say_behind(console, 10 * " ", finding.fix)
     stops = sum(finding.level is Level.STOP for finding in findings)
     warnings = sum(finding.level is Level.WARNING for finding in findings)
     if stops:
-        again = escape(next_step("check", config))
-        console.print(f"\n{_counted(stops, 'blocking problem')}, {_counted(warnings, 'warning')}. Fix them.\n{again}")
+        say(console, f"\n{_counted(stops, 'blocking problem')}, {_counted(warnings, 'warning')}. Fix them.")
     else:
-        console.print(f"\nReady, {_counted(warnings, 'warning')}.\n{escape(next_step('dry-run', config))}")
+        say(console, f"\nReady, {_counted(warnings, 'warning')}.")
+    print(next_step("check" if stops else "dry-run", config))
 
 
 def _counted(number: int, what: str) -> str:

@@ -1,16 +1,22 @@
 """Missed deadlines and missing replies: the exact counts and times at which they stop the arm."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from hil.config.schema import Config
+from hil.config.schema import Config, load_config
 from hil.errors import Cause, SafetyStop
 from hil.experiment.deadlines import Deadlines
+from hil.experiment.silence import Silence
 from hil.plan.silence import Limit, is_missing_too_long, late_limit, missing_limit
+from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
 RATE = 400
+FAKE = load_config(CONFIGS / "fake_two_link_ideal.toml")
 
 
 def safety(lines: str) -> tuple[str, str]:
@@ -132,3 +138,80 @@ def test_limits_of_silence(arm: Arm, lines: str, missing: Limit, late: Limit) ->
 )
 def test_missing_too_long(count: int, seconds: float, too_long: bool) -> None:
     assert is_missing_too_long(count, seconds, Limit(0.015, "")) is too_long
+
+
+def asked(silence: Silence, times: Sequence[float], *, refused: bool = False, alone: bool = True) -> list[str | None]:
+    """What is said about one joint that replies to the first exchange and to no other."""
+    silence.ask(0.0)
+    silence.heard(0, 0.0)
+    said = []
+    for now in times:
+        silence.ask(now)
+        said.append(silence.missed(0, now, refused=refused, alone=alone))
+    return said
+
+
+def test_a_silent_servo_counts_for_the_time_in_which_it_was_asked(arm: Arm) -> None:
+    said = asked(Silence(arm(), 1 / RATE), [n / RATE for n in range(1, 7)])
+    assert said == [None] * 5 + ["15 ms ago; safety.missing_time = 0.015 s allows 15 ms"]
+
+
+def test_a_stall_of_the_computer_is_no_silence_of_the_servos(arm: Arm) -> None:
+    said = asked(Silence(arm(), 1 / RATE), [0.020 + n / RATE for n in range(6)])
+    assert said[:5] == [None] * 5
+    assert (
+        said[5] == "32 ms ago, 18 ms of it because this computer was busy; safety.missing_time = 0.015 s allows 15 ms"
+    )
+
+
+def test_but_nobody_stays_blind_for_longer_than_deadlines_may_be_missed(arm: Arm) -> None:
+    said = asked(Silence(arm(), 1 / RATE), [0.0475, 0.0501])
+    assert said[0] is None and said[1] is not None and said[1].startswith("50 ms ago, 45 ms of it because")
+
+
+def test_waiting_for_a_slow_adapter_is_listening(arm: Arm) -> None:
+    assert asked(Silence(arm(), 1 / RATE), [0.0075, 0.015])[-1] is None
+    assert asked(Silence(arm(), 1 / RATE, patience=0.0075), [0.0075, 0.015])[-1] is not None
+
+
+@pytest.mark.parametrize(
+    ("late", "alone", "replies"),
+    [(0.0, False, 6), (0.0009, False, 6), (0.001, False, 20), (0.001, True, 6)],
+)
+def test_while_this_program_is_late_silence_of_all_may_be_the_computers(
+    arm: Arm, late: float, alone: bool, replies: int
+) -> None:
+    silence = Silence(arm(), 1 / RATE)
+    silence.woke_up(0.0, late)
+    said = asked(silence, [n / RATE for n in range(1, 30)], alone=alone)
+    assert said.index(next(filter(None, said))) == replies - 1
+
+
+def test_a_computer_is_busy_for_a_while_only(arm: Arm) -> None:
+    silence = Silence(arm(), 1 / RATE)
+    silence.woke_up(0.0, 0.003)
+    silence.ask(1.99)
+    assert silence.is_busy
+    silence.ask(2.01)
+    assert not silence.is_busy
+
+
+def test_one_refusal_is_enough_after_the_time_allowed(arm: Arm) -> None:
+    silence = Silence(arm(), 0.02)
+    assert asked(silence, [0.02], refused=True)[-1] is not None
+    assert asked(Silence(arm(), 0.02), [0.02])[-1] is None
+
+
+@given(
+    gaps=st.lists(st.floats(0.0, 0.08), min_size=1, max_size=40),
+    interval=st.sampled_from([0.001, 0.0025, 0.01]),
+)
+def test_a_servo_is_never_silent_for_longer_than_either_limit(gaps: list[float], interval: float) -> None:
+    """Whatever the computer does: the second missing reply after the limit of missed deadlines is one too many."""
+    times = np.cumsum(gaps).tolist()
+    said = asked(Silence(FAKE, interval), times)
+    for count, (now, each) in enumerate(zip(times, said, strict=True), start=1):
+        if count >= 2 and now >= 0.05:
+            assert each is not None
+        if each is None and count >= 2:
+            assert count * interval < 0.015

@@ -91,11 +91,19 @@ def test_silence_of_all_servos_points_to_what_they_share(arm: Arm, missing: tupl
 
 def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> None:
     guard = Guard(arm())
-    guard.late()
+    guard.look(at(0, STILL))
+    guard.woke_up(0.0, 0.0011)
     silent = MISSING._replace(missing=(True, True))
-    with pytest.raises(SafetyStop, match="other programs keep this computer busy: deadlines were missed before"):
-        for number in range(10):
+    with pytest.raises(SafetyStop, match="other programs keep this computer busy: this program was late just before"):
+        for number in range(1, 30):
             guard.look(at(number, silent))
+    assert number == 20, "50 ms, as for missed deadlines"
+    guard.look(at(30, STILL))
+    guard.woke_up(30 / 400, 0.0011)
+    with pytest.raises(SafetyStop, match=r"Check its cable and its supply.$"):
+        for number in range(31, 60):
+            guard.look(at(number, MISSING))
+    assert number == 36, "one servo among others is silent itself"
 
 
 def test_a_current_that_does_not_follow(arm: Arm) -> None:

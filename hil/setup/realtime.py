@@ -1,14 +1,14 @@
 """Real-time settings of Linux for the control loop: requested, used if granted, and reported either way.
 
-real-time scheduling   SCHED_FIFO: only other real-time tasks may preempt the loop
+no garbage collection  Python's collector is off inside the loop, and existing objects are frozen
 locked memory          mlockall: no page of this process is swapped in during a cycle
+timer slack            the kernel may delay a wake-up by 1 ns instead of 50 us
+short switch interval  another Python thread (the progress bar) releases the interpreter after 50 us, not 5 ms
+real-time scheduling   SCHED_FIFO: only other real-time tasks may preempt the loop
 own core               the loop stays on one core and keeps its caches; only together with SCHED_FIFO, because
                        otherwise a pinned loop has to wait for other tasks on its core
-timer slack            the kernel may delay a wake-up by 1 ns instead of 50 us
-no garbage collection  Python's collector is off inside the loop, and existing objects are frozen
-short switch interval  another Python thread (the progress bar) releases the interpreter after 50 us, not 5 ms
 
-The first and the third apply only to the calling thread. All settings are restored at the end.
+Scheduling, core and timer slack apply only to the calling thread. All settings are restored at the end.
 """
 
 import ctypes
@@ -18,6 +18,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple
+
+from hil.drivers.clock import Clock, WallClock
 
 PRIORITY = 20
 """Priority for SCHED_FIFO (1 to 99): above ordinary tasks, below the kernel threads (50) that serve the serial port."""
@@ -40,9 +42,22 @@ class Granted(NamedTuple):
 
 @contextmanager
 def real_time() -> Iterator[list[Granted]]:
-    """Request all settings. Yields the list of settings and whether each was granted."""
+    """Request all settings. Yields the list of settings and whether each was granted.
+
+    What takes long comes before the priority, which would keep a second control loop on this computer waiting.
+    """
     with ExitStack() as undo:
-        yield [step(undo) for step in (_fifo, _own_core, _lock_memory, _timer_slack, _no_collection, _short_turns)]
+        yield [step(undo) for step in (_no_collection, _lock_memory, _timer_slack, _short_turns, _fifo, _own_core)]
+
+
+@contextmanager
+def on_time(clock: Clock) -> Iterator[list[Granted]]:
+    """`real_time` for exchanges on the wall clock; on a virtual clock nothing can be late, and nothing is requested."""
+    if isinstance(clock, WallClock):
+        with real_time() as granted:
+            yield granted
+    else:
+        yield []
 
 
 def _fifo(undo: ExitStack) -> Granted:

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from hil.experiment.realtime import real_time
+from hil.setup.realtime import real_time
 
 
 def settings() -> tuple[object, ...]:
@@ -22,12 +22,12 @@ def test_everything_is_taken_back(fail: bool) -> None:
         assert not gc.isenabled()
         assert sys.getswitchinterval() < 1e-3
         assert [each.name for each in granted] == [
-            "real-time scheduling",
-            "own core",
+            "no garbage collection",
             "locked memory",
             "timer slack",
-            "no garbage collection",
             "short thread switch interval",
+            "real-time scheduling",
+            "own core",
         ]
         assert all(each.given or each.note for each in granted)
         1 / (not fail)
@@ -41,7 +41,7 @@ def test_what_is_not_permitted_is_said_and_how_to_get_it(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     with real_time() as granted:
-        fifo, core, *_ = granted
+        *_, fifo, core = granted
         assert str(fifo) == "real-time scheduling: no (Operation not permitted; needs `ulimit -r 20` or root)"
         # Without SCHED_FIFO, a pinned loop would have to wait for other tasks on its core.
         assert not core.given

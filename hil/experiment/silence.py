@@ -1,0 +1,93 @@
+"""How long servos have not replied, by the time for which this program listened to them.
+
+While a computer stalls it hears nothing and sends nothing, which says nothing about the servos. That time is limited as
+missed deadlines are (`hil.experiment.deadlines`); silence proper is time in which a reply was awaited in vain.
+
+A busy computer also delays what it has received: the kernel hands the bytes of a serial port on in a thread of its own,
+which has to wait for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up
+late, silence of all servos may be the computer's, and is limited as missed deadlines are, too. If some servos are heard
+and one is not, it is that servo's.
+"""
+
+from hil.config.schema import Config
+from hil.plan.silence import Limit, is_missing_too_long, late_limit, missing_limit
+
+LATE_WAKE_UP_S = 1e-3
+"""Lateness of this program that shows a busy computer [s]; an idle one stays below a third of it."""
+
+BUSY_S = 2.0
+"""How long a computer counts as busy after that [s]."""
+
+
+class Silence:
+    """Counts the missing replies of each joint.
+
+    interval: time between two exchanges [s]. patience: how long an exchange waits for replies [s].
+    """
+
+    def __init__(self, config: Config, interval: float, patience: float = 0.0) -> None:
+        count = len(config.joints)
+        self._interval = interval
+        self._longest_turn = max(interval, patience)
+        self._limit = missing_limit(config)
+        late = late_limit(config)
+        self._blind: Limit = max(late, self._limit, key=lambda limit: limit.seconds)
+        self._asked_at: float | None = None
+        self._turn = 0.0
+        self._last_heard: list[float | None] = [None] * count
+        self._listened = [0.0] * count
+        self._busy_until = float("-inf")
+        self.counts = [0] * count
+        """Replies missed in a row, by joint."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether this computer was late a short time ago."""
+        return self._asked_at is not None and self._asked_at < self._busy_until
+
+    def woke_up(self, now: float, late: float) -> None:
+        """Record that this program woke up at `now` [s], `late` [s] after it wanted to."""
+        if late >= LATE_WAKE_UP_S:
+            self._busy_until = now + BUSY_S
+
+    def ask(self, now: float) -> None:
+        """Begin an exchange at `now` [s]."""
+        since = 0.0 if self._asked_at is None else now - self._asked_at
+        self._turn = min(since, self._longest_turn)
+        self._asked_at = now
+
+    def heard(self, joint: int, now: float) -> None:
+        """Record a reply to the exchange that began at `now` [s]."""
+        self.counts[joint] = 0
+        self._listened[joint] = 0.0
+        self._last_heard[joint] = now
+
+    def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
+        """Record a missing reply to the exchange that began at `now` [s]; return what was too long, or None.
+
+        refused: the servo answered, with an error instead of its state; one such answer is enough. alone: another servo
+        was heard.
+        """
+        last = self._last_heard[joint]
+        if last is None:
+            last = self._last_heard[joint] = now
+        self.counts[joint] += 1
+        self._listened[joint] += self._turn
+        listened = max(self._listened[joint], self.counts[joint] * self._interval)
+        elapsed = max(now - last, listened)
+        count = self.counts[joint] + refused
+        allowed = self._limit if alone or not self.is_busy else self._blind
+        if is_missing_too_long(count, listened, allowed):
+            return f"{_ms(elapsed)} ago{_delayed(elapsed - listened)}; {allowed.said} allows {_ms(allowed.seconds)}"
+        if is_missing_too_long(count, elapsed, self._blind):
+            delayed = _delayed(elapsed - listened)
+            return f"{_ms(elapsed)} ago{delayed}; {self._blind.said} allows {_ms(self._blind.seconds)}"
+        return None
+
+
+def _delayed(seconds: float) -> str:
+    return f", {_ms(seconds)} of it because this computer was busy" if seconds >= LATE_WAKE_UP_S else ""
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.0f} ms"

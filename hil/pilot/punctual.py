@@ -1,0 +1,26 @@
+"""A run that is stopped because this computer was late says nothing about the arm: it is played again."""
+
+from collections.abc import Callable
+
+from hil.config.schema import Config
+from hil.errors import Cause, SafetyStop
+from hil.runs.run_folder import RunFolder
+
+MOST_REPEATS = 3
+
+
+def punctual(play: Callable[[], str], config: Config, folder: RunFolder, name: str, say: Callable[[str], None]) -> str:
+    """Return what `play` returns; play again if deadlines were missed, at most MOST_REPEATS times.
+
+    The recording of a stopped run is set aside in `folder`. Raises what `play` raises.
+    """
+    for number in range(1, MOST_REPEATS + 1):
+        try:
+            return play()
+        except SafetyStop as stopped:
+            if stopped.cause is not Cause.LATE:
+                raise
+            torque = " ".join(getattr(stopped, "__notes__", []))
+            say(f"{name} ended early: {stopped} {torque}\nRepeating it, {number} of at most {MOST_REPEATS} times.")
+            folder.set_aside(f"late-{number}", config)
+    return play()

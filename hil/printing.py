@@ -1,0 +1,77 @@
+"""Text and tables on standard output that lose nothing in a narrow terminal."""
+
+from collections.abc import Iterator
+
+from rich.console import Console
+from rich.measure import Measurement
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+_INDENT = 2
+
+
+class ResultConsole(Console):
+    """Standard output, without rich's own colours and its own idea of a closed pipe (`hil.cli.output` has another)."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
+def result_console() -> Console:
+    """A console for results."""
+    return ResultConsole(highlight=False)
+
+
+def say(console: Console, text: str) -> None:
+    """Print a sentence: a terminal gets it wrapped between words, a file or a pipe in one line."""
+    console.print(text, soft_wrap=not console.is_terminal, markup=False)
+
+
+def say_behind(console: Console, label: str, text: str, style: str = "") -> None:
+    """Print a sentence behind a label; on a terminal its further lines begin below its first."""
+    line = Text(label, style=style) + Text(text)
+    if not console.is_terminal or line.cell_len <= console.width or len(label) > console.width // 3:
+        console.print(line, soft_wrap=not console.is_terminal)
+        return
+    grid = Table.grid()
+    grid.add_column(width=len(label))
+    grid.add_row(Text(label, style=style), Text(text, overflow="fold"))
+    console.print(grid)
+
+
+def natural_width(console: Console, table: Table) -> int:
+    """Columns that the table needs for all its figures."""
+    wide = Console(file=console.file, width=10_000)
+    return Measurement.get(wide, wide.options, table).maximum
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Print a table without cutting a figure: where the terminal is too narrow, the terminal wraps its lines."""
+    width = max(console.width, natural_width(console, table))
+    ResultConsole(file=console.file, highlight=False, width=width).print(table)
+
+
+def print_fitting(console: Console, table: Table) -> None:
+    """Print a table; where the terminal is too narrow, each row as a paragraph that names its columns."""
+    if not console.is_terminal or natural_width(console, table) <= console.width:
+        print_table(console, table)
+        return
+    if table.title:
+        console.print(table.title)
+    former = None
+    for title, cells in _paragraphs(table):
+        if title != former:
+            console.print(title)
+            former = title
+        console.print(Padding(", ".join(cells), (0, 0, 0, _INDENT)))
+
+
+def _paragraphs(table: Table) -> Iterator[tuple[str, list[str]]]:
+    """The first cell of each row (or that of the row above, if it is empty), and the others with their headings."""
+    headings = [str(column.header) for column in table.columns]
+    title = ""
+    for row in zip(*(column.cells for column in table.columns), strict=True):
+        first, *others = map(str, row)
+        title = f"{headings[0]} {first}".strip() if first else title
+        yield title, [f"{heading} {cell}".strip() for heading, cell in zip(headings[1:], others, strict=True) if cell]
