@@ -146,32 +146,23 @@ class Converter:
         sent = tuple([unit * tick for unit, tick in zip(self._drive_units, ticks, strict=True)])
         # Additional registers precede the three that are always read, but voltage and temperature follow them.
         at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
-        drive, velocity, position, error, missing = [], [], [], [], []
-        for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True):
-            if answer is None or len(answer) == 1:
-                drive.append(NAN)
-                velocity.append(NAN)
-                position.append(NAN)
-                error.append(0 if answer is None else answer[0])
-                missing.append(True)
-            else:
-                drive.append(answer[at] * drive_unit)
-                velocity.append(answer[at + 1] * velocity_unit)
-                position.append((answer[at + 2] - zero) * position_unit)
-                error.append(answer[0])
-                missing.append(False)
-        return State(
-            reply.time_before_write,
-            reply.time_after_read,
-            sent,
-            tuple(drive),
-            tuple(velocity),
-            tuple(position),
-            tuple(error),
-            tuple(missing),
-            _slow(reply) if 0 < reply.span <= SLOW_SPANS else None,
-            self._status(reply.servos) if reply.span > SLOW_SPANS else None,
-        )
+        each = [
+            (NAN, NAN, NAN, 0 if answer is None else answer[0], True)
+            if answer is None or len(answer) == 1
+            else (
+                answer[at] * drive_unit,
+                answer[at + 1] * velocity_unit,
+                (answer[at + 2] - zero) * position_unit,
+                answer[0],
+                False,
+            )
+            for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True)
+        ]
+        drive, velocity, position, error, missing = zip(*each, strict=True)
+        slow = _slow(reply) if 0 < reply.span <= SLOW_SPANS else None
+        status = self._status(reply.servos) if reply.span > SLOW_SPANS else None
+        before, after = reply.time_before_write, reply.time_after_read
+        return State(before, after, sent, drive, velocity, position, error, missing, slow, status)
 
     def _status(self, answers: Sequence[Answer]) -> tuple[Status | None, ...]:
         told: list[Status | None] = []

@@ -237,6 +237,10 @@ class SelectionOptions:
     """RMS residual in units of the noise above which presliding is tried, which is slow to fit."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)
     """Initial widths of one joint's smoothed Coulomb step [rad/s], tried if the motion is not explained."""
+    initial_bends: tuple[float, ...] = (1e-3, 5e-3)
+    """Initial presliding deflections of one joint at which it begins to slide [rad], tried likewise."""
+    max_restarts: int = 6
+    """Maximum number of fits from other initial guesses."""
     overrule_ratio: float = 0.8
     """Prediction error relative to the chosen model's that another model must reach to replace it."""
     ripple_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))

@@ -1,5 +1,6 @@
 """Attacks on the bytes between host and servos by a man in the middle, and attacks on the servos themselves."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -60,16 +61,42 @@ class Kind(StrEnum):
     SIGTERM = "SIGTERM"
     SIGHUP = "SIGHUP"
     KILLED = "killed"
+    HICCUPS = "hiccups"
+    CLOCK_SET = "clock_set"
+    WRONG_ID = "wrong_id"
+    ONE_BEHIND = "one_behind"
+    REORDERED = "reordered"
+    RIVAL = "rival"
+    FACTORY_RESET = "factory_reset"
+    SHADOWED = "shadowed"
+    THROTTLED = "throttled"
+    HOMING_MOVED = "homing_moved"
+    SLIP = "slip"
+    OBSTACLE = "obstacle"
+    SNAG = "snag"
+    LOAD_CHANGED = "load_changed"
 
 
-ON_REPLIES = frozenset({Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.COLLISION})
+ON_REPLIES = frozenset({Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.COLLISION}) | {
+    Kind.ONE_BEHIND,
+    Kind.REORDERED,
+}
 FORGED = frozenset({Kind.SWAP, Kind.FREEZE, Kind.SCALE, Kind.REPLAY, Kind.BIAS, Kind.CREEP, Kind.LAG, Kind.JITTER}) | {
     Kind.STUCK_BIT,
     Kind.CONSTANT,
+    Kind.WRONG_ID,
 }
-ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED, Kind.GRIPPED, Kind.PLAY})
+ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED, Kind.GRIPPED, Kind.PLAY}) | {
+    Kind.SLIP,
+    Kind.OBSTACLE,
+    Kind.SNAG,
+    Kind.LOAD_CHANGED,
+}
 ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD, Kind.GOAL_FIGHT})
-AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - {Kind.ECHO})
+ON_TIME = frozenset({Kind.RIVAL, Kind.HICCUPS})
+"""Attacks that happen again and again from their start to their end."""
+
+AT_ONCE = frozenset(set(Kind) - ON_REPLIES - FORGED - ON_INSTRUCTIONS - ON_MOTORS - ON_TIME - {Kind.ECHO})
 """Attacks that happen once, at their start time."""
 
 
@@ -186,14 +213,17 @@ def with_field(block: bytes, request: Request, name: str, value: int) -> bytes:
     return block[:at] + value.to_bytes(size, "little", signed=True) + block[at + size :]
 
 
-def forged(answers: dict[int, tuple[int, bytes]], request: Request) -> bytes:
-    """The bytes of answers with forged values; every CRC is correct."""
+def forged(answers: dict[int, tuple[int, bytes]], request: Request, named: Mapping[int, int] | None = None) -> bytes:
+    """The bytes of answers with forged values; every CRC is correct. named: other IDs to send some of them with."""
+    named = named or {}
     if not request.fast:
-        return b"".join(encode_status(servo_id, error, block) for servo_id, (error, block) in answers.items())
+        return b"".join(
+            encode_status(named.get(servo_id, servo_id), error, block) for servo_id, (error, block) in answers.items()
+        )
     length = 1 + (request.length + 4) * len(request.ids)
     whole = HEADER + b"\xfe" + length.to_bytes(2, "little") + b"\x55"
     for servo_id in request.ids:
         error, block = answers[servo_id]
-        whole += bytes((error, servo_id)) + block
+        whole += bytes((error, named.get(servo_id, servo_id))) + block
         whole += crc(whole).to_bytes(2, "little")
     return whole

@@ -101,6 +101,20 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.SIGTERM: frozenset({SIGNAL}),
     Kind.SIGHUP: frozenset({SIGNAL}),
     Kind.KILLED: frozenset(),
+    Kind.HICCUPS: frozenset({PROGRAM, LATE}),
+    Kind.CLOCK_SET: frozenset(),
+    Kind.WRONG_ID: _BYTES | {MIXED},
+    Kind.ONE_BEHIND: _FORGED | {LATE},
+    Kind.REORDERED: _BYTES,
+    Kind.RIVAL: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
+    Kind.FACTORY_RESET: frozenset({SILENCE, REBOOT, TORQUE}),
+    Kind.SHADOWED: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
+    Kind.THROTTLED: _FORGED | {LIMIT},
+    Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE},
+    Kind.SLIP: _FORGED | {LIMIT, POSE},
+    Kind.OBSTACLE: _FORGED | {LIMIT},
+    Kind.SNAG: _FORGED | {LIMIT},
+    Kind.LOAD_CHANGED: _FORGED | {LIMIT, POSE},
     FaultKind.LOST_REPLY: frozenset({SILENCE}),
     FaultKind.CORRUPTED_REPLY: _BYTES,
     FaultKind.TRUNCATED_REPLY: _BYTES,
@@ -129,6 +143,8 @@ UNHEARD = _INSTRUCTIONS | {
     Kind.KILLED,
     Kind.NEW_ID,
     Kind.NEW_BAUD,
+    Kind.FACTORY_RESET,
+    Kind.HICCUPS,
     FaultKind.CABLE_PULLED,
     FaultKind.SILENT_SERVO,
     FaultKind.REBOOT,
@@ -136,10 +152,10 @@ UNHEARD = _INSTRUCTIONS | {
 }
 """Faults during which the program cannot reach a servo, so that the watchdog's timeout applies."""
 
-SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SPLIT, FaultKind.LATE_REPLY})
+SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.HICCUPS, Kind.SPLIT, FaultKind.LATE_REPLY})
 """Faults after which the program may play its plan later than in an undisturbed run."""
 
-HARMLESS = frozenset({Kind.CLOCK_WRAP, Kind.RAISED_LIMIT})
+HARMLESS = frozenset({Kind.CLOCK_WRAP, Kind.CLOCK_SET, Kind.RAISED_LIMIT})
 """Faults after which a run ends as if undisturbed."""
 
 _OF_ONE_FIELD = frozenset({Kind.BIAS, Kind.CREEP, Kind.JITTER, Kind.STUCK_BIT, Kind.CONSTANT})
@@ -209,7 +225,7 @@ def _chance(random: Random) -> float:
 def _attack(kind: Kind, at: float, ids: Sequence[int], random: Random) -> Attack:
     servo = random.choice((None, *ids))
     # Forged values stay forged: an intermittent forgery would be a new fault at every sample.
-    chance = 1.0 if kind in FORGED | ON_MOTORS | {Kind.ECHO} else _chance(random)
+    chance = 1.0 if kind in FORGED | ON_MOTORS | {Kind.ECHO, Kind.ONE_BEHIND, Kind.REORDERED} else _chance(random)
     fields = ("position", "velocity", "current")
     field = random.choice(fields if kind in _OF_ONE_FIELD else ("state", *fields))
     amount = _amount(kind, field, random)
@@ -242,6 +258,15 @@ def _amount(kind: Kind, field: str, random: Random) -> float:
         Kind.GRIPPED: random.uniform(0.1, 2.0),
         Kind.PLAY: 10 ** random.uniform(-2.0, -0.7),
         Kind.GOAL_FIGHT: sign * random.uniform(0.02, 1.0),
+        Kind.HICCUPS: random.choice((0.03, 0.1, 0.3)),
+        Kind.CLOCK_SET: sign * 3600.0,
+        Kind.RIVAL: sign * random.uniform(0.02, 1.0),
+        Kind.THROTTLED: random.choice((0.0, 0.05, 0.3)),
+        Kind.HOMING_MOVED: sign * 10 ** random.uniform(1.0, 3.3),
+        Kind.SLIP: sign * 10 ** random.uniform(-1.3, 0.0),
+        Kind.OBSTACLE: sign * random.uniform(0.5, 3.0),
+        Kind.SNAG: random.uniform(0.3, 3.0),
+        Kind.LOAD_CHANGED: sign * random.uniform(0.3, 2.0),
         Kind.ANSWERS_LESS: float(random.randrange(2)),
     }.get(kind, 0.0)
 

@@ -2,10 +2,13 @@
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from random import Random
 
 from benchmarks.fault_campaign.attack import Attack, Kind, Request, blocks_in, field_of, forged, with_field
+
+_IDS = 3
+"""Wrong IDs are 1 to this: those of the arm, and one that is not on the bus."""
 
 
 class Forger:
@@ -32,9 +35,10 @@ class Forger:
                 if each.concerns(servo_id):
                     changed[servo_id] = error, self._block(each, number, servo_id, block, request, now)
         self._latest.update(answers)
-        if changed == answers or (request.fast and set(answers) != set(request.ids)):
+        named = _misnamed(answers, attacks)
+        if (changed == answers and not named) or (request.fast and set(answers) != set(request.ids)):
             return packet
-        return forged(changed, request)
+        return forged(changed, request, named)
 
     def _block(self, attack: Attack, number: int, servo_id: int, block: bytes, request: Request, now: float) -> bytes:
         if attack.kind == Kind.SWAP:
@@ -89,3 +93,9 @@ class Forger:
                 earlier = field_of(block, request, name)
                 return value if earlier is None else earlier
         return value
+
+
+def _misnamed(answers: Mapping[int, object], attacks: Sequence[Attack]) -> dict[int, int]:
+    """The ID of the next servo, or of one that is not there, for the servos that answer with a wrong ID."""
+    hit = [each for each in answers for attack in attacks if attack.kind == Kind.WRONG_ID and attack.concerns(each)]
+    return {each: each % _IDS + 1 for each in hit}

@@ -17,6 +17,7 @@ from benchmarks.fault_campaign.attack import (
     ON_INSTRUCTIONS,
     ON_MOTORS,
     ON_REPLIES,
+    ON_TIME,
     Attack,
     Kind,
     Request,
@@ -28,6 +29,9 @@ from benchmarks.fault_campaign.forger import Forger
 from benchmarks.fault_campaign.touch import Killed, happen, overwrite_goals, prepare
 from hil.drivers.packet import HEADER, encode_status
 from hil.fakes.protocol_fake import FakeSerial
+
+HICCUP_EVERY_S, RIVAL_EVERY_S = 0.2, 0.013
+"""Time between two stalls of a program with hiccups, and between two goals of a second master [s]."""
 
 LOOK_BACK_S = 0.5
 """Time before a replay attack from which replies are stored for it [s]."""
@@ -60,6 +64,9 @@ class Middle(FakeSerial):
         self._request: Request | None = None
         self._forger = Forger()
         self._fights: list[Attack] = []
+        self._again: dict[Attack, float] = {}
+        self._former: dict[tuple[int, int], bytes] = {}
+        self._held: bytes | None = None
         self._undo: list[Callable[[], None]] = []
         super().__init__(*args, **kwargs)
 
@@ -68,7 +75,8 @@ class Middle(FakeSerial):
         self._attacks = attacks
         self._random = Random(seed)
         self._to_come = sorted((each for each in attacks if each.kind in AT_ONCE), key=lambda each: each.start)
-        on_bytes = [each for each in attacks if each.kind not in AT_ONCE | ON_MOTORS]
+        on_bytes = [each for each in attacks if each.kind not in AT_ONCE | ON_MOTORS | ON_TIME]
+        self._again = {each: each.start for each in attacks if each.kind in ON_TIME}
         for each in attacks:
             prepare(each, self)
         self._wakes = min(
@@ -191,7 +199,7 @@ class Middle(FakeSerial):
                     copies *= 2
                 case _:
                     packet = self._spoilt(each, packet)
-        for _ in range(copies):
+        for _ in range(copies if packet else 0):
             if gap is None:
                 yield wait, packet
             else:
@@ -199,11 +207,31 @@ class Middle(FakeSerial):
                 yield wait, packet[:half]
                 yield wait + gap, packet[half:]
 
+    def _one_behind(self, packet: bytes) -> bytes:
+        key = packet[4] if len(packet) > 4 else -1, len(packet)
+        former, self._former[key] = self._former.get(key, packet), packet
+        return former
+
+    def _reordered(self, packet: bytes) -> bytes:
+        """Hold the first servo's answer back until the last one's; a fast answer is a single packet."""
+        ids = self._request.ids if self._request is not None else ()
+        if len(packet) < 11 or len(ids) < 2 or packet[4] not in ids:
+            return packet
+        if packet[4] == ids[0]:
+            self._held = packet
+            return b""
+        held, self._held = self._held, None
+        return packet + held if held is not None else packet
+
     def _forging(self, now: float) -> list[Attack]:
         return [each for each in self._lasting(now, FORGED) if self._strikes(each, now)]
 
     def _spoilt(self, attack: Attack, packet: bytes) -> bytes:
-        """Corrupt bytes so that no checksum matches."""
+        """Another packet in its place, or its bytes corrupted so that no checksum matches."""
+        if attack.kind == Kind.ONE_BEHIND:
+            return self._one_behind(packet)
+        if attack.kind == Kind.REORDERED:
+            return self._reordered(packet)
         if attack.kind == Kind.CUT:
             at = self._random.randrange(len(packet))
             return packet[:at] + packet[at + self._random.randrange(1, 5) :]
@@ -248,6 +276,14 @@ class Middle(FakeSerial):
             for each in self._fights:
                 overwrite_goals(each, self)
             self._fights.clear()
+        for each, due in self._again.items():
+            if due <= now < each.end and not self.over and not self.bus.on_the_way:
+                if each.kind == Kind.RIVAL:
+                    self._again[each] = now + RIVAL_EVERY_S
+                    overwrite_goals(each, self)
+                else:
+                    self._again[each] = now + each.amount + HICCUP_EVERY_S
+                    self.clock.wait_until(now + each.amount)
         while self._to_come and self._to_come[0].start <= now:
             each = self._to_come.pop(0)
             if not self.over:

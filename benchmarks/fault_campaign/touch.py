@@ -1,14 +1,16 @@
 """Attacks on the servos, their motors and the program itself rather than on bytes."""
 
-import contextlib
 import os
 import resource
 import signal
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from benchmarks.fault_campaign.attack import ON_MOTORS, Attack, Kind
 from benchmarks.fault_campaign.witness import Witness
+from hil.drivers.packet import Instruction, encode
+from hil.fakes.servo.backup import RESET_ALL, factory_reset
 from hil.fakes.servo.servo import EmulatedServo
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ _ROOM_BYTES = 1 << 12  # a file may grow to this once the disk is full
 _WRAP_S = 32.768
 _SHORT_BOOT_S = 5e-3
 _POSITION_MODE = 3
+_OF_THE_MOMENT = ("Torque Enable", "Hardware Error Status", "Registered Instruction")
 
 
 class Killed(BaseException):
@@ -54,6 +57,10 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
             port.clock.wait_until(port.clock.now() + attack.amount)
         case Kind.DISK_FULL:
             return [_fill_disk()]
+        case Kind.CLOCK_SET:
+            return [_set_clock(attack.amount)]
+        case Kind.SHADOWED:
+            return _shadow(attack, port.bus._servos)
         case _:
             return [
                 undo
@@ -66,14 +73,19 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
 def overwrite_goals(attack: Attack, port: "Middle") -> None:
     """Write another goal, as a second master does that answers each of the program's commands."""
     for servo in port.bus._servos:
-        if attack.concerns(servo.id):
-            _write_goal(attack, servo)
+        if attack.concerns(servo.id) and servo.torque_enabled:
+            address, goal = _write_goal(attack, servo)
+            if attack.kind == Kind.RIVAL:  # the program hears it as well
+                said = encode(servo.id, Instruction.WRITE, address.to_bytes(2, "little") + goal)
+                port.bus._wire.put(said, port.bus.time)
 
 
-def _write_goal(attack: Attack, servo: EmulatedServo) -> None:
-    with contextlib.suppress(KeyError):
-        goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
-        servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
+def _write_goal(attack: Attack, servo: EmulatedServo) -> tuple[int, bytes]:
+    address, limit = (102, "Current Limit") if servo.operating_mode == 0 else (100, "PWM Limit")
+    goal = round(attack.amount * servo.value(limit)) if limit in servo.memory else 0
+    data = goal.to_bytes(2, "little", signed=True)
+    servo.write(address, data)
+    return address, data
 
 
 def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
@@ -92,6 +104,8 @@ def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:
             undo = _change(servo, "Drive Mode", servo.value("Drive Mode") ^ 1)
             servo.reboot(now, _SHORT_BOOT_S)  # with torque on it could not be written
             return undo
+        case Kind.FACTORY_RESET:
+            return _reset(servo, now)
         case Kind.CLOCK_RATE:
             servo.present._clock_rate *= 1.0 + attack.amount
         case _:
@@ -113,6 +127,10 @@ def _reconfigure(attack: Attack, servo: EmulatedServo) -> Undo | None:
             return _change(servo, limit, round(attack.amount * servo.value(limit)))
         case Kind.RAISED_LIMIT if limit == "Current Limit":
             return _change(servo, limit, 2 * servo.value(limit))
+        case Kind.THROTTLED if servo.operating_mode == 0 and "Goal PWM" in servo.memory:
+            return _change(servo, "Goal PWM", round(attack.amount * servo.value("PWM Limit")))
+        case Kind.HOMING_MOVED:
+            return _change(servo, "Homing Offset", servo.value("Homing Offset") + round(attack.amount))
         case Kind.SLOW_REPLIES:
             return _change(servo, "Return Delay Time", _SLOWEST_REPLY)
         case Kind.NEW_ID:
@@ -136,6 +154,41 @@ def _change(servo: EmulatedServo, register: str, value: int, before: int | None 
             servo.memory.set(register, before)
             servo._derive()
 
+    return undo
+
+
+def _reset(servo: EmulatedServo, now: float) -> Undo:
+    """Factory Reset with ID and baud rate, as by a button pressed in another program."""
+    before = {name: servo.memory.value(name) for name in servo.memory.registers}
+    factory_reset(servo.memory, bytes((RESET_ALL,)))
+    servo.reboot(now, _SHORT_BOOT_S)
+
+    def undo() -> None:
+        for name, value in before.items():
+            if name not in _OF_THE_MOMENT:
+                servo.memory.set(name, value)
+        servo._derive()
+
+    return undo
+
+
+def _shadow(attack: Attack, servos: Sequence[EmulatedServo]) -> list[Undo]:
+    """Let a servo execute the instructions to its neighbour too."""
+    return [
+        _change(servo, "Secondary(Shadow) ID", servos[number - 1].id)
+        for number, servo in enumerate(servos)
+        if len(servos) > 1 and attack.concerns(servo.id) and "Secondary(Shadow) ID" in servo.memory
+    ]
+
+
+def _set_clock(seconds: float) -> Undo:
+    """Set the computer's clock; the monotonic one goes on."""
+    right = time.time
+
+    def undo() -> None:
+        time.time = right
+
+    time.time = lambda: right() + seconds
     return undo
 
 

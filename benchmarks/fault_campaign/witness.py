@@ -16,6 +16,12 @@ CURRENT_MODE, PWM_MODE = 0, 16
 GRIP_RAD_S = 0.1
 """Velocity at which a hand that grips the arm brakes with most of its force [rad/s]."""
 
+SLIPS_S = 0.05
+"""Time in which a joint slips on its shaft [s]."""
+
+SOFT_RAD = 0.02
+"""Way on which an obstacle, or a cable that snags, comes to its full force [rad]."""
+
 PUSH_RISES_S = 0.03
 """Rise time of a push [s]: no hand is faster."""
 
@@ -44,16 +50,24 @@ class Witness:
         self._missing = [0.0] * bus.plant.joints
         self._turned_at = [(0.0, -1.0)] * bus.plant.joints  # sign of the current, and when it changed
         self._largest = [0.0] * bus.plant.joints
+        self._found_at: dict[tuple[int, Attack], float] = {}
+        self._slipped = [0.0] * bus.plant.joints
+        self._slips = [0.0] * bus.plant.joints
         self.joints = bus.plant.joints
         bus.plant = self
 
     @property
     def position(self) -> Sequence[float]:
-        return self._plant.position
+        """Angles of the servos' shafts: those of the joints, unless one has slipped."""
+        if not any(self._slipped):
+            return self._plant.position
+        return tuple(angle + slipped for angle, slipped in zip(self._plant.position, self._slipped, strict=True))
 
     @property
     def velocity(self) -> Sequence[float]:
-        return self._plant.velocity
+        if not any(self._slips):
+            return self._plant.velocity
+        return tuple(speed + slips for speed, slips in zip(self._plant.velocity, self._slips, strict=True))
 
     @property
     def current(self) -> Sequence[float]:
@@ -90,7 +104,29 @@ class Witness:
                 case Kind.PUSHED:
                     felt[joint] = before + most * min(1.0, (now - each.start) / PUSH_RISES_S)
                     self._missing[joint] += before - felt[joint]
+                case Kind.SLIP:
+                    self._slip(joint, each, now)
+                case _:
+                    felt[joint] = before + most * self._resists(joint, each)
+                    self._missing[joint] += before - felt[joint]
         return felt
+
+    def _slip(self, joint: int, attack: Attack, now: float) -> None:
+        done = min(1.0, (now - attack.start) / SLIPS_S)
+        self._slips[joint] = attack.amount / SLIPS_S if done < 1.0 else 0.0
+        self._slipped[joint] = attack.amount * done
+
+    def _resists(self, joint: int, attack: Attack) -> float:
+        """Force of an obstacle, a snagged cable, or a changed load, relative to the attack's amount."""
+        angles = self._plant.position
+        found = self._found_at.setdefault((joint, attack), angles[joint])
+        way = max(-1.0, min(1.0, (angles[joint] - found) / SOFT_RAD))
+        if attack.kind == Kind.SNAG:
+            return -way
+        if attack.kind == Kind.OBSTACLE:
+            forward = math.copysign(1.0, attack.amount)
+            return -max(0.0, forward * way)
+        return math.cos(sum(angles[: joint + 1]))
 
     def _turns(self, joint: int, current: float, now: float) -> float:
         """Time since the current has changed its sign [s]."""

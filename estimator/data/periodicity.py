@@ -1,11 +1,17 @@
 """Whether an arm has settled: the difference between successive periods of a periodic experiment."""
 
+import itertools
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ShapeError
+
+EVEN = 1.1  # ratio of successive changes up to which they count as falling
+SLOWLY = 0.4, 0.97  # mean ratio of successive changes of a slow drift: a transient falls faster, others do not fall
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,25 @@ def settling_difference(former: Array, latest: Array) -> float:
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
+
+
+def periods_of_drift(differences: Sequence[float], within: float) -> int | None:
+    """Return how many more periods a slow drift takes until successive periods differ by at most `within`.
+
+    As grease warms up, the change from period to period falls slowly and evenly. None if the changes do not look like
+    that: play or a dragging cable make them irregular, and a transient dies out faster.
+
+    differences: relative differences of successive periods, in the order of time; the first may contain a transient.
+    """
+    falling = list(differences[1:])
+    if len(falling) < 2 or not all(math.isfinite(each) and each > 0.0 for each in falling):
+        return None
+    if any(later > EVEN * former for former, later in itertools.pairwise(falling)):
+        return None
+    ratio = (falling[-1] / falling[0]) ** (1.0 / (len(falling) - 1))
+    if not SLOWLY[0] <= ratio <= SLOWLY[1]:
+        return None
+    return max(1, math.ceil(math.log(within / falling[-1]) / math.log(ratio)))
 
 
 def _rms(values: Array) -> Array:

@@ -35,9 +35,12 @@ class Minimum:
     """The sum of squares at the minimum."""
     iterations: int
     """Number of points at which it was evaluated."""
+    stalled: bool = False
+    """Whether it was accepted because no damping gave the decrease that the normal equations predict."""
 
 
 Evaluate = Callable[[Array], Quadratic]
+Cost = Callable[[Array], float]
 Move = Callable[[Array, Array], Array]
 Limits = Callable[[Array], tuple[Array, Array]]
 
@@ -49,11 +52,15 @@ def minimise(
     damping: float | None = None,
     at: Quadratic | None = None,
     *,
+    cost: Cost | None = None,
     move: Move = np.add,
     limits: Limits | None = None,
     options: MinimiserOptions = DEFAULTS,
 ) -> Minimum:
     """Minimise a sum of squares from `start`, in coordinates of order 1.
+
+    Where the sum alone costs much less than its normal equations, `cost` spares those of rejected steps, and a step
+    that succeeds is compared with less damped ones.
 
     Damped steps are short along weakly determined directions and would end the iteration too early there: near the
     minimum, `damping` should start at `options.min_damping`.
@@ -64,6 +71,7 @@ def minimise(
         ftol: stop when the actual or predicted relative decrease of a step is below this.
         damping: initial damping; by default `options.initial_damping`.
         at: the sum of squares at `start`, if known.
+        cost: returns the sum of squares alone, the same as `evaluate` but for rounding; by default `evaluate` is used.
         move: applies a step to coordinates.
         limits: returns the minimum and maximum change of each coordinate in a step; by default +-`options.max_step`.
         options: limits of the iteration.
@@ -83,10 +91,11 @@ def minimise(
     gained = np.inf
     for _ in range(options.max_iterations):
         bounds = step_limits(x, options) if limits is None else limits(x)
-        found, damping, tried = _improve(evaluate, x, here, damping, ftol, move, bounds, options)
-        evaluations += tried
+        trials = _Trials(x, here, ftol, move, bounds, evaluate, cost)
+        found, damping = trials.improve(damping, options)
+        evaluations += trials.evaluations
         if found is None:
-            return Minimum(x, here, evaluations)
+            return Minimum(x, here, evaluations, stalled=damping >= options.max_damping)
         gained = here.cost - found[1].cost
         x, here = found
         if gained < ftol * here.cost:
@@ -104,32 +113,64 @@ def step_limits(x: Array, options: MinimiserOptions) -> tuple[Array, Array]:
     return np.full(x.size, -options.max_step), np.full(x.size, options.max_step)
 
 
-def _improve(
-    evaluate: Evaluate,
-    x: Array,
-    at: Quadratic,
-    damping: float,
-    ftol: float,
-    move: Move,
-    limits: tuple[Array, Array],
-    options: MinimiserOptions,
-) -> tuple[tuple[Array, Quadratic] | None, float, int]:
-    """Return a better point or None, the damping for the next step, and the number of points tried."""
-    tried = 0
-    while damping < options.max_damping:
-        step = _step(at.normal, at.gradient, damping, *limits)
-        foreseen = -float(step @ (2.0 * at.gradient + at.normal @ step))
-        if foreseen < ftol * at.cost:
-            break
-        moved = move(x, step)
-        there = evaluate(moved)
-        tried += 1
-        gained = at.cost - there.cost
-        if gained > 0.0:
-            trusted = 0.1 if gained > 0.5 * foreseen else 1.0
-            return (moved, there), max(options.min_damping, damping * trusted), tried
-        damping = max(10.0 * damping, options.initial_damping)
-    return None, damping, tried
+@dataclass
+class _Trials:
+    """Damped steps from one point; `evaluations` counts the normal equations that they took."""
+
+    x: Array
+    at: Quadratic
+    ftol: float
+    move: Move
+    limits: tuple[Array, Array]
+    evaluate: Evaluate
+    cost: Cost | None
+    evaluations: int = 0
+    _latest: tuple[Array, Quadratic] | None = None
+
+    def improve(self, damping: float, options: MinimiserOptions) -> tuple[tuple[Array, Quadratic] | None, float]:
+        """Return a better point or None, and the damping for the next step."""
+        while damping < options.max_damping:
+            moved, foreseen = self._moved(damping)
+            if foreseen < self.ftol * self.at.cost:
+                break
+            gained = self.at.cost - self._cost_at(moved)
+            if gained > 0.0:
+                trusted = 0.1 if gained > 0.5 * foreseen else 1.0
+                if self.cost is not None and trusted < 1.0:
+                    moved, damping = self._bolder(moved, gained, damping, options)
+                there = self._evaluated(moved)
+                if there.cost < self.at.cost:
+                    return (moved, there), max(options.min_damping, damping * trusted)
+            damping = max(10.0 * damping, options.initial_damping)
+        return None, damping
+
+    def _bolder(self, moved: Array, gained: float, damping: float, options: MinimiserOptions) -> tuple[Array, float]:
+        """Return the best of successively less damped steps, and its damping."""
+        while damping > options.min_damping:
+            less = max(options.min_damping, 0.1 * damping)
+            further, _ = self._moved(less)
+            more = self.at.cost - self._cost_at(further)
+            if not more > gained:
+                break
+            moved, gained, damping = further, more, less
+        return moved, damping
+
+    def _moved(self, damping: float) -> tuple[Array, float]:
+        """Return the end of a damped step, and the decrease of the sum of squares that the normal equations foresee."""
+        step = _step(self.at.normal, self.at.gradient, damping, *self.limits)
+        return self.move(self.x, step), -float(step @ (2.0 * self.at.gradient + self.at.normal @ step))
+
+    def _cost_at(self, x: Array) -> float:
+        if self.cost is not None:
+            return self.cost(x)
+        self._latest = x, self._evaluated(x)
+        return self._latest[1].cost
+
+    def _evaluated(self, x: Array) -> Quadratic:
+        if self._latest is not None and self._latest[0] is x:
+            return self._latest[1]
+        self.evaluations += 1
+        return self.evaluate(x)
 
 
 def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:

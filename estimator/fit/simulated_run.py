@@ -12,7 +12,13 @@ from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.arm import simulate, steps_per_sample
 from hil.estimator.simulation.back_emf import by_names, causes_of
 from hil.estimator.simulation.drive import motor_torque, torque_and_slopes
-from hil.estimator.simulation.encoder import by_motion, measured, measured_and_slopes
+from hil.estimator.simulation.encoder import (
+    by_motion,
+    measured,
+    measured_and_slopes,
+    slopes_without_errors,
+    without_errors,
+)
 from hil.estimator.simulation.presliding_sensitivity import sensitive
 
 PIECE = 8192  # samples; the derivatives of one piece are a few MiB
@@ -33,7 +39,9 @@ class SimulatedRun:
     max_substeps: int
     """Maximum number of substeps into which a step is divided near standstill."""
     pulled_to: Array | None = None
-    """Angles to which springs pull the arm, held between samples (joints, samples) [rad]; by default `measured`."""
+    """Readings of the encoders at the angles to which springs pull the arm, held between samples (joints, samples)
+    [rad]. By default springs pull to the angles `measured`, whatever the errors of the encoders.
+    """
 
     @classmethod
     def of(cls, period: SettledPeriod, integration: IntegrationOptions) -> "SimulatedRun":
@@ -47,11 +55,18 @@ class SimulatedRun:
         steps = steps_per_sample(self.rate, integration.max_step)
         return replace(self, steps=steps, max_substeps=integration.max_substeps)
 
-    def position(self, physics: Physics, start: Array) -> Array:
-        """Return the simulated encoder angles (joints, samples) [rad] from the initial state `start` (2, joints)."""
+    def position(
+        self, physics: Physics, start: Array, tracking_stiffness: Array | None = None, horizon: float = 1.0
+    ) -> Array:
+        """Return the simulated encoder angles (joints, samples) [rad] without derivatives; see `pieces`."""
+        samples = round(horizon * self.command.shape[1])
         of = self.command, self.rate, self.command_to_sample, self.steps
-        torque = motor_torque(*of, delay=physics.delay, lag=physics.lags)
-        return measured(physics, simulate(physics, start, torque, 1.0 / (self.rate * self.steps))[0])
+        torque = motor_torque(*of, delay=physics.delay, lag=physics.lags)[:, :samples]
+        springs = None
+        if tracking_stiffness is not None:
+            springs = tracking_stiffness, self._spring_ends(physics)[:, :samples]
+        step = 1.0 / (self.rate * self.steps)
+        return measured(physics, simulate(physics, start, torque, step, self.max_substeps, springs)[0])
 
     def pieces(
         self,
@@ -76,15 +91,21 @@ class SimulatedRun:
         """
         joints, samples = self.command.shape
         state = tuple(f"{what}_{joint + 1}" for what in ("position", "velocity") for joint in range(joints))
-        moving = by_motion(names)
+        ends, slopes_of_ends, moving = self._spring_ends(physics), None, by_motion(names)
+        if self.pulled_to is not None and tracking_stiffness is not None:
+            slopes_of_ends, moving = slopes_without_errors(physics, ends), names
         causes = (*causes_of(physics, moving), *state)
         step = 1.0 / (self.rate * self.steps)
         motion = sensitive(physics)(physics, start, causes, step, self.max_substeps, tracking_stiffness)
         of = self.command, self.rate, self.command_to_sample, self.steps
         torque, slopes = torque_and_slopes(*of, delay=physics.delay, lag=physics.lags)
         samples = round(horizon * samples)
-        ends = self.measured if self.pulled_to is None else self.pulled_to
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))
-            true, slope = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], ends[:, part])
-            yield part, *measured_and_slopes(physics, names, true, by_names(physics, moving, slope))
+            pulled = ends[:, part], None if slopes_of_ends is None else slopes_of_ends[:, part]
+            true, slope = motion.advance(np.ascontiguousarray(torque[:, part]), slopes[:, :, part], *pulled)
+            yield part, *measured_and_slopes(physics, names, moving, true, by_names(physics, moving, slope))
+
+    def _spring_ends(self, physics: Physics) -> Array:
+        """Return the angles to which springs pull the arm (joints, samples) [rad]."""
+        return self.measured if self.pulled_to is None else without_errors(physics, self.pulled_to)

@@ -18,13 +18,9 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.simulated_run import SimulatedRun
-from hil.estimator.models.parameters import ENCODER, Physics
-from hil.estimator.models.terms import joint_of, kind_of
+from hil.estimator.models.parameters import Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.closed_loop import Stabilised
-from hil.estimator.simulation.encoder import without_errors
-
-SHIFT = 1e-3  # change of an encoder error for its derivative [rad]
 
 
 @dataclass(frozen=True)
@@ -32,7 +28,7 @@ class StabilisedRun:
     """The input of a run's simulation, from its recording."""
 
     run: SimulatedRun
-    """The run without the stabiliser. Its `pulled_to` holds the angles to which the springs pull."""
+    """The run without the stabiliser. Its `pulled_to` holds the readings to which the springs pull."""
     stiffness: Array
     """Stiffness of the stabiliser's springs (joints,) [N m/rad]."""
 
@@ -55,9 +51,11 @@ class StabilisedRun:
         """Return the same run with other integration steps."""
         return replace(self, run=self.run.integrated(integration))
 
-    def position(self, physics: Physics, start: Array) -> Array:
-        """Return the simulated encoder angles (joints, samples) [rad] from the initial state `start` (2, joints)."""
-        return np.concatenate([position for _, position, _ in self.pieces(physics, start, ())], axis=1)
+    def position(
+        self, physics: Physics, start: Array, tracking_stiffness: Array | None = None, horizon: float = 1.0
+    ) -> Array:
+        """Return the simulated encoder angles (joints, samples) [rad] without derivatives; see `pieces`."""
+        return self.run.position(physics, start, self._stiffest(tracking_stiffness), horizon)
 
     def pieces(
         self,
@@ -71,26 +69,7 @@ class StabilisedRun:
 
         For each joint, the stiffer of the stabiliser's spring and `tracking_stiffness` is used.
         """
-        stiffness = self.stiffness if tracking_stiffness is None else np.maximum(self.stiffness, tracking_stiffness)
-        errors = [(index, name) for index, name in enumerate(names) if kind_of(name) in ENCODER]
-        base = self._pulled_by(physics).pieces(physics, start, names, stiffness, horizon)
-        # An encoder error moves the springs' ends too, which no other derivative contains.
-        moved = [
-            self._pulled_by(_shifted(physics, name)).pieces(physics, start, (), stiffness, horizon)
-            for _, name in errors
-        ]
-        for (part, position, derivative), *others in zip(base, *moved, strict=True):
-            for (index, _), (_, other, _) in zip(errors, others, strict=True):
-                derivative[:, :, index] += (other - position) / SHIFT
-            yield part, position, derivative
+        return self.run.pieces(physics, start, names, self._stiffest(tracking_stiffness), horizon)
 
-    def _pulled_by(self, physics: Physics) -> SimulatedRun:
-        """Return the run with springs to where the joints were if the encoders have the errors of `physics`."""
-        assert self.run.pulled_to is not None
-        return replace(self.run, pulled_to=without_errors(physics, self.run.pulled_to))
-
-
-def _shifted(physics: Physics, name: str) -> Physics:
-    encoder = physics.encoder.copy()
-    encoder[(joint_of(name) or 1) - 1, ENCODER.index(kind_of(name))] += SHIFT
-    return replace(physics, encoder=encoder)
+    def _stiffest(self, tracking_stiffness: Array | None) -> Array:
+        return self.stiffness if tracking_stiffness is None else np.maximum(self.stiffness, tracking_stiffness)

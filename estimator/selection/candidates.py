@@ -280,29 +280,35 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
     )
 
 
-def ripple_cycles(period: SettledPeriod, estimate: Estimate, cycles: Sequence[float]) -> dict[str, float]:
+def ripple_cycles(
+    period: SettledPeriod, estimate: Estimate, cycles: Sequence[float], only: Sequence[int] = ()
+) -> dict[str, float]:
     """Return the numbers of `cycles` per turn for which ripple of each joint would explain most of the residual.
 
     This is the score test of ripple for one number of cycles after the other, after removing what the fitted parameters
-    explain. The result is by parameter name.
+    explain. The result is by parameter name. Ripple that the estimate's model has is left out where it is searched for.
+
+    only: joints, from 1, that are searched; by default all.
     """
     used = without_spikes(period)
     run = simulated_run(used).integrated(COARSE)
     weight = np.where(np.isfinite(estimate.residual), 1.0 / period.noise[:, None], 0.0)
-    physics = Physics.of(estimate.parameters)
-    columns, position = _columns(run, physics, estimate.start, estimate.names, weight)
+    joints = tuple(only) or tuple(range(1, period.joints + 1))
+    searched = {f"ripple_{what}_{joint}": 0.0 for joint in joints for what in ("sin", "cos", "cycles")}
+    known = estimate.parameters | searched
+    fitted = tuple(name for name in estimate.names if name not in searched)
+    columns, position = _columns(run, Physics.of(known), estimate.start, fitted, weight)
     Q = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
     residual = (weight * (run.measured - position)).reshape(-1)
     rest = residual - Q @ (Q.T @ residual)
     best: dict[int, tuple[float, float]] = {}
-    joints = range(1, period.joints + 1)
+    names = tuple(f"ripple_{wave}_{joint}" for joint in joints for wave in ("sin", "cos"))
     for each in cycles:
         given = {f"ripple_cycles_{joint}": each for joint in joints}
-        names = tuple(f"ripple_{wave}_{joint}" for joint in joints for wave in ("sin", "cos"))
-        waves, _ = _columns(run, Physics.of({**estimate.parameters, **given}), estimate.start, names, weight)
+        waves, _ = _columns(run, Physics.of({**known, **given}), estimate.start, names, weight)
         waves = waves[:, : len(names)] - Q @ (Q.T @ waves[:, : len(names)])
-        for joint in joints:
-            own = waves[:, 2 * joint - 2 : 2 * joint]
+        for place, joint in enumerate(joints):
+            own = waves[:, 2 * place : 2 * place + 2]
             fall = float(np.sum((np.linalg.qr(own)[0].T @ rest) ** 2))
             best[joint] = max(best.get(joint, (-1.0, 0.0)), (fall, each))
     return {f"ripple_cycles_{joint}": best[joint][1] for joint in joints}

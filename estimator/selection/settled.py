@@ -23,6 +23,7 @@ from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_o
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
 from hil.estimator.selection.drift import Drift, friction_change
+from hil.estimator.selection.restarts import bristles, restarts
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
 
@@ -135,7 +136,7 @@ class Selection:
             unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
         smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
         self._begin(model.having(*unknown), coarse=True)
-        self._begin(smooth)
+        self._begin(smooth, coarse=True)
         self._begin(smooth.having("presliding"), coarse=True)
         plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
@@ -143,9 +144,9 @@ class Selection:
             return self._steadied(plain) or plain
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
-            best = self._steadied(self._better(self._try_or_none(smooth, plain), plain))
+            best = self._steadied(self._better(self._try_or_none(smooth, plain, coarse=True), plain))
         if best is None or self._left(best) > self._options.presliding_residual**2:
-            best = self._better(self._try_or_none(smooth), best)
+            best = self._better(self._try_or_none(smooth, coarse=True), best)
         if best is None:
             raise ConvergenceError("no friction model could be fitted: check the recording, or lower the torque")
         if self._left(best) > self._options.presliding_residual**2:
@@ -154,7 +155,20 @@ class Selection:
             if not self._is_explained(best):
                 best = self._better(self._with_ripple(near), best) or best
         best = self._steadied(best) or best
-        return best if self._left(best) < self._options.presliding_residual**2 else self._reshaped(best)
+        again = self._with_bristles(self._restarted(best))
+        return self._converged(best if again is best else self._steadied(again) or again)
+
+    def _with_bristles(self, best: Trial) -> Trial:
+        """Add presliding to a model that explains nearly everything, from where it is: a search would find no more."""
+        if best.estimate is None or "presliding" in best.model.options:
+            return best
+        richer = best.model.having("presliding")
+        for bend in self._options.initial_bends:
+            if self._is_explained(best):
+                break
+            values = {name: value for each in bristles(best.estimate, bend) for name, value in each.items()}
+            best = self._better(self._try_or_none(richer, best, values, coarse=True), best) or best
+        return best
 
     def _closest(self) -> list[Trial]:
         """Return the trials that explain most, with and without presliding, the best first.
@@ -215,17 +229,29 @@ class Selection:
         known = ripple_cycles(self._periods[0], best.estimate, self._options.ripple_cycles)
         for each in candidates(self._periods[0], best.estimate, known):
             if each.part == "ripple" and each.evidence > self._options.ripple_evidence:
-                return self._better(self._try_or_none(each.model, best, each.values), best) or best
+                return self._better(self._try_or_none(each.model, best, each.values, coarse=True), best) or best
         return best
 
-    def _reshaped(self, best: Trial) -> Trial:
-        """Refit the model from other widths of each joint's Coulomb step, since there are local minima."""
-        for joint in range(1, best.model.joints + 1):
-            for width in self._options.initial_widths:
-                name = f"coulomb_width_{joint}"
-                if best.estimate is None or self._is_explained(best) or name not in best.estimate.names:
-                    return best
-                best = self._better(self._try_or_none(best.model, best, {name: width}), best) or best
+    def _converged(self, trial: Trial) -> Trial:
+        """Return a fit with full precision: while models are compared, those that leave much do not get it."""
+        if not trial.coarse or self._is_explained(trial):
+            return trial
+        return self._better(self._try_or_none(trial.model, trial), trial) or trial
+
+    def _restarted(self, best: Trial) -> Trial:
+        """Refit the model from other initial guesses while it does not explain the motion of every joint."""
+        left = self._options.max_restarts
+        while best.estimate is not None:
+            for values in restarts(self.period, best.estimate, self._options):
+                left -= 1
+                again = self._better(self._try_or_none(best.model, best, values, coarse=True), best)
+                if left <= 0 or (again is not None and again is not best):
+                    break
+            else:
+                return best
+            best = again or best
+            if left <= 0:
+                break
         return best
 
     def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:

@@ -38,6 +38,8 @@ class Trial:
     score: float
     """RMS error of the free prediction in units of the noise; without a held-out motion, the equivalent criterion."""
     seconds: float
+    coarse: bool = False
+    """Whether the fit was stopped early if it left much of the motion unexplained."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ class Fitting:
         options = QUICK if coarse and "presliding" in model.options else THOROUGH
         estimate = identify(self.periods, model, starts=self.starts, near=place, coarse=coarse, options=options)
         relative, score = self._predicted(estimate)
-        return Trial(model, estimate, relative, score, time.perf_counter() - started)
+        return Trial(model, estimate, relative, score, time.perf_counter() - started, coarse)
 
     def _predicted(self, estimate: Estimate) -> tuple[Array | None, float]:
         other = self.held_out

@@ -53,7 +53,14 @@ def steps_per_sample(rate: float, longest: float = INTEGRATION.max_step) -> int:
     return math.ceil(1.0 / (rate * longest))
 
 
-def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tuple[Array, Array]:
+def simulate(
+    physics: Physics,
+    start: Array,
+    torque: Array,
+    step: float,
+    max_substeps: int = MAX_SUBSTEPS,
+    springs: tuple[Array, Array] | None = None,
+) -> tuple[Array, Array]:
     """Simulate as many samples as `torque` has.
 
     Args:
@@ -62,6 +69,9 @@ def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tupl
             the bristles [N m], by default that of sliding joints.
         torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
         step: length of a step [s].
+        max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.
+        springs: stiffness of additional springs (joints,) [N m/rad] and the angles to which they pull the joints, held
+            between samples (joints, samples) [rad].
 
     Returns:
         The angles at the samples (joints, samples) [rad] and the state after the last sample's steps (3, joints).
@@ -74,9 +84,16 @@ def simulate(physics: Physics, start: Array, torque: Array, step: float) -> tupl
     both = np.zeros((2, *torque.shape[1:]))
     both[:joints] = torque
     position = np.empty((2, samples))
-    pieces = finer_pieces(physics, step)
-    moving = without_dry_friction(physics.vector)
-    _simulate(physics.vector, has_bristles(physics), moving, state, both, step, pieces, position)
+    pieces = finer_pieces(physics, step, max_substeps)
+    vector = physics.vector.copy()
+    pulls = np.zeros((2, samples if springs is not None else 0))
+    if springs is not None:
+        # A spring is a cable, and an offset that changes from sample to sample.
+        stiffness, ends = springs
+        vector[CABLE : CABLE + joints] += stiffness
+        pulls[:joints] = stiffness[:, None] * ends
+    moving = without_dry_friction(vector)
+    _simulate(vector, has_bristles(physics), moving, state, both, pulls, step, pieces, position)
     return position[:joints], state[:, :joints]
 
 
@@ -212,14 +229,21 @@ def step_bent(
     return q1, q2, v1, v2, a1, a2
 
 
-def _loop(p: Any, bristly: bool, m: Any, state: Any, torque: Any, step: float, pieces: int, position: Any) -> None:
+# pulls: torques of the springs if the joints were at zero (2, samples) [N m], or (2, 0) without springs.
+def _loop(
+    p: Any, bristly: bool, m: Any, state: Any, torque: Any, pulls: Any, step: float, pieces: int, position: Any
+) -> None:
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
     b = state[2]
     a1 = a2 = 0.0
     piece = step / pieces
+    offset_1, offset_2 = p[OFFSET], p[OFFSET + 1]
     for k in range(position.shape[1]):
         position[0, k] = q1
         position[1, k] = q2
+        if pulls.shape[1] > 0:
+            p[OFFSET] = m[OFFSET] = offset_1 - pulls[0, k]
+            p[OFFSET + 1] = m[OFFSET + 1] = offset_2 - pulls[1, k]
         for s in range(torque.shape[2]):
             t1, t2 = torque[0, k, s], torque[1, k, s]
             left = pieces
@@ -235,4 +259,4 @@ def _loop(p: Any, bristly: bool, m: Any, state: Any, torque: Any, step: float, p
 bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
     inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
 )
-_simulate: Callable[[Array, bool, Array, Array, Array, float, int, Array], None] = compiled(_loop)
+_simulate: Callable[[Array, bool, Array, Array, Array, Array, float, int, Array], None] = compiled(_loop)

@@ -27,35 +27,50 @@ def without_errors(physics: Physics, reading: Array) -> Array:
     return position
 
 
+def slopes_without_errors(physics: Physics, position: Array) -> Array:
+    """Return the derivatives of `without_errors` by the joint's encoder errors (joints, samples, errors).
+
+    position: the resulting angles (joints, samples) [rad].
+    """
+    slopes: Array = -_waves(position) / _steepness(physics, position)[:, :, None]
+    return slopes
+
+
 def by_motion(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return those of the parameters `names` on which the motion itself depends."""
+    """Return those of the parameters `names` on which the motion depends where nothing pulls it to a reading."""
     return tuple(name for name in names if kind_of(name) not in ENCODER)
 
 
 def measured_and_slopes(
-    physics: Physics, names: tuple[str, ...], position: Array, derivative: Array
+    physics: Physics, names: tuple[str, ...], moving: tuple[str, ...], position: Array, derivative: Array
 ) -> tuple[Array, Array]:
     """Return the encoder readings (joints, samples) [rad] and their derivatives by `names`, then by the initial state.
 
     position: true angles (joints, samples) [rad]. derivative: derivatives of the true angles (joints, samples, causes)
-    by `by_motion(names)`, then by the initial state.
+    by `moving`, those of `names` on which the motion depends, then by the initial state.
     """
     wanted = [name for name in names if kind_of(name) in ENCODER]
     if not wanted and not physics.encoder.any():
         return position, derivative
-    joints = position.shape[0]
     waves = _waves(position)
-    sin_1, cos_1, sin_2, cos_2 = np.moveaxis(waves, 2, 0)
-    slopes = np.stack((cos_1, -sin_1, 2.0 * cos_2, -2.0 * sin_2), axis=2)
-    steeper = 1.0 + np.einsum("jc,jsc->js", physics.encoder[:joints], slopes)
-    moving = [i for i, name in enumerate(names) if kind_of(name) not in ENCODER]
+    places = [names.index(name) for name in moving]
     rest = derivative.shape[2] - len(moving)
     full = np.zeros((*derivative.shape[:2], len(names) + rest))
-    full[:, :, [*moving, *range(len(names), len(names) + rest)]] = derivative * steeper[:, :, None]
+    full[:, :, [*places, *range(len(names), len(names) + rest)]] = (
+        derivative * _steepness(physics, position)[:, :, None]
+    )
     for name in wanted:
         joint = (joint_of(name) or 1) - 1
-        full[joint, :, names.index(name)] = waves[joint, :, ENCODER.index(kind_of(name))]
+        full[joint, :, names.index(name)] += waves[joint, :, ENCODER.index(kind_of(name))]
     return measured(physics, position), full
+
+
+def _steepness(physics: Physics, position: Array) -> Array:
+    """Return the derivative of the readings by the true angles (joints, samples)."""
+    sin_1, cos_1, sin_2, cos_2 = np.moveaxis(_waves(position), 2, 0)
+    slopes = np.stack((cos_1, -sin_1, 2.0 * cos_2, -2.0 * sin_2), axis=2)
+    steepness: Array = 1.0 + np.einsum("jc,jsc->js", physics.encoder[: position.shape[0]], slopes)
+    return steepness
 
 
 def _waves(position: Array) -> Array:

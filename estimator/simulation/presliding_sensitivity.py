@@ -228,7 +228,8 @@ def _loop(
         for i in range(causes):
             derivative[0, k, i] = Z[i]
             derivative[1, k, i] = Z[WIDE + i]
-        spring[1, 0], spring[1, 1] = ends[0, k], ends[1, k]
+        for row in range(ends.shape[2]):
+            spring[1 + row, 0], spring[1 + row, 1] = ends[0, k, row], ends[1, k, row]
         for s in range(torque.shape[2]):
             t1, t2 = torque[0, k, s], torque[1, k, s]
             for cause in range(2):

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled
-from hil.estimator.models.parameters import CONSTANTS, Physics
+from hil.estimator.models.parameters import CONSTANTS, ENCODER, Physics
 from hil.estimator.simulation.arm import (
     ASYMMETRY,
     CABLE,
@@ -51,9 +51,13 @@ from hil.estimator.simulation.arm import (
     pieces_now,
 )
 
-# Quantities by which one can differentiate: the constants, the drive's times, the state at the first sample.
-CAUSES = (*CONSTANTS, "delay", "lag", "lag_difference_2", "position_1", "position_2", "velocity_1", "velocity_2")
-DELAY, LAG_DIFFERENCE, STATE = len(CONSTANTS), len(CONSTANTS) + 2, len(CONSTANTS) + 3
+# Quantities by which one can differentiate: the constants, the drive's times, encoder errors that move the ends of the
+# springs, the state at the first sample.
+TRACKED = tuple(f"{name}_{joint}" for name in ENCODER for joint in (1, 2))
+STATES = ("position_1", "position_2", "velocity_1", "velocity_2")
+CAUSES = (*CONSTANTS, "delay", "lag", "lag_difference_2", *TRACKED, *STATES)
+DELAY, LAG_DIFFERENCE, END = len(CONSTANTS), len(CONSTANTS) + 2, len(CONSTANTS) + 3
+STATE = END + len(TRACKED)
 COUPLING, GRAVITY_1, GRAVITY_2 = map(CONSTANTS.index, ("coupling", "gravity_1", "gravity_2"))
 ZERO_1, ZERO_2 = ZERO, ZERO + 1
 
@@ -105,19 +109,22 @@ class Sensitive:
         # The mass matrix, m11, m12 and m22, is linear in the inertias.
         for row, inertia in ((4, 0), (4, 2), (5, 2), (6, 2), (6, 3)):
             rows[:, row, self._places[inertia]] = 1.0
-        spring = np.zeros((2, 2))
+        spring = np.zeros((2 + len(ENCODER), 2))
         spring[0, : self._joints] = 0.0 if tracking_stiffness is None else tracking_stiffness
         self._room = (rows.reshape(-1), np.zeros(2 * NUMBERS), *np.zeros((4, 2, 2)), spring, self._places)
         self._z = z.reshape(-1)
         self._turn = np.zeros(1, dtype=np.int64)
 
-    def advance(self, torque: Array, torque_slopes: Array, tracked: Array | None = None) -> tuple[Array, Array]:
+    def advance(
+        self, torque: Array, torque_slopes: Array, tracked: Array | None = None, tracked_slopes: Array | None = None
+    ) -> tuple[Array, Array]:
         """Simulate as many samples as `torque` has.
 
         Args:
             torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
             torque_slopes: its derivatives by delay and by each joint's lag (2, joints, samples, steps) [N m/s].
             tracked: angles to which the springs pull, held between samples (joints, samples) [rad].
+            tracked_slopes: its derivatives by the encoder errors of the same joint (joints, samples, errors).
 
         Returns:
             The angles (joints, samples) [rad] and their derivatives (joints, samples, causes).
@@ -127,8 +134,9 @@ class Sensitive:
         both[:joints] = torque
         slopes = np.zeros((2, 2, samples, steps))
         slopes[:, :joints] = torque_slopes
-        ends = np.zeros((2, samples))
-        ends[:joints] = 0.0 if tracked is None else tracked
+        ends = np.zeros((2, samples, 1 + len(ENCODER)))
+        ends[:joints, :, 0] = 0.0 if tracked is None else tracked
+        ends[:joints, :, 1:] = 0.0 if tracked_slopes is None else tracked_slopes
         position = np.empty((2, samples))
         derivative = np.empty((2, samples, self._count))
         self._go_on(
@@ -147,7 +155,7 @@ class Sensitive:
 #   here           angles and velocities at which the stage is evaluated (2, joints)
 #   left, slope    torques available for acceleration and slopes of friction (stages, joints)
 #   dt             derivatives of the motor torques by delay and lag (causes, joints)
-#   spring         stiffness and target angle of the springs (2, joints)
+#   spring         stiffness and target angle of the springs, and the target's derivatives by encoder errors
 #   at             the column of each cause
 def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:  # noqa: PLR0915 a call costs time
     """Compute the torque of a drive minus friction and the slope of friction, with all derivatives, into `room`."""
@@ -239,6 +247,10 @@ def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple
     f1_q2, f2_q2 = fall_12 + across * whirl, fall_12 - across * v1 * v1
     for joint in range(2):
         left[stage, joint] += spring[0, joint] * (spring[1, joint] - here[0, joint])
+        if spring[0, joint] != 0.0:
+            f = (2 * now + stage) * STAGE + joint * WIDE
+            for error in range(spring.shape[0] - 2):
+                rows[f + at[END + 2 * error + joint]] = spring[0, joint] * spring[2 + error, joint]
     left[stage, 0] += turning * whirl - p[GRAVITY_1] * cos_1 - p[GRAVITY_2] * cos_12
     left[stage, 1] -= turning * v1 * v1 + p[GRAVITY_2] * cos_12
     f1 = (2 * now + stage) * STAGE
@@ -390,7 +402,8 @@ def _loop(
     piece = step / pieces
     for k in range(position.shape[1]):
         position[0, k], position[1, k] = x[0, 0], x[0, 1]
-        spring[1, 0], spring[1, 1] = ends[0, k], ends[1, k]
+        for row in range(ends.shape[2]):
+            spring[1 + row, 0], spring[1 + row, 1] = ends[0, k, row], ends[1, k, row]
         written = False
         for s in range(torque.shape[2]):
             t1, t2 = torque[0, k, s], torque[1, k, s]

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.clearance.kept import known_shapes
 from hil.clearance.kernel import BOXES, FLOOR, all_distances, least_room
-from hil.clearance.shapes import Shapes, shapes_of
+from hil.clearance.shapes import Shapes
 from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.description.arm import ArmDescription
@@ -117,6 +118,17 @@ class Space:
         return self._arrays[3][:3], float(self._arrays[3][3])
 
     @property
+    def chain(self) -> tuple[Array, Array, Array]:
+        """Each joint's rotation (joints, 3, 3), translation [m] and axis (joints, 3) in the frame before it."""
+        return self._chain
+
+    @property
+    def boxes(self) -> Array:
+        """Obstacles in the base frame (boxes, 5, 3): rotation matrix, centre and half of the size [m]."""
+        found: Array = self._arrays[4][: len(self.obstacles)]
+        return found
+
+    @property
     def links(self) -> NDArray[np.int64]:
         """Index of the link each capsule belongs to (capsules,); 0 is the base."""
         return self._arrays[0]
@@ -164,7 +176,7 @@ class _Key:
 @lru_cache(maxsize=8)
 def _space(key: _Key) -> Space:
     config, arm, wanted = key.config, key.arm, key.config.clearance
-    shapes = shapes_of(arm)
+    shapes = known_shapes(arm)
     link = np.array([capsule.link for capsule in shapes.capsules], dtype=np.int64)
     upright = rotation_of(*config.arm.base)
     floor = np.array([*upright[2], wanted.floor if isinstance(wanted.floor, float) else -np.inf])

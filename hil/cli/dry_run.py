@@ -15,7 +15,10 @@ def dry_run(
         Path | None, typer.Option("--result", metavar="RUN", help="Earlier run whose result replaces the prior.")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="Also save a plot: .png or .svg.")
+        Path | None,
+        typer.Option(
+            "--picture", metavar="FILE", help="Also save a plot (.png, .svg) or a page with the moving arm (.html)."
+        ),
     ] = None,
     arms: Annotated[int, typer.Option("--arms", min=20, max=5000, help="Number of arms to simulate.")] = 128,
     servos: Annotated[
@@ -31,14 +34,17 @@ def dry_run(
     from hil.dry_run.summary import print_dry_run
     from hil.next_step import next_step
     from hil.printing import result_console
+    from hil.report.dry_run_page import write_dry_run_page
 
     if picture is not None and not picture.absolute().parent.is_dir():
         raise typer.BadParameter(f"--picture {picture}: the folder {picture.parent} does not exist. Create it first.")
-    if picture is not None and picture.suffix not in (".png", ".svg"):
-        raise typer.BadParameter(f"--picture {picture}: its name must end in .png or .svg.")
+    if picture is not None and picture.suffix not in (".png", ".svg", ".html"):
+        raise typer.BadParameter(f"--picture {picture}: its name must end in .png, .svg or .html.")
     with Terminal(quiet=json_only).following(config) as follow:
         rehearsal = simulate(config, result=result, arms=arms, servos=servos, on_progress=follow)
-    if picture is not None:
+    if picture is not None and picture.suffix == ".html":
+        write_dry_run_page(rehearsal.config, rehearsal.found, picture)
+    elif picture is not None:
         draw(rehearsal.config, rehearsal.prediction, picture)
     if json_only:
         print(strict_json.dumps(rehearsal.to_json()))

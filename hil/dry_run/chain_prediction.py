@@ -35,7 +35,7 @@ class ChainPrediction:
 
     peaks: as for a planar arm. nearest: least clearance of all arms, at `moment` [s] of the segment `role`. rooms: each
     arm's least clearance minus the required one (arms,) [m]. tracking: median of the arms' largest tracking errors
-    (joints,) [rad].
+    (joints,) [rad]. ways: number of samples of the transition at either end of the first segment.
     """
 
     peaks: Prediction
@@ -44,6 +44,7 @@ class ChainPrediction:
     moment: float
     rooms: Array
     tracking: Array
+    ways: int
 
     @property
     def is_clear(self) -> bool:
@@ -103,7 +104,7 @@ def predict_chain(
         rest,
         plan.rate,
     )
-    return ChainPrediction(prediction, *worst[1:], rooms, np.median(tracking, axis=0))
+    return ChainPrediction(prediction, *worst[1:], rooms, np.median(tracking, axis=0), plan.segments[0].ramp_samples)
 
 
 def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:

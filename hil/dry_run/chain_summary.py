@@ -110,7 +110,7 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
 def print_chain_dry_run(run: ChainDryRun, console: Console) -> None:
     """Print the table and the verdict."""
     print_fitting(console, _table(run))
-    for line in (*run.servos, *_lines(run)):
+    for line in (*run.servos, *chain_dry_run_lines(run)):
         say(console, line)
 
 
@@ -133,7 +133,8 @@ def _table(run: ChainDryRun) -> Table:
     return table
 
 
-def _lines(run: ChainDryRun) -> list[str]:
+def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
+    """Explain the result in sentences, the verdict last."""
     fall, lowering, why = run.stops.fall, run.stops.lowering, unsafe(run.config, run.foreseen)
     hit = "nothing within 1.5 s" if fall.hits is None else f"{fall.hits[0]} hits {fall.hits[1]}"
     lines = [

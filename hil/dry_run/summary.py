@@ -65,7 +65,7 @@ def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
     """Print the table and the verdict."""
     shown = run.largest.prediction if run.asked is None else run.asked
     print_fitting(console, _table(config, shown, run))
-    for line in (*run.servos, *_lines(config, shown, run)):
+    for line in (*run.servos, *dry_run_lines(config, shown, run)):
         say(console, line)
 
 
@@ -121,7 +121,8 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
     return table
 
 
-def _lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
+def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
+    """Explain the result in sentences, the verdict last."""
     torque = ", ".join(f"{value:.2f}" for value in run.largest.peak_torque)
     planned, passed = run.stopping.planned, run.stopping.passed
     stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])

@@ -95,7 +95,8 @@ class Consistency:
         self._sum_moved += moved
         self._sum_difference += difference
         self._sum_unknown += unknown
-        self._most_curved = max(self._most_curved, curved)
+        if curved > self._most_curved:
+            self._most_curved = curved
         if self._sum_seconds < LONG_EVERY_S:
             return False
         long = self._long
@@ -174,4 +175,7 @@ class _Memory:
         """Whether position and velocity disagree, given the largest accepted lag [s] and scale error."""
         of_lag = lag * (velocity - self.mean)
         allowed = self._unsure + scale * abs(self.far) + self._curved + self._unknown + _LAG_SHARE * lag * self.span
-        return self.apart > allowed + max(of_lag, 0.0) or self.apart < min(of_lag, 0.0) - allowed
+        apart = self.apart
+        if of_lag > 0.0:
+            return apart > allowed + of_lag or apart < -allowed
+        return apart > allowed or apart < of_lag - allowed

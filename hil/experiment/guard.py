@@ -90,14 +90,15 @@ class Guard:
         count = len(config.joints)
         self._safety = safety
         self._commands = CommandLimits(config)
-        self._work = Work(config) if config.stabiliser is None else None
+        planned = planned or _planned(config)
+        self._work = Work(config, planned) if config.stabiliser is None else None
         self._interval = 1.0 / rate if interval is None else interval
         self._silence = Silence(config, self._interval, patience)
         self._patience = patience or float("inf")
         self._deadlines = Deadlines(config)
         self._following = [
             None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
-            for joint, peak in zip(config.joints, planned or _planned(config), strict=True)
+            for joint, peak in zip(config.joints, planned, strict=True)
         ]
         self._apart = Apart()
         self._consistency = [Consistency() for _ in config.joints]
@@ -134,20 +135,22 @@ class Guard:
         """
         now = state.time_before_write
         took = state.time_after_read - now
-        self._deadlines.check_gap(max(watchdog_gap, took))
+        self._deadlines.check_gap(watchdog_gap if watchdog_gap > took else took)
         self._silence.ask(now)
         self._silence.woke_up(now, took - self._patience)
-        self._shortest = shortest = min(self._shortest, took)
-        self._unsure = took - shortest
+        if took < self._shortest:
+            self._shortest = took
+        self._unsure = took - self._shortest
         if not between:
             self._deadlines.met()
+        missing, error = state.missing, state.error
         for index, limits in enumerate(self._limits):
-            if state.error[index] & ALERT:
+            if error[index] & ALERT:
                 self._stop(
                     index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
                 )
-            if state.missing[index]:
-                self._count_missing(index, state.error[index], now, alone=not all(state.missing))
+            if missing[index]:
+                self._count_missing(index, error[index], now, alone=not all(missing))
             else:
                 self._look_at_joint(index, limits, state, now)
         if state.apart is not None and (turned := self._apart.look(state.apart)) is not None:
@@ -169,7 +172,10 @@ class Guard:
         interval = self._interval
         elapsed = now - self._seen_at[index]
         # A punctual sample after a late one still represents a whole interval.
-        seconds = max(elapsed, interval * (1 + self._missing[index]))
+        missed = self._missing[index]
+        seconds = interval * (1 + missed)
+        if elapsed > seconds:
+            seconds = elapsed
         former = self._position[index]
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
@@ -181,7 +187,6 @@ class Guard:
             self._too_fast(index, velocity)
         self._position[index] = position
         self._seen_at[index] = now
-        missed = self._missing[index]
         self._silence.heard(index, now)
         following = self._following[index]
         if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:

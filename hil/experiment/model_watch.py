@@ -72,18 +72,21 @@ class ModelWatch:
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
-        if any(state.missing):
+        if True in state.missing:
             return
         goal, self._goal = self._goal, state.goal_current
-        seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
+        now = state.time_before_write
+        seconds, self._seen_at = now - self._seen_at, now
         # During a long exchange the time of the measurement is unknown, so the motion up to it is not judged.
-        took = state.time_after_read - state.time_before_write
-        self._shortest = min(self._shortest, took)
+        took = state.time_after_read - now
+        if took < self._shortest:
+            self._shortest = took
         if goal is None or took - self._shortest > self._long:
             goal, seconds = state.goal_current, float("inf")
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
-        follows = self._follows
-        torque = self._felt = [felt + follows * (now - felt) for felt, now in zip(self._felt, torque, strict=True)]
+        if self._follows < 1.0:
+            follows = self._follows
+            torque = self._felt = [felt + follows * (now - felt) for felt, now in zip(self._felt, torque, strict=True)]
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint < 0:
             self._stands_for = 0.0

@@ -55,8 +55,10 @@ class Repetition:
                 self._unlike_for[joint] = (
                     self._unlike_for[joint] + 1 if abs(latest - former[index]) > self._allowed[joint] else 0
                 )
-                sums.lowest = min(sums.lowest, latest)
-                sums.highest = max(sums.highest, latest)
+                if latest < sums.lowest:
+                    sums.lowest = latest
+                if latest > sums.highest:
+                    sums.highest = latest
                 if compared:
                     sums.add(_EMPTY if self._anew else former[index], latest)
             former[index] = latest
@@ -64,10 +66,8 @@ class Repetition:
     @property
     def unlike(self) -> int | None:
         """Index of a joint that does not repeat the motion of the period before, or None."""
-        for joint, count in enumerate(self._unlike_for):
-            if count >= self._lasting:
-                return joint
-        return None
+        longest = max(self._unlike_for)
+        return self._unlike_for.index(longest) if longest >= self._lasting else None
 
     @property
     def moved(self) -> list[float]:

@@ -8,6 +8,7 @@ ones match, the remaining periods to be recorded, and a ramp out; then no curren
 of a stop allows it, the arm is braked before `run` raises; the caller that switched torque on switches it off.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
+from hil.estimator.data.periodicity import periods_of_drift
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.lowering import Lowering, may_lower
@@ -31,7 +33,7 @@ from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
-from hil.plan.stabiliser import Stabiliser
+from hil.plan.stabiliser import Stabiliser, must_balance
 from hil.runs.recording import Phase, Recorder, missed
 from hil.setup.servo_session import has_moved
 
@@ -145,6 +147,8 @@ class Stream:
             self._note(f"{segment.role}: ramp out")
             self._play(self._ramps[number][1], Phase.RAMP_OUT)
         self._come_to_rest()
+        if self._stabiliser is not None and must_balance(self._config):
+            self._balance(self._stabiliser)
 
     def _rest(self) -> None:
         self._note("rest")
@@ -175,9 +179,11 @@ class Stream:
         repetition = self._repetition
         self._play_period(segment, 0)
         self._check_motion(repetition.moved)
+        differences = []
         for period in range(1, self._plan.max_settling_periods + 1):
             self._play_period(segment, period)
             difference = repetition.difference
+            differences.append(difference)
             if difference <= self._plan.settle_within:
                 self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
                 for further in range(1, self._plan.periods):
@@ -189,8 +195,19 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. Check for play, a "
-            "dragging cable or a slipping joint; or raise max_settling_periods."
+            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. "
+            + self._advice(differences, samples)
+        )
+
+    def _advice(self, differences: Sequence[float], samples: int) -> str:
+        """What to do about periods of `samples` samples that differ from each other by `differences`."""
+        further = periods_of_drift(differences, self._plan.settle_within)
+        if further is None:
+            return "Check for play, a dragging cable or a slipping joint; or raise max_settling_periods."
+        seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
+        return (
+            f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "
+            f"while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
@@ -231,6 +248,18 @@ class Stream:
         told = ", ".join(f"{speed:.2f}" for speed in fastest)
         self._note(f"still moving at {told} rad/s after {self._safety.rest_time:g} s without current")
 
+    def _balance(self, stabiliser: Stabiliser) -> None:
+        """Bring an upright arm as close to balance as friction allows, or it falls over when torque is cut."""
+        window = rest_window(self._plan.rate)
+        state = self._play(self._silence(window), Phase.COMING_TO_REST)
+        stabiliser.balance()
+        for _ in range(window, self._plan.end_samples, window):
+            if stabiliser.is_balanced(self._config, state) and not self._moving(state):
+                self._note("balanced")
+                return
+            state = self._play(self._silence(window), Phase.COMING_TO_REST)
+        self._note("not balanced: without torque, friction may not hold the arm upright")
+
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
         """Send goal currents (samples, joints) [A], one row per tick; return the last state."""
         state = missed(self._goal, self._clock.now())
@@ -239,9 +268,10 @@ class Stream:
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
-        for state in self._between_samples():
-            self._look(state, phase, between=True)
-            self._stop.check()
+        if self._turns > 1:
+            for state in self._between_samples():
+                self._look(state, phase, between=True)
+                self._stop.check()
         self._deadline, now, late = self._ticks.wait()
         self._guard.woke_up(now, now - max(self._deadline, self._awake_at))
         self._awake_at = now

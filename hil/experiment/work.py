@@ -4,21 +4,26 @@ It is checked only without a stabiliser: such an arm starts at a stable rest pos
 put in, so a motor that continually takes work out of it turns the wrong way.
 """
 
+from collections.abc import Sequence
+
 from hil.config.schema import Config
 
-TOLERANCE_RAD = 0.03
-"""Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest torque."""
+TOLERANCE_RAD = 0.04
+"""Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest planned torque.
+
+A healthy motor returns some because of delays: a heavy arm at 20 Hz up to 0.02 rad.
+"""
 
 _OF_OTHERS = 0.5
 """Share of the work put in by the other joints' motors that may come out at this joint."""
 
 
 class Work:
-    """Sums the work of each joint's motor."""
+    """Sums the work of each joint's motor. planned: largest planned goal of each joint [A, or V under PWM]."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, planned: Sequence[float]) -> None:
         self._scales = [joint.torque_per_goal for joint in config.joints]
-        self._least = [-TOLERANCE_RAD * joint.goal_limit * joint.torque_per_goal for joint in config.joints]
+        self._least = [-TOLERANCE_RAD * goal * scale for goal, scale in zip(planned, self._scales, strict=True)]
         self._done = [0.0] * len(config.joints)
         self._held = [0.0] * len(config.joints)
 

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from hil import strict_json
 from hil.arm_model import ArmModel
+from hil.config.schema import Config
 from hil.errors import RunFolderError
 from hil.model_file import model_of, read_usable_result
 from hil.results.result import Result
+from hil.runs.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,6 @@ class Recorded:
     def open(cls, run: Path) -> "Recorded":
         """Read a run folder; raises RunFolderError, and ResultError for a damaged result."""
         from hil.runs.recording_folder import is_recording_folder
-        from hil.runs.run_folder import RunFolder
 
         if is_recording_folder(run):
             raise RunFolderError(
@@ -69,6 +70,11 @@ class Recorded:
         from hil.runs.recording import load_samples
 
         return load_samples(self.run / "samples.npy", len(self.joints))
+
+    @cached_property
+    def config(self) -> Config:
+        """The configuration of the run. Raises RunFolderError, ConfigError."""
+        return RunFolder.open(self.run).load_config()
 
     @cached_property
     def started(self) -> float:

@@ -108,10 +108,13 @@ class Belief:
         """Raise the dry friction of arms whose joints move although the real ones stood `still` (joints,)."""
         belief = self
         places = [self.names.index(f"coulomb_{joint + 1}") for joint in np.flatnonzero(still)]
+        count = len(self.coordinates)
+        moving = np.arange(count)
         for _ in range(_MOST_RAISES if places else 0):
-            motions = belief._motions(config, seen)[:, still]
-            moves = np.ptp(motions, axis=2) > _STILL
-            if not moves.any():
+            moves = np.zeros((count, len(places)), dtype=np.bool_)
+            moves[moving] = np.ptp(belief._motions(config, seen, moving)[:, still], axis=2) > _STILL
+            moving = np.flatnonzero(moves.any(axis=1))
+            if not moving.size:
                 break
             x = belief.coordinates.copy()
             x[:, places] += np.where(moves, random.uniform(*_RAISE, moves.shape), 0.0)
@@ -136,12 +139,15 @@ class Belief:
         left = np.mean((foreseen(belief) - measured) ** 2, axis=1)
         return belief._without_strays(left, random)
 
-    def _motions(self, config: Config, seen: Seen) -> Array:
-        """Motion of every arm under the recorded commands (arms, joints, samples) [rad]."""
-        ensemble = replace(self, learned=0).ensemble()
+    def _motions(self, config: Config, seen: Seen, arms: NDArray[np.int64] | None = None) -> Array:
+        """Motion of the arms with these indices, by default all, under the recorded commands (arms, joints, samples)
+        [rad].
+        """
+        coordinates = self.coordinates if arms is None else self.coordinates[arms]
+        ensemble = replace(self, learned=0, coordinates=coordinates).ensemble()
         poses = np.tile(seen.pose, (ensemble.size, 1))
-        arms = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback_of(config))
-        return arms.positions(seen.command, config.experiment.rate)
+        many = ManyArms(ensemble.physics, ensemble.torque_scale, poses, feedback_of(config))
+        return many.positions(seen.command, config.experiment.rate)
 
     def _moved(self, foreseen: Array, measured: Array, inflation: float, random: np.random.Generator) -> "Belief":
         """One smoother update with measurement errors scaled by sqrt(inflation)."""

@@ -6,6 +6,10 @@ import numpy as np
 
 from hil.report.chart import Matrix
 
+LARGE = 30
+"""Number of labels above which a matrix is drawn without its faint cells, which would be most of the page."""
+FAINT = 0.1
+
 
 def draw_matrix(matrix: Matrix, width: float, font: str) -> str:
     """Draw one `<svg>` element; width in px."""
@@ -23,7 +27,8 @@ def draw_matrix(matrix: Matrix, width: float, font: str) -> str:
         at = left + cell * (row + 0.5) + 0.35 * size
         turned = f'transform="rotate(-90 {at:.1f} {top - 5:.1f})"'
         parts.append(f'<text x="{at:.1f}" y="{top - 5:.1f}" {turned}>{escape(name)}</text>')
-        parts += [_cell(matrix, row, column, left, top, cell) for column in range(count)]
+        shown = [column for column in range(count) if count <= LARGE or not abs(matrix.values[row, column]) < FAINT]
+        parts += [_cell(matrix, row, column, left, top, cell) for column in shown]
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" class="{"wide" if width > 500 else "narrow"} matrix" '
         f'viewBox="0 0 {width:g} {height:.1f}" role="img" aria-label="{escape(matrix.title, quote=True)}" '

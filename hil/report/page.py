@@ -1,7 +1,9 @@
 """The report page: all sections, rendered by one template into a single self-contained file."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
@@ -10,7 +12,7 @@ from markupsafe import Markup
 
 from hil import __version__
 from hil.errors import RunFolderError
-from hil.report.chart import Figure
+from hil.report.chart import Chart, Figure
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.sections.correlation import correlation
@@ -28,6 +30,10 @@ from hil.report.sections.verdict import verdict
 from hil.report.svg import NARROW, WIDE, draw_svg
 
 FILE_NAME = "report.html"
+MOST_POINTS = 70_000
+"""Number of points of all curves of a page together, in the wide drawing; twice what a planar arm's page has."""
+FEWEST_POINTS = 600
+SCRIPTS = ("page.js", "spatial.js")
 SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     verdict,
     parameters,
@@ -65,20 +71,21 @@ def make_page(data: RunData) -> str:
     return render(Path(data.record.config).stem, data.record.started, sections(data))
 
 
-def render(title: str, started: str, shown: Sequence[Section]) -> str:
-    """The HTML document of these sections. started: ISO 8601."""
+def render(title: str, started: str, shown: Sequence[Section], kind: str = "Identified arm") -> str:
+    """The HTML document of these sections. started: ISO 8601. kind: what the page shows."""
     folder = files("hil.report")
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(folder.joinpath("page.html.j2").read_text(encoding="utf-8"))
     return template.render(
         title=title,
+        kind=kind,
         started=datetime.fromisoformat(started).strftime("%Y-%m-%d %H:%M"),
         version=__version__,
         sections=shown,
         style=Markup(folder.joinpath("page.css").read_text(encoding="utf-8")),
-        script=Markup(folder.joinpath("page.js").read_text(encoding="utf-8")),
-        draw=_draw,
+        script=Markup("".join(folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)),
+        draw=partial(_draw, share=_share_of_points(shown)),
     )
 
 
@@ -87,6 +94,14 @@ def sections(data: RunData) -> list[Section]:
     return [section for make in SECTIONS if (section := make(data)) is not None]
 
 
-def _draw(figure: Figure) -> Markup:
+def _share_of_points(shown: Sequence[Section]) -> float:
+    """Fraction of the points that each curve may have, so that a page with many joints stays small."""
+    charts = [picture.figure for section in shown for picture in section.pictures if isinstance(picture.figure, Chart)]
+    wanted = sum(min(len(series.x), WIDE.points) for chart in charts for series in chart.series)
+    return min(1.0, MOST_POINTS / max(1, wanted))
+
+
+def _draw(figure: Figure, share: float) -> Markup:
     """Draw both widths; the style sheet shows the one that fits."""
-    return Markup(draw_svg(figure, WIDE) + draw_svg(figure, NARROW))
+    sizes = (replace(size, points=max(FEWEST_POINTS, int(share * size.points))) for size in (WIDE, NARROW))
+    return Markup("".join(draw_svg(figure, size) for size in sizes))

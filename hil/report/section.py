@@ -1,6 +1,7 @@
 """The parts of a report section."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from hil.report.chart import Figure
 
@@ -40,13 +41,22 @@ class Folded:
 class Motion:
     """A planar arm to be played. interval: between frames [s]; angles: of each joint, frame by frame [rad].
 
-    lengths: of the links, in any unit; hangs: whether gravity acts in the plane, downwards.
+    lengths: of the links, in any unit; hangs: whether gravity acts in the plane, downwards; caption: what is shown.
     """
 
     interval: float
     angles: tuple[tuple[float, ...], ...]
     lengths: tuple[float, ...]
     hangs: bool
+    caption: str = "The arm in the fitted period, as measured"
+
+
+@dataclass(frozen=True)
+class SpatialMotion:
+    """A spatial arm to be played and turned. caption: what is shown; scene: data of the page's script (JSON types)."""
+
+    caption: str
+    scene: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -61,4 +71,4 @@ class Section:
     folded: tuple[Folded, ...] = ()
     bullets: tuple[str, ...] = field(default=())
     tone: str = ""
-    motion: Motion | None = None
+    motion: Motion | SpatialMotion | None = None

@@ -88,10 +88,10 @@ def _path(series: Series, x: Scale, y: Scale, points: int) -> str:
     if series.low is not None:
         both = np.concatenate((series.y, series.low[::-1]))
         return _polyline(x.pixels(np.concatenate((series.x, series.x[::-1]))), y.pixels(both)) + "Z"
-    if series.kind in ("points", "dots"):
-        places = zip(x.pixels(series.x).tolist(), y.pixels(series.y).tolist(), strict=True)
-        return "".join(f"M{across:.2f},{up:.2f}h0" for across, up in places if np.isfinite(up))
     kept_x, kept_y = thin(series.x, series.y, points)
+    if series.kind in ("points", "dots"):
+        places = zip(x.pixels(kept_x).tolist(), y.pixels(kept_y).tolist(), strict=True)
+        return "".join(f"M{across:.2f},{up:.2f}h0" for across, up in places if np.isfinite(up))
     return _polyline(x.pixels(kept_x), y.pixels(kept_y))
 
 

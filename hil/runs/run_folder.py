@@ -28,6 +28,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from hil import __version__, strict_json
+from hil.clearance.kept import keep_shapes
+from hil.config.chain import described_arm
 from hil.config.experiment import ExperimentConfig
 from hil.config.schema import Config, StabiliserConfig, parse_config
 from hil.errors import RunFolderError
@@ -99,7 +101,7 @@ _OF_A_START = frozenset(
         "servo_settings.json",
     }
 )
-_DESCRIPTIONS = (".urdf", ".xml")
+_DESCRIPTIONS = (".urdf", ".xml", ".shapes.json")
 
 
 class RunFolder:
@@ -119,6 +121,8 @@ class RunFolder:
             run.config_path.write_bytes(config.path.read_bytes())
             for urdf in _urdfs(config):
                 (path / urdf.name).write_bytes(urdf.read_bytes())
+            if config.is_chain:
+                keep_shapes(described_arm(config), path)
         except OSError as error:
             raise RunFolderError(f"Run folder {path} cannot be written: {error.strerror}.") from error
         return run
@@ -129,7 +133,7 @@ class RunFolder:
         The same --out can then be used again. A folder with a sample, a result or a foreign file is kept.
         """
         files = [path for path in self.path.rglob("*") if path.is_file()]
-        if any(path.name not in _OF_A_START and path.suffix not in _DESCRIPTIONS for path in files):
+        if any(path.name not in _OF_A_START and not path.name.endswith(_DESCRIPTIONS) for path in files):
             return False
         if any(path.name == "samples.npy" and _has_samples(path) for path in files):
             return False

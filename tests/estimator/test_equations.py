@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hil.estimator.data.fourier import cut_off, held_lines, lines_of, motion_of
-from hil.estimator.data.periodicity import period_difference
+from hil.estimator.data.periodicity import period_difference, periods_of_drift
 from hil.estimator.errors import ModelError, ShapeError
 from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
 from hil.estimator.models.model import Model
@@ -160,3 +160,12 @@ def test_a_joint_that_never_answered_is_not_settled() -> None:
     periods = np.ones((2, 2, 50))
     periods[1, 1] = np.nan
     assert period_difference(periods).relative.tolist() == [[0.0, np.inf]]
+
+
+def test_a_slow_drift_is_told_from_a_transient_and_from_play() -> None:
+    slow = [0.2, *(0.05 * 0.8**n for n in range(5))]
+    further = periods_of_drift(slow, 0.01)
+    assert further is not None and slow[-1] * 0.8**further <= 0.01 < slow[-1] * 0.8 ** (further - 1)
+    transient, play, steady = [0.2, 0.02, 0.002, 0.0002], [0.2, 0.03, 0.05, 0.02, 0.04], [0.2, 0.05, 0.05, 0.05]
+    for others in (transient, play, steady, slow[:2], [0.2, np.inf, 0.05]):
+        assert periods_of_drift(others, 1e-5) is None

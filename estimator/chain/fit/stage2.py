@@ -79,8 +79,8 @@ class ChainOptions:
 DEFAULTS = ChainOptions()
 REPEATED = 4  # equal readings in a row that still count in full: a moving joint gives as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
-LAST = MinimiserOptions(max_damping=10.0)
-"""Options of the last iterations.
+NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
+"""Options of the last iterations with coarse steps, which fine ones follow, and with fine steps.
 
 Where a joint is on the verge of sticking, the sum of squares has small steps. A decrease that is only achieved with
 heavy damping is such a step and is not pursued.
@@ -123,22 +123,29 @@ def fit_periods(
     Raises ConvergenceError.
     """
     problem, x = _problem(periods, model, linear, prior, options)
-    coarse = replace(problem, steps=_steps(periods, options.coarse_step))
+    # Undivided steps cannot resolve friction near standstill: its shape, fitted to them, would end up far away in a
+    # curved valley, along which the later fits progress slowly.
+    coarse = replace(problem, steps=_steps(periods, options.coarse_step), reach=0.0)
     x = _towards_prior(coarse, x, options)
     soft, softness, spent = _softened(coarse, x, options)
-    sticking = replace(coarse, softness=softness, finer=options.finer)
+    sticking = replace(coarse, softness=softness, finer=options.finer, reach=1.0)
     near = sticking.minimise(soft, options.ftol_near)
     positions = sticking.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
     weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
     weights = tuple((weight * _repeated(each)).T for weight, each in zip(weights, periods, strict=True))
-    nearer = replace(sticking, weights=weights, reach=options.reach).minimise(near.x, options.ftol_nearer)
+    nearer = replace(sticking, weights=weights, reach=options.reach).minimise(
+        near.x, options.ftol_nearer, options=NEARER
+    )
     last = replace(sticking, weights=weights, steps=problem.steps, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
     # Damping holds back poorly determined coordinates, so it is removed now. Without it from the beginning, many
     # coordinates would reach their step limits and hold up the others.
-    minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
-    spent += near.iterations + nearer.iterations + damped.iterations + minimum.iterations
+    minimum = damped
+    if not damped.stalled:
+        minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
+        spent += minimum.iterations
+    spent += near.iterations + nearer.iterations + damped.iterations
     return _fit(last, minimum, outliers, COVARIANCE, spent)
 
 
@@ -156,7 +163,7 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
         every = 1 if last or coarse.steps > 1 else skip
         trial = replace(coarse, softness=frequency, every=every)
         try:
-            found = trial.minimise(x, options.ftol_near if last else options.ftol_coarse)
+            found = trial.minimise(x, options.ftol_coarse)
         except ConvergenceError:
             if cost is None:
                 raise

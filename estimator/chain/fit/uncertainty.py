@@ -5,8 +5,9 @@ of the motion, which determine the parameters. The noise that remains there is e
 f the fit absorbs the fraction h(f) of the noise, the leverage of its Jacobian, so the power of the residual is that of
 the noise times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for model errors,
 which are slow, it is far above that of white noise. Since short recordings have few degrees of freedom, each level is
-shrunk towards the mean level of all joints, and that towards white noise. Where the fit absorbs nearly all noise, as at
-frequency zero, the level cannot be estimated and white noise is assumed. The covariance is the sandwich N^-1 S N^-1,
+shrunk towards the mean level of all joints, and that towards white noise. The level also stands for frequencies at
+which the fit absorbs nearly all noise, so that none can be seen: the observer suppresses the slow part of the rounding
+errors, so that there is not more of it than at the frequencies above. The covariance is the sandwich N^-1 S N^-1,
 where S sums the information of each frequency times the noise there.
 """
 
@@ -32,9 +33,9 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
     parts = [part for index in range(len(problem.periods)) for part in _spectra(problem, x, index, scale, inverse)]
     levels = _levels(parts, problem.model.joints)
     for part in parts:
-        noise = levels[part.joint] + part.share**2 * (1.0 - levels[part.joint])
-        seen += part.information(np.ones_like(noise))
-        middle += part.information(noise)
+        information = part.information()
+        seen += information
+        middle += levels[part.joint] * information
     # The part of the normal matrix that does not come from the data comes from the prior.
     covariance: Array = inverse @ (normal / lengths - seen + middle) @ inverse / lengths
     return covariance
@@ -54,10 +55,9 @@ class _Spectrum:
     stands_for: float
     """Number of the period's samples over the number used."""
 
-    def information(self, noise: Array) -> Array:
-        """Return the sum over frequencies of the information times the noise (lines,) there."""
-        weighted = self.lines * noise[:, None]
-        total: Array = self.stands_for * (self.lines.real.T @ weighted.real + self.lines.imag.T @ weighted.imag)
+    def information(self) -> Array:
+        """Return the information under white noise, summed over frequencies (coordinates, coordinates)."""
+        total: Array = self.stands_for * (self.lines.real.T @ self.lines.real + self.lines.imag.T @ self.lines.imag)
         return total
 
 

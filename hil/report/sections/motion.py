@@ -1,17 +1,17 @@
 """Animation of the arm during the fitted period with the torque that moved it, then the suggested next commands."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.report.chart import GREEN, Chart, Series
 from hil.report.run_data import RunData
-from hil.report.section import Motion, Picture, Section, Table
+from hil.report.scene import MOST_FRAMES, spatial_motion
+from hil.report.section import Motion, Picture, Section, SpatialMotion, Table
 from hil.runs.period_file import PlayedPeriod
-
-MOST_FRAMES = 600
 
 
 def motion(data: RunData) -> Section | None:
-    """Present if the run has its settled period; drawn for planar arms only."""
+    """Present if the run has its settled period. Raises ConfigError, ArmFileError."""
     if data.fitted is None:
         return None
     period = data.fitted
@@ -29,7 +29,7 @@ def motion(data: RunData) -> Section | None:
         )
         for joint, name in enumerate(data.names)
     )
-    moving = None if data.config.is_chain else _moving(data, period)
+    moving = _moving_in_space(data, period) if data.config.is_chain else _moving(data, period)
     return Section("motion", "The experiment", pictures=pictures, motion=moving)
 
 
@@ -46,8 +46,18 @@ def next_commands(data: RunData) -> Section:
     return Section("next", "What next", tables=(Table(("", ""), rows, 2),))
 
 
+def _moving_in_space(data: RunData, period: PlayedPeriod) -> SpatialMotion:
+    said = "The arm in the fitted period, as measured, with its parts enclosed in capsules."
+    return spatial_motion(data.config, _filled(period), period.rate, said)
+
+
+def _filled(period: PlayedPeriod) -> NDArray[np.float64]:
+    """Measured positions; predicted ones where a measurement is missing."""
+    return np.where(np.isfinite(period.position), period.position, period.predicted)
+
+
 def _moving(data: RunData, period: PlayedPeriod) -> Motion:
-    filled = np.where(np.isfinite(period.position), period.position, period.predicted)
+    filled = _filled(period)
     step = max(1, -(-filled.shape[1] // MOST_FRAMES))
     lengths = data.config.arm.link_lengths or (1.0,) * len(filled)
     return Motion(

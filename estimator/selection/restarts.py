@@ -1,0 +1,72 @@
+"""Other initial guesses for an estimate that may be a local minimum.
+
+The likelihood has several minima where a term acts in a narrow range: the width of the Coulomb step, the stiffness of
+bristles (once they are too stiff to bend, nothing tells how stiff), and the period of torque ripple.
+"""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.identify import Estimate
+from hil.estimator.options import SelectionOptions
+from hil.estimator.selection.candidates import ripple_cycles
+
+ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
+ALIKE_CYCLES = 0.3  # difference of two numbers of cycles per turn between which no minimum is expected
+
+
+def left_per_joint(period: SettledPeriod, estimate: Estimate) -> Array:
+    """Return the mean square of each joint's residual (joints,), in units of the noise."""
+    left: Array = np.nanmean((estimate.residual / period.noise[:, None]) ** 2, axis=1)
+    return left
+
+
+def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOptions) -> Iterator[Mapping[str, float]]:
+    """Yield changed parameters, by name, from which another minimum may be reached; the worst joint's come first.
+
+    Only joints whose residual exceeds `options.presliding_residual` are changed.
+    """
+    left = left_per_joint(period, estimate)
+    for joint in np.argsort(-left) + 1:
+        if left[joint - 1] > options.presliding_residual**2:
+            yield from _ripple(period, estimate, int(joint), options)
+            yield from _standstill(estimate, int(joint), options)
+
+
+def _ripple(
+    period: SettledPeriod, estimate: Estimate, joint: int, options: SelectionOptions
+) -> Iterator[Mapping[str, float]]:
+    name = f"ripple_cycles_{joint}"
+    if name not in estimate.names:
+        return
+    found = ripple_cycles(period, estimate, options.ripple_cycles, (joint,))
+    if abs(found[name] - estimate.parameters[name]) > ALIKE_CYCLES:
+        yield found | {f"ripple_sin_{joint}": 0.0, f"ripple_cos_{joint}": 0.0}
+
+
+def bristles(estimate: Estimate, bend: float) -> list[dict[str, float]]:
+    """Return presliding parameters of each joint, by name, for bristles that slip when deflected by `bend` [rad]."""
+    parameters = estimate.parameters
+    return [
+        {
+            f"presliding_stiffness_{joint}": parameters[f"coulomb_{joint}"] / bend,
+            f"presliding_damping_{joint}": parameters[f"viscous_{joint}"],
+        }
+        for joint in range(1, estimate.model.joints + 1)
+    ]
+
+
+def _standstill(estimate: Estimate, joint: int, options: SelectionOptions) -> Iterator[Mapping[str, float]]:
+    parameters = estimate.parameters
+    stiffness, width = f"presliding_stiffness_{joint}", f"coulomb_width_{joint}"
+    if stiffness in estimate.names:
+        for bend in options.initial_bends:
+            guess = bristles(estimate, bend)[joint - 1]
+            if abs(np.log(guess[stiffness] / parameters[stiffness])) > np.log(ALIKE_STIFFNESS):
+                yield guess
+    elif width in estimate.names:
+        for initial in options.initial_widths:
+            yield {width: initial}

@@ -1,0 +1,36 @@
+"""The capsules of an arm as a file beside a copy of its description, whose meshes are not copied."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from hil.clearance.shapes import Capsule, Shapes, shapes_of
+from hil.description.arm import ArmDescription, ArmFileError
+
+
+def keep_shapes(arm: ArmDescription, folder: Path) -> None:
+    """Write the capsules of `arm` for the copy of its description in `folder`. Raises ArmFileError, OSError."""
+    shapes = shapes_of(arm)
+    capsules = [[each.link, *each.ends.reshape(-1).tolist(), each.radius] for each in shapes.capsules]
+    said = {"names": shapes.names, "guessed": shapes.guessed, "capsules": capsules}
+    _path(folder / arm.path.name).write_text(json.dumps(said), encoding="utf-8")
+
+
+def known_shapes(arm: ArmDescription) -> Shapes:
+    """The kept capsules if they belong to these links, otherwise those of the description. Raises ArmFileError."""
+    path = _path(arm.path)
+    if not path.is_file():
+        return shapes_of(arm)
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+        rows = np.array(said["capsules"], dtype=np.float64).reshape(-1, 8)
+        capsules = tuple(Capsule(int(row[0]), row[1:7].reshape(2, 3), float(row[7])) for row in rows)
+        found = Shapes(tuple(said["names"]), capsules, tuple(said["guessed"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ArmFileError(f"{path}: the capsules of the arm cannot be read: {error}") from error
+    return found if found.names == (arm.base, *(joint.link for joint in arm.joints)) else shapes_of(arm)
+
+
+def _path(description: Path) -> Path:
+    return description.with_name(f"{description.name}.shapes.json")

@@ -1,0 +1,71 @@
+"""The page of a dry run: verdict, predicted peaks and one of the simulated arms moving; one file, like a report."""
+
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from hil.config.schema import Config
+from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_lines
+from hil.dry_run.prediction import Prediction, quantities_of
+from hil.dry_run.summary import DryRun, dry_run_lines
+from hil.report.page import render, write_page
+from hil.report.scene import MOST_FRAMES, spatial_motion
+from hil.report.section import Motion, Section, SpatialMotion, Table
+
+
+def write_dry_run_page(config: Config, found: DryRun | ChainDryRun, path: Path) -> None:
+    """Write the page. Raises RunFolderError, ConfigError, ArmFileError."""
+    shown = found.prediction if isinstance(found, ChainDryRun) else found.asked or found.largest.prediction
+    is_safe = found.is_safe(config)
+    lines = chain_dry_run_lines(found) if isinstance(found, ChainDryRun) else dry_run_lines(config, shown, found)
+    title = "The experiment looks safe" if is_safe else "The experiment is not safe"
+    moving = _in_space(found) if isinstance(found, ChainDryRun) else _in_plane(config, shown)
+    sections = (
+        Section("verdict", title, tone="good" if is_safe else "poor", bullets=tuple(lines)),
+        Section("motion", "The motion", motion=moving),
+        Section("peaks", "Predicted peaks", tables=(_peaks(config, shown),)),
+    )
+    page = render(config.path.stem, datetime.now().isoformat(), sections, f"Dry run on {found.arms} simulated arms")
+    write_page(page, path)
+
+
+def _in_space(found: ChainDryRun) -> SpatialMotion | None:
+    """The simulated arm that comes closest to anything."""
+    motions = found.prediction.shown
+    if not len(motions):
+        return None
+    closest = int(np.argmin(found.foreseen.rooms[: len(motions)]))
+    said = (
+        f"Of {len(motions)} simulated arms, the one that comes closest to anything: from the rest pose to the path, "
+        "twice along it, and back."
+    )
+    ways = found.foreseen.ways
+    return spatial_motion(found.config, np.nan_to_num(motions[closest]), found.prediction.rate, said, (ways, ways))
+
+
+def _in_plane(config: Config, shown: Prediction) -> Motion | None:
+    if not len(shown.shown):
+        return None
+    angles = shown.shown[0]
+    step = max(1, -(-angles.shape[1] // MOST_FRAMES))
+    lengths = config.arm.link_lengths or (1.0,) * len(angles)
+    return Motion(
+        step / shown.rate,
+        tuple(tuple(round(float(angle), 4) for angle in row) for row in angles[:, ::step]),
+        tuple(float(length) for length in lengths),
+        bool(config.arm.gravity),
+        "One of the simulated arms",
+    )
+
+
+def _peaks(config: Config, shown: Prediction) -> Table:
+    rows = [
+        (
+            f"{joint.name}: {name} [{unit}]",
+            *(f"{values[row, index]:.3g}" for values in (shown.median, shown.quantile, shown.limits)),
+        )
+        for index, joint in enumerate(config.joints)
+        for row, (name, unit) in enumerate(quantities_of(config))
+    ]
+    return Table(("joint and quantity", "median", "99 %", "limit"), tuple(rows))

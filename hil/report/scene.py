@@ -1,0 +1,90 @@
+"""A spatial arm's motion as data for the page: geometry once, then angles and clearance frame by frame.
+
+The page's script (spatial.js) places the links itself, so that a motion of minutes takes a few hundred kilobytes.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.space import Space
+from hil.config.schema import Config
+from hil.description.urdf import rotation_of
+from hil.report.section import SpatialMotion
+
+Array = NDArray[np.float64]
+
+MOST_FRAMES = 600
+FEW_POSES = 60
+"""Number of poses from which the size of the picture is found."""
+MOST_SHOWN_M = 1.0
+"""Clearances above this are shown as this [m]."""
+
+
+def spatial_motion(
+    config: Config, position: Array, rate: float, caption: str, ways: tuple[int, int] = (0, 0)
+) -> SpatialMotion:
+    """The motion (joints, samples) [rad] of a configured spatial arm.
+
+    ways: number of samples at the beginning and at the end that lead from and to the rest pose, in which parts may be
+    closer than the margin. Raises ConfigError, ArmFileError.
+    """
+    space = Space.of(config)
+    step = max(1, -(-position.shape[1] // MOST_FRAMES))
+    kept = np.arange(0, position.shape[1], step)
+    angles = position[:, kept]
+    on_the_way = (kept < ways[0]) | (kept >= position.shape[1] - ways[1])
+    upright = rotation_of(*config.arm.base)
+    centre, reach = _extent(space, angles, upright)
+    scene: dict[str, Any] = {
+        "interval": step / rate,
+        "angles": np.round(angles, 4).tolist(),
+        "names": [joint.name for joint in config.joints],
+        "limits": [[round(float(end), 4) for end in joint.position_limit] for joint in config.joints],
+        "chain": [_rounded(turn, shift, axis) for turn, shift, axis in zip(*space.chain, strict=True)],
+        "capsules": _capsules(space),
+        "boxes": [_rounded(*box) for box in space.boxes],
+        "upright": _rounded(upright),
+        "floor": space.floor[1] if np.isfinite(space.floor[1]) else None,
+        "centre": _rounded(centre),
+        "reach": round(reach, 4),
+        **_clearances(space, angles, on_the_way),
+    }
+    return SpatialMotion(caption, scene)
+
+
+def _clearances(space: Space, angles: Array, on_the_way: NDArray[np.bool_]) -> dict[str, Any]:
+    """Least clearance of each frame [mm], excess over the required one [mm], and index of the pair in `pairs`."""
+    pairs: dict[tuple[str, str], int] = {}
+    clearance, room, nearest = [], [], []
+    for frame, way in enumerate(on_the_way.tolist()):
+        found = space.nearest(angles[:, [frame]], on_the_way=way)
+        lies = way and bool(space.lies(angles[:, [frame]])[0])
+        clearance.append(round(1e3 * min(found.distance, MOST_SHOWN_M)))
+        room.append(round(1e3 * min(max(found.room, 0.0) if lies else found.room, MOST_SHOWN_M)))
+        nearest.append(pairs.setdefault(found.pair, len(pairs)))
+    return {"pairs": list(map(list, pairs)), "clearance": clearance, "room": room, "nearest": nearest}
+
+
+def _capsules(space: Space) -> list[dict[str, Any]]:
+    return [
+        {"link": each.link, "name": space.shapes.names[each.link], "ends": _rounded(each.ends), "radius": each.radius}
+        for each in space.shapes.capsules
+    ]
+
+
+def _extent(space: Space, angles: Array, upright: Array) -> tuple[Array, float]:
+    """Centre and radius [m] of a sphere around the arm in all its poses, in the upright frame."""
+    every = np.linspace(0, angles.shape[1] - 1, min(FEW_POSES, angles.shape[1])).astype(int)
+    ends = np.concatenate([space.ends(angles[:, frame])[0].reshape(-1, 3) for frame in every] + [np.zeros((1, 3))])
+    points = ends @ upright.T
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    radius = max((each.radius for each in space.shapes.capsules), default=0.0)
+    return centre, float(np.linalg.norm(points - centre, axis=1).max()) + radius
+
+
+def _rounded(*arrays: Array) -> list[float]:
+    """All numbers in one list, to a hundredth of a millimetre."""
+    flat = np.concatenate([np.asarray(each, dtype=np.float64).reshape(-1) for each in arrays])
+    return [float(value) for value in np.round(flat, 5)]
