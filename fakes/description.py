@@ -190,7 +190,7 @@ def _known_names(name: str) -> str:
     """What to say of a bare name that is no arm's."""
     if "." in name or "/" in name:
         return ""
-    close = get_close_matches(name, arm_names(), 1)
+    close = get_close_matches(name, arm_names(), 1, 0.75)
     return f"; did you mean {close[0]}?" if close else f"; arms known by name: {', '.join(arm_names())}"
 
 
