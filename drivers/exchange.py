@@ -164,6 +164,9 @@ class Exchange:
         else:
             port.write(goals)
             received = port.ask(read.request, read.reply_size, timeout, before)
+        if port.overheard:
+            self._look_for_strangers(port.overheard)
+            port.overheard = b""
         servos = read.unpack(received)
         if servos is None:
             servos = self._search(read, received, before + timeout)
@@ -216,9 +219,12 @@ class Exchange:
                 break
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
+        self._look_for_strangers(received)
+        return answers
+
+    def _look_for_strangers(self, received: bytes) -> None:
         if not self._echoes:
             self.strangers += sum(not packet.is_status for packet in Framer().feed(received))
-        return answers
 
     def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
         """Return the reply received through an adapter that echoes what is sent, with the echo removed."""
