@@ -1,15 +1,31 @@
-"""MCAP export, for Foxglove and PlotJuggler: one topic per joint, JSON messages with a schema, result.json attached."""
+"""MCAP export, for Foxglove and PlotJuggler: one topic per joint, JSON messages with a schema, result.json attached.
+
+The topics `/transforms` and `/arm` hold the moving arm's frames and shapes, for a 3D panel.
+"""
 
 import json
 import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hil import __version__, strict_json
 from hil.errors import ExportError, RunFolderError
 from hil.export.columns import COLUMN_UNITS
+from hil.export.foxglove import (
+    SCENE,
+    TRANSFORMS,
+    scene_message,
+    scene_schema,
+    transform_messages,
+    transforms_schema,
+)
+from hil.export.moving_scene import moving_scene
 from hil.export.source import Source
 
+_SHOWN_HZ = 50.0
+"""Rate of the frames [Hz]: as smooth as a screen shows."""
 _WHOLE = ("phase", "segment", "period", "error", "missing")
 _TIMES = ("deadline", "time_before_write", "time_after_read")
 _SHARED = (*_TIMES, "phase", "segment", "period")
@@ -51,10 +67,32 @@ def _write(writer: Any, source: Source) -> None:
             message = shared | {name: _number(columns[name][row][joint]) for name in _PER_JOINT}
             data = json.dumps(message, allow_nan=False).encode()
             writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, data=data, sequence=row)
+    _write_scene(writer, source, start)
     result = strict_json.dumps(source.result.to_json(), indent=2).encode()
     writer.add_attachment(
         create_time=start, log_time=start, name="result.json", media_type="application/json", data=result
     )
+
+
+def _write_scene(writer: Any, source: Source, start: int) -> None:
+    """Write the arm's shapes once, and its frames wherever all joints were read."""
+    scene = moving_scene(source.config)
+    samples = source.samples
+    time = samples["deadline"] - samples["deadline"][0]
+    due = np.unique(np.searchsorted(time, np.arange(0.0, float(time[-1]) + 1.0 / _SHOWN_HZ, 1.0 / _SHOWN_HZ)))
+    due = due[due < len(samples)]
+    seen = due[np.isfinite(samples["position"][due]).all(axis=1)]
+    stamps = [start + round(float(time[row]) * 1e9) for row in seen]
+    moving = transform_messages(scene, samples["position"][seen].T.astype(np.float64), stamps)
+    for topic, name, schema, messages in (
+        ("/arm", SCENE, scene_schema(), [(start, scene_message(scene, start))]),
+        ("/transforms", TRANSFORMS, transforms_schema(), list(zip(stamps, moving, strict=True))),
+    ):
+        known = writer.register_schema(name=name, encoding="jsonschema", data=json.dumps(schema).encode())
+        channel = writer.register_channel(topic=topic, message_encoding="json", schema_id=known)
+        for stamp, message in messages:
+            data = json.dumps(message, allow_nan=False).encode()
+            writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, data=data)
 
 
 def _number(value: float) -> float | None:

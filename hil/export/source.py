@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
+from hil.config.schema import Config
 from hil.errors import RunFolderError
 from hil.model_file import model_of, read_usable_result
 from hil.results.result import Result
+from hil.runs.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,11 @@ class Source:
                 "arm: urdf, mjcf, toml or json."
             )
         return load_samples(self.run / "samples.npy", len(self.model.joints))
+
+    @cached_property
+    def config(self) -> Config:
+        """The configuration of the run. Raises RunFolderError, ConfigError."""
+        return RunFolder.open(self.run).load_config()
 
     @cached_property
     def started(self) -> float:

@@ -87,7 +87,7 @@ def test_mcap(run: Path) -> None:
         opened = reader.make_reader(file)
         found: dict[str, list[dict[str, float]]] = {"/shoulder": [], "/elbow": []}
         stamps = []
-        for schema, channel, message in opened.iter_messages():
+        for schema, channel, message in opened.iter_messages(["/shoulder", "/elbow"]):
             assert schema.name == "hil.Sample"
             found[channel.topic].append(json.loads(message.data))
             stamps.append(message.log_time)
