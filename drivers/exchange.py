@@ -165,6 +165,9 @@ class Exchange:
         else:
             port.write(goals)
             received = port.ask(read.request, read.reply_size, timeout, before)
+        if port.overheard:
+            self._look_for_strangers(port.overheard)
+            port.overheard = b""
         servos = read.unpack(received)
         if servos is None:
             servos = self._search(read, received, before + timeout)
@@ -217,9 +220,12 @@ class Exchange:
                 break
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
+        self._look_for_strangers(received)
+        return answers
+
+    def _look_for_strangers(self, received: bytes) -> None:
         if not self._echoes:
             self.strangers += sum(self._is_strange(packet) for packet in _packets_within(received))
-        return answers
 
     def _is_strange(self, packet: Packet) -> bool:
         """Whether this is an instruction, or the answer to one, of another master. A refusal has no data."""

@@ -52,6 +52,9 @@ class Wire(Port):
     def discard_input(self) -> None:
         self.waiting = b""
 
+    def _put_aside(self) -> None:
+        self.overheard, self.waiting = self.waiting, b""
+
 
 def state(current: int, velocity: int, position: int) -> bytes:
     return struct.pack("<hii", current, velocity, position)
@@ -318,3 +321,15 @@ def test_under_pwm_the_applied_pwm_is_read_and_the_load_passed_over() -> None:
     every = spans(Mode.PWM, [XL430])
     assert (every[0].address, every[0].size, every[0].format) == (124, 12, "hxxii")
     assert every[2].format == "hxxiixxxxxxxxHB"
+
+
+def test_another_masters_instructions_between_two_cycles_are_counted() -> None:
+    """Late replies and noise, which may be pending as well, are not."""
+    both = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire([both] * 3)
+    cycles = exchange(wire)
+    goal = encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")
+    for pending, count in ((answer(1, 1, 2, 3) + b"\xff\xfd", 0), (goal + answer(2, 0, 0, 0), 1), (b"", 1)):
+        wire.waiting = pending
+        assert None not in cycles.cycle([0, 0]).servos
+        assert cycles.strangers == count
