@@ -4,6 +4,7 @@ from pathlib import Path
 
 ARMS = Path(__file__).parent / "arms"
 
+_FAKE = "\n[fake]"
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -14,9 +15,10 @@ def configs_folder() -> Path:
 
 
 def arm_names() -> tuple[str, ...]:
-    """Return every name that `find_arm` accepts: the arms for other programs first, then hil's own fake arms."""
+    """Return the names of all fake arms: those for other programs first, then those of hil's own configurations."""
     ready = sorted(path.stem for path in ARMS.glob("*.toml"))
-    return (*ready, *sorted(path.stem for path in configs_folder().glob("fake_*.toml")))
+    own = sorted(path.stem for path in configs_folder().glob("*.toml") if _FAKE in path.read_text(encoding="utf-8"))
+    return (*ready, *(name for name in own if name not in ready))
 
 
 def find_arm(path: Path | str) -> Path:

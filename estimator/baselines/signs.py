@@ -1,5 +1,7 @@
 """Detection of reversed columns: torques or positions with the wrong sign, by inverse dynamics for each combination.
 
+Angles that are counted from a fixed direction instead of from the link before are found in the same way.
+
 If the torque of the only joint, or of all joints, is reversed, the residual stays the same but inertias and friction
 become negative. If one of two joints is reversed, it contradicts the other joint's equations, which increases the
 residual.
@@ -76,6 +78,25 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
         if credible and (best is None or residual < best[0]):
             best = residual, signs
     return None if best is None else Suspicion(best[1], best[0], left, impossible)
+
+
+def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | None:
+    """Whether joint 2's angle seems to be counted from a fixed direction instead of from link 1.
+
+    Returns the relative RMS of the torque residual, worst joint, with angle 2 minus angle 1 and as given; None if the
+    difference does not explain the recordings much better.
+    """
+    if recordings[0].joints != 2:
+        return None
+    as_given = Signs((1, 1), (1, 1))
+    relative = [
+        replace(each, position=np.stack([each.position[0], each.position[1] - each.position[0]])) for each in recordings
+    ]
+    given, fitted = _fit(recordings, as_given), _fit(relative, as_given)
+    if given is None or fitted is None or _impossible(fitted):
+        return None
+    residual, left = float(fitted.relative_residual.max()), float(given.relative_residual.max())
+    return (residual, left) if residual < LESS_RESIDUAL * left else None
 
 
 def _combinations(joints: int) -> Iterator[Signs]:

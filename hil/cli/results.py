@@ -26,7 +26,8 @@ def report(
     ] = None,
 ) -> None:
     """Write a run as one self-contained HTML page: verdict, parameters, figures."""
-    from hil.next_step import next_step
+    from hil.cli.views.result_table import what_next
+    from hil.model_file import read_result
     from hil.report.pictures import save_pictures
     from hil.report.run_data import RunData
 
@@ -36,7 +37,7 @@ def report(
         if folder is not None and data is not None:
             print(f"{len(save_pictures(data, folder, kind))} figures in {folder}")
     if not is_quiet():  # on standard error, so that the page's path stays alone on standard output
-        print(next_step("export", run, "--format", "mjcf"), file=sys.stderr)
+        print(what_next(read_result(run), run), file=sys.stderr)
 
 
 def export(

@@ -58,6 +58,9 @@ class Columns(_Table):
         None, min_length=1, max_length=7, description="one column per joint, from the base outwards"
     )
     position_unit: Literal["rad", "mrad", "deg", "turns", "ticks"] | None = None
+    angles: Literal["relative", "absolute"] = Field(
+        "relative", description="absolute: every angle is counted from the same direction, not from the link before"
+    )
     ticks_per_turn: PositiveFloat | None = Field(None, description="of the encoders, for positions in ticks")
     zero: list[float] | None = Field(
         None, description="rad added to each position, so that joint 1 is measured from the horizontal"

@@ -346,12 +346,21 @@ def port_url(port: str) -> str:
     return url
 
 
+def _is_only_fake(path: Path) -> bool:
+    """Whether a TOML file describes nothing but a fake arm, as `hil fake` takes it."""
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return False
+    return "fake" in values and "port" not in values and "joints" not in values
+
+
 def _url_of(port: str) -> str:
     if "://" in port:
         return port
     config = find_config(Path(port))
     if config.suffix == ".toml" or config.is_file():
-        return load_config(config).url
+        return f"{FAKE_URL}{config}" if _is_only_fake(config) else load_config(config).url
     arm = find_arm(port)
     if arm.suffix == ".toml":
         return f"{FAKE_URL}{arm}"

@@ -54,8 +54,9 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     lengths = config.arm.link_lengths
     if lengths is None:
         raise ConfigError(
-            f"{config.path}: a dry run needs arm.link_lengths = [...] in m, one for each of [[joints]], or the run "
-            "folder of an earlier identification (--result)."
+            f"{config.path}: what a torque does to this arm cannot be foreseen without its link lengths. Measure "
+            "from joint to joint and to the tip with a ruler, and set arm.link_lengths = [...] in m, one for each of "
+            "[[joints]]; or give a dry run an earlier identification (--result)."
         )
     random = np.random.default_rng((seed, 5))
     drawn = {name: quantity.draw(random, count) for name, quantity in quantities(config, np.array(lengths)).items()}

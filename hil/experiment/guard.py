@@ -24,6 +24,7 @@ from hil.experiment.following import Following, Unfollowed
 from hil.experiment.silence import Silence
 from hil.experiment.status_check import StatusCheck
 from hil.experiment.work import Work
+from hil.plan.find_torque import how_to_find_torque
 
 JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
@@ -89,6 +90,7 @@ class Guard:
         ]
         count = len(config.joints)
         self._safety = safety
+        self._safe_torque = how_to_find_torque(config)
         self._commands = CommandLimits(config)
         planned = planned or _planned(config)
         self._work = Work(config, planned) if config.stabiliser is None else None
@@ -272,8 +274,8 @@ class Guard:
         self._stop(
             index,
             Cause.POSITION,
-            f"is at {position:.3f} rad, outside its position limit [{low:g}, {high:g}]. Lower experiment.peak_torque; "
-            "`hil dry-run` finds a safe value.",
+            f"is at {position:.3f} rad, outside its position limit [{low:g}, {high:g}]. Lower experiment.peak_torque. "
+            f"{self._safe_torque}",
         )
 
     def _too_fast(self, index: int, velocity: float) -> NoReturn:
@@ -281,7 +283,7 @@ class Guard:
             index,
             Cause.VELOCITY,
             f"moves at {velocity:.2f} rad/s, more than its velocity limit {self._limits[index].velocity:g}. Lower "
-            "experiment.peak_torque; `hil dry-run` finds a safe value.",
+            f"experiment.peak_torque. {self._safe_torque}",
         )
 
     def _not_followed(self, index: int, off: Unfollowed) -> NoReturn:

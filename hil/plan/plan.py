@@ -11,6 +11,7 @@ from hil.config.schema import Config
 from hil.drivers.bus import CHECK_S
 from hil.errors import ConfigError
 from hil.estimator.excitation.multisine import Multisine, design_multisine, detecting_lines, zippered_lines
+from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import check_rate
 
 IDENTIFY, HELD_OUT = "identify", "held_out"
@@ -175,7 +176,8 @@ def _segment(config: Config, role: str, seed: int) -> Segment:
     experiment = config.experiment
     if experiment.peak_torque is None:
         raise ConfigError(
-            f"{config.path}: experiment.peak_torque is missing. `hil dry-run` finds a safe value; or set pilot = true."
+            f"{config.path}: experiment.peak_torque is missing. {how_to_find_torque(config)} Or let hil find "
+            "it: pilot = true."
         )
     multisine = design_multisine(experiment.rate, experiment.period, _lines(config), experiment.peak_torque, seed)
     return Segment(role, multisine, period_current(config, multisine), round(experiment.ramp * experiment.rate))

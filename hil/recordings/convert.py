@@ -47,6 +47,8 @@ def convert(table: Table, columns: Columns) -> Converted:
     time = _time(table, whole)
     ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn
     position = np.stack([_quantity(table, name, "position", whole.position_unit, ticks) for name in whole.position])
+    if whole.angles == "absolute":
+        position = np.diff(position, axis=0, prepend=0.0)
     torque = np.stack([_torque(table, whole, joint) for joint in range(len(whole.position))])
     zero = np.array(whole.zero or [0.0] * len(position))[:, None]
     steps = [whole.position_step or encoder_step(row) for row in position]

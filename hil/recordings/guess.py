@@ -32,6 +32,7 @@ _NOT_MEASURED = re.compile(
 _NOT_POSITION = re.compile(
     r"(?<![a-z])(vel|velocity|speed|acc|accel|dq|qd|qdd|ddq|temp|temperature|err|error)(?![a-z])", re.I
 )
+_LENGTHS = ("mm", "cm", "m", "in", "inch")
 _EXAMPLE = 5  # columns of a recording of two joints
 _SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
 
@@ -134,6 +135,13 @@ def _stem(name: str) -> str:
 
 def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
     some = list(found)
+    lengths = [name for name in table.columns if (table.units.get(name) or split_head(name)[1] or "") in _LENGTHS]
+    if what == "position" and not some and lengths:
+        return CsvError(
+            f"{table.source}: {', '.join(lengths)} {'is a length' if len(lengths) == 1 else 'are lengths'}: needed is "
+            "the angle of each joint (rad, deg, turns or ticks), from the base outwards. Where the tip is does not "
+            "tell how the joints stand; record the encoders, or compute the angles first."
+        )
     seen = f"several may be meant ({', '.join(some[:12])})" if some else "none has a name that says so"
     example = '[columns]\ntime = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
     names = list(table.columns)

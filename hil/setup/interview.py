@@ -51,12 +51,12 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         )
     )
     directions = [_direction(servo, name, ask, say) for servo, name in zip(handles, names, strict=True)]
-    ask(_POSE[stance], "")
+    hanging = _at_rest(handles, names, stance, ask, say)
     joints = []
-    for number, (servo, found, name) in enumerate(zip(handles, chosen, names, strict=True)):
+    for number, (found, name) in enumerate(zip(chosen, names, strict=True)):
         rest = _REST[stance] if number == 0 else 0.0
         unit = directions[number] * servo_model(str(found.model)).position_unit
-        zero = servo.read("Present Position") - round(rest / unit)
+        zero = hanging[number] - round(rest / unit)
         beyond = "the tip" if number == len(chosen) - 1 else names[number + 1]
         usual = f"{1e3 * usual_length(str(found.model)):.0f}"
         length = 1e-3 * _number(f"Length from {name} to {beyond} in mm", usual, _LENGTHS_MM, ask, say)
@@ -69,6 +69,23 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
     )
     gravity = 0.0 if stance == FLAT else round(STANDARD_GRAVITY * math.cos(tilt), 3)
     return ArmAnswers(url, baud, tuple(joints), gravity, head)
+
+
+def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: Ask, say: Say) -> list[int]:
+    """Present Positions in the pose of rest. Hanging joints are read from both sides, since friction holds them."""
+    ask(_POSE[stance], "")
+    first = [servo.read("Present Position") for servo in handles]
+    if stance != HANGING:
+        return first
+    ask("Friction may hold it aside: push each joint a little to its other side, let go, and press Enter", "")
+    second = [servo.read("Present Position") for servo in handles]
+    for name, before, after in zip(names, first, second, strict=True):
+        if abs(after - before) > _MOVED_TICKS:
+            say(
+                f"{name} came to rest {abs(after - before)} steps apart: friction holds it. The middle is taken for "
+                "hanging; if it is not, correct zero_ticks in the file."
+            )
+    return [round((before + after) / 2) for before, after in zip(first, second, strict=True)]
 
 
 def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
@@ -95,8 +112,20 @@ def _choose(servos: list[Found], ask: Ask, say: Say) -> list[Found]:
         answer = ask(f"IDs of the arm's joints (one or two), from the base outwards; found: {listed}", usual)
         words = answer.replace(",", " ").split()
         if 1 <= len(words) <= 2 and len(set(words)) == len(words) and all(_known(word, by_id) for word in words):
+            _say_who_is_left_out([each for number, each in by_id.items() if str(number) not in words], say)
             return [by_id[int(word)] for word in words]
         say(f"{answer!r}: give one or two different IDs out of {', '.join(map(str, by_id))}, for example: {usual}")
+
+
+def _say_who_is_left_out(others: Sequence[Found], say: Say) -> None:
+    if others:
+        ids = ", ".join(str(found.id) for found in others)
+        say(
+            f"LEFT OUT: ID {ids}. hil init describes planar arms of one or two joints; the others are neither read nor "
+            "moved, so hold or fix their joints. An arm of more joints, or one that is not planar, needs its URDF or "
+            "MJCF: copy configs/open_manipulator_x.toml, name the description in [arm] urdf, then type: hil pose "
+            "YOUR_FILE.toml"
+        )
 
 
 def _known(word: str, by_id: dict[int, Found]) -> bool:

@@ -14,7 +14,7 @@ from hil.estimator.models.terms import TERMS, joint_of, kind_of, term_of
 from hil.next_step import command, next_step
 from hil.printing import print_table, say
 from hil.results.parts import Quantity
-from hil.results.result import SettledResult, ShootingResult
+from hil.results.result import Result, SettledResult, ShootingResult
 
 _NOTHING = 1e-9
 """Fraction of a value below which a truth is rounding error, so that a relative error means nothing."""
@@ -58,7 +58,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
     if run is not None:
         print(f"Run folder: {run}, report: {run / 'report.html'}")
         if result.arm is not None:
-            print(next_step("export", run, "--format", _usual_format(result)))
+            print(what_next(result, run))
 
 
 def _parameters(result: SettledResult) -> Table:
@@ -157,12 +157,23 @@ def _torque_constants(result: SettledResult, config: Config) -> list[str]:
 def _next(result: SettledResult, run: Path) -> list[str]:
     return [
         f"Run folder: {run}, report: {run / 'report.html'}",
-        f"To estimate again from the recording: {command('estimate', run)}",
-        next_step("export", run, "--format", _usual_format(result)),
+        *([] if _is_useless(result) else [f"To estimate again from the recording: {command('estimate', run)}"]),
+        what_next(result, run),
     ]
 
 
-def _usual_format(result: SettledResult | ShootingResult) -> str:
+def what_next(result: Result, run: Path) -> str:
+    """The line that names the next command: export, or another estimate of numbers that are not to be used."""
+    if _is_useless(result):
+        return next_step("estimate", run)
+    return next_step("export", run, "--format", _usual_format(result))
+
+
+def _is_useless(result: Result) -> bool:
+    return result.verdict is not None and result.verdict.trust == "no"
+
+
+def _usual_format(result: Result) -> str:
     """A format that can hold this arm: MJCF needs the length of link 1, which only gravity determines."""
     flat = result.chain is None and result.arm is not None and not result.arm.gravity
     return "toml" if flat else "mjcf"

@@ -16,6 +16,7 @@ from hil.errors import ConfigError, CsvError
 from hil.estimation.physical import physical_of
 from hil.estimation.unsettled.chain_recordings import estimate_chain_recordings
 from hil.estimation.unsettled.estimate import Estimated, estimate_any
+from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
 from hil.recordings.convert import Converted, convert
@@ -53,6 +54,7 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
+    refuse_slips(read.recordings, ", ".join(map(str, paths)))
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped)
     result = _named(found, read, gravity)
     if config.known is not None:

@@ -35,10 +35,17 @@ def motion(data: RunData) -> Section | None:
 
 def next_commands(data: RunData) -> Section:
     """Commands to copy; always present."""
-    run = data.run.path
+    run, length = data.run.path, ""
+    if not data.config.is_chain and not data.config.arm.gravity and len(data.config.joints) > 1:
+        # Of an arm that gravity does not move, the motion says nothing of the length of link 1.
+        known = data.config.arm.link_lengths
+        length = f" --link-length {f'{known[0]:g}' if known else 'METRES'}"
     rows = (
-        ("the arm for MuJoCo, or as URDF", f"hil export {run} --format mjcf --format urdf"),
-        ("a hundred arms drawn from the error bars", f"hil export {run} --format mjcf --samples 100 --out arms"),
+        ("the arm for MuJoCo, or as URDF", f"hil export {run} --format mjcf --format urdf{length}"),
+        (
+            "a hundred arms drawn from the error bars",
+            f"hil export {run} --format mjcf --samples 100 --out arms{length}",
+        ),
         ("estimate again, after a change of [model] in its config.toml", f"hil estimate {run}"),
         ("what changed since another run", f"hil diff OTHER_RUN {run}"),
         ("other methods on the same recording", f"hil compare {run}"),

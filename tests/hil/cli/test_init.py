@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,7 +13,9 @@ from hil.config.schema import load_config, parse_config, port_url
 from hil.drivers.port import open_port
 from hil.drivers.servo_model import SERVO_MODELS, Mode
 from hil.errors import ExperimentError
-from hil.setup.config_template import ArmAnswers, JointAnswers, arm_toml
+from hil.fakes.bus.hand import Move
+from hil.setup.bus_rate import SHARE, ExchangeMode, choose_mode
+from hil.setup.config_template import RATES, ArmAnswers, JointAnswers, arm_toml
 from hil.setup.interview import interview
 from hil.setup.scan import Found, Heard, scan
 from tests.support.command_line import hil
@@ -70,6 +73,7 @@ def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> Non
     assert [text.split(":")[0] for text in said] == [
         "'7'",
         "'1 1'",
+        "LEFT OUT",
         "'perhaps'",
         "wrist did not move",
         "'0'",
@@ -124,3 +128,38 @@ def test_every_model_and_baud_gives_a_file_that_is_valid(model: str, baud: int) 
     assert config.joints[0].name == 'the "first"'
     assert (config.joints[0].drive_mode is Mode.PWM) == (model == "XL430-W250")
     assert config.experiment.rate * 2 * 78 * 10 / baud < 1.1
+
+
+def test_friction_that_holds_the_arm_aside_is_read_from_both_sides(arm_file: ArmFile) -> None:
+    port = open_port(port_url(str(arm_file())), 1_000_000)
+    bus = port._serial.bus
+
+    def ask(question: str, usual: str) -> str:
+        for start, angle in (("Let the arm hang", 0.2), ("Friction may hold it aside", -0.1)):
+            if question.startswith(start):
+                bus.hand.move(Move(servo=2, to=angle, duration=0.1))
+                port.clock.wait_until(port.clock.now() + 0.5)
+                bus.advance(port.clock.now())
+        return usual
+
+    said: list[str] = []
+    try:
+        arm = interview(port, "fake://", list(scan(port, (1_000_000,))), ask, said.append)
+    finally:
+        port.close()
+    unit = 2 * math.pi / 4096
+    assert arm.joints[1].zero_ticks == pytest.approx(2048 + 0.05 / unit, abs=3)
+    assert any(text.startswith("elbow came to rest 19") and "steps apart" in text for text in said), said
+
+
+@pytest.mark.parametrize(("sustained", "chosen"), [(52.0, 40), (900.0, 400), (370.0, 300), (23.0, 20), (61.0, 50)])
+def test_the_highest_rate_with_a_margin_is_chosen(sustained: float, chosen: int) -> None:
+    mode = ExchangeMode(True, True, 0.001, SHARE / sustained, 0.05, 0)
+    bus = SimpleNamespace(config=SimpleNamespace(fast_sync_read=True, one_write=True))
+    assert choose_mode(bus, [mode], RATES)[1] == chosen  # type: ignore[arg-type]
+
+
+def test_a_file_with_nothing_but_a_fake_is_a_port(tmp_path: Path) -> None:
+    path = tmp_path / "fake.toml"
+    path.write_text("[fake]\n", encoding="utf-8")
+    assert port_url(str(path)) == f"fake://{path}"

@@ -1,14 +1,18 @@
 """Recordings as other programs write them, down to recordings in SI units."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hil.arm_model import ArmModel, JointFacts
 from hil.config.csv_columns import Columns
 from hil.errors import CsvError
+from hil.estimation.unsettled.slips import refuse_slips
+from hil.estimator.data.recording import Recording
 from hil.recordings.convert import Converted, convert
 from hil.recordings.encoder import encoder_step
 from hil.recordings.files import read_tables
@@ -259,3 +263,53 @@ def test_a_periodic_recording_is_averaged() -> None:
 def test_units_are_read_from_headers(header: str, name: str, unit: str | None) -> None:
     bare, stated = split_head(header)
     assert bare == name and (None if stated is None else unit_of(stated)) == unit
+
+
+def swung(slip: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """A simulated arm's recording whose positions (joints, samples) are written down wrongly."""
+    time = np.arange(2000) * 0.005
+    position = np.stack([0.8 * np.sin(2.1 * time) + 0.3 * np.sin(7.3 * time), 0.9 * np.sin(3.3 * time + 1.0)])
+    velocity = np.gradient(position, 0.005, axis=1)
+    acceleration = np.gradient(velocity, 0.005, axis=1)
+    values = {
+        **{"inertia_1": 0.018, "coupling": 0.0033, "inertia_2": 0.0028, "armature_2": 0.01},
+        **{"gravity_1": 0.55, "gravity_2": 0.22, "viscous_1": 0.045, "viscous_2": 0.04},
+    }
+    values |= {f"{name}_{joint}": 0.0 for name in ("coulomb", "offset") for joint in (1, 2)}
+    facts = JointFacts("joint", "XM430-W350", "current", 1.8, 0.1, 1.2, (-3.0, 0.5), 10.0)
+    arm = ArmModel(values, values, 9.81, (-1.57, 0.0), (facts,) * 2)
+    torque = arm.inverse_dynamics(position.T, velocity.T, acceleration.T).T
+    return Recording(time, torque, slip(position), np.full(2, 0.0015), "linear")
+
+
+@pytest.mark.parametrize(
+    ("slip", "said"),
+    [
+        (lambda q: q * np.array([[1.0], [-1.0]]), "the sign of the position of joint 2 is reversed"),
+        (lambda q: np.cumsum(q, axis=0), 'angles = "absolute"'),
+    ],
+)
+def test_a_plain_slip_is_refused_before_the_fit(slip: Callable[[np.ndarray], np.ndarray], said: str) -> None:
+    with pytest.raises(CsvError, match=said):
+        refuse_slips([swung(slip)], "arm.csv")
+
+
+def test_a_right_recording_is_not_refused() -> None:
+    refuse_slips([swung(lambda q: q)], "arm.csv")
+
+
+def test_lengths_are_no_angles(tmp_path: Path) -> None:
+    path = tmp_path / "tip.csv"
+    path.write_text("t,x [mm],y [mm],tau1,tau2\n0,1,2,0,0\n", encoding="utf-8")
+    with pytest.raises(CsvError, match=r"x \[mm\], y \[mm\] are lengths"):
+        convert(read_tables(path)[0], Columns())
+
+
+def test_absolute_angles_are_made_relative(tmp_path: Path) -> None:
+    path = tmp_path / "absolute.csv"
+    rows = "".join(
+        f"{0.01 * k:.2f},{math.sin(0.1 * k):.6f},{2 * math.sin(0.1 * k):.6f},{k % 7},{k % 5}\n" for k in range(200)
+    )
+    path.write_text("t,q1,q2,tau1,tau2\n" + rows, encoding="utf-8")
+    (recording,) = convert(read_tables(path)[0], Columns(angles="absolute")).recordings
+    assert recording.position[1] == pytest.approx(recording.position[0], abs=2e-6)

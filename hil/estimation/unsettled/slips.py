@@ -1,0 +1,41 @@
+"""Slips in recordings so clear that no estimate is made: it would take a minute and lead to nothing."""
+
+from collections.abc import Sequence
+
+from hil.errors import CsvError
+from hil.estimator.baselines.signs import suspect_absolute, suspect_signs
+from hil.estimator.data.recording import Recording
+
+CLEAR = 0.25
+"""Largest torque residual with the slip undone, relative to that of the recording as given."""
+
+WELL = 0.3
+"""Largest torque residual with the slip undone, relative to the torque."""
+
+
+def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
+    """Raise CsvError if a sign is reversed, or an angle counted from elsewhere, beyond doubt."""
+    absolute = suspect_absolute(recordings)
+    if absolute is not None and _is_clear(*absolute):
+        raise CsvError(
+            f"{source}: the angle of joint 2 seems to be counted from a fixed direction, such as the horizontal, "
+            f"instead of from link 1. With the difference of both angles, inverse dynamics leaves "
+            f"{_percent(absolute[0])} of the torque unexplained instead of {_percent(absolute[1])}. Set in "
+            '[columns] of --config ARM.toml: angles = "absolute"'
+        )
+    signs = suspect_signs(recordings)
+    if signs is not None and _is_clear(signs.residual, signs.residual_given):
+        columns = " and ".join(signs.signs.reversed_columns)
+        raise CsvError(
+            f"{source}: the sign of {columns} is reversed: with the sign changed, inverse dynamics leaves "
+            f"{_percent(signs.residual)} of the torque unexplained instead of {_percent(signs.residual_given)}. Change "
+            "the sign in the file, or exchange the columns."
+        )
+
+
+def _is_clear(residual: float, given: float) -> bool:
+    return residual < CLEAR * given and residual < WELL
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"

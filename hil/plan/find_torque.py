@@ -1,0 +1,13 @@
+"""How to find a safe peak torque, in the words of messages."""
+
+from hil.config.schema import Config
+
+
+def how_to_find_torque(config: Config) -> str:
+    """What finds a safe value of experiment.peak_torque for this arm."""
+    if config.is_chain or config.arm.link_lengths is not None:
+        return "`hil dry-run` finds a safe value."
+    return (
+        "`hil dry-run` finds a safe value, but it needs the length of each link: measure from joint to joint and to "
+        "the tip with a ruler, and set arm.link_lengths = [...] in m."
+    )
