@@ -61,7 +61,7 @@ CANNOT = (
 
 _BY_FORCE = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.OBSTACLE, Kind.SNAG, Kind.LOAD_CHANGED})
 COMMANDABLE = _BY_FORCE | {
-    *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP, Kind.CLOCK_RATE),
+    *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP),
     *(Kind.RAISED_LIMIT, Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG),
 }
 """Kinds after which every servo still hears, obeys and tells the truth."""
