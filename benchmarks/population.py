@@ -14,6 +14,8 @@ yes_but_wrong         share of the "yes" with an inertia, gravity or friction pa
                       friction is evaluated in the middle of the fitted multisine
 worst_percent_of_yes  largest such error of a "yes" [%]
 held_out_percent      largest held-out prediction error among the "yes", and its median [% of motion RMS]
+held_out_as_fitted_percent   the same with friction as it was in the fitted motion, where it has changed since: the
+                      above takes one factor per joint from the held-out motion itself
 cpu_seconds_*         processor time of the whole process
 arm_seconds_median    time for which the arm was driven
 """
@@ -68,6 +70,7 @@ class Outcome:
     beyond_predicted: float
     trust: str = ""
     held_out: float = 0.0
+    held_out_as_fitted: float = 0.0
     residual: float = 0.0
     model: str = ""
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -188,6 +191,9 @@ def _judged(outcome: Outcome, arm: DrawnArm, config: Config, result: dict[str, A
             **{name: getattr(outcome, name) for name in outcome.__dataclass_fields__},
             "trust": result["verdict"]["trust"],
             "held_out": max(result["validation"].get("held_out_rms", [np.nan])),
+            "held_out_as_fitted": max(
+                result["validation"].get("held_out_as_fitted_rms") or result["validation"].get("held_out_rms", [np.nan])
+            ),
             "residual": max(result["fit"]["residual_rms_ticks"]),
             "model": result["fit"]["model"],
             "errors": errors,
@@ -214,6 +220,10 @@ def figures(outcomes: list[Outcome]) -> dict[str, Any]:
         "worst_percent_of_yes": max((100 * abs(e[0]) for each in yes for e in each.wrong.values()), default=0.0),
         "held_out_percent": max((100 * each.held_out for each in yes), default=None),
         "held_out_percent_median": float(np.median([100 * each.held_out for each in yes])) if yes else None,
+        "held_out_as_fitted_percent": max((100 * each.held_out_as_fitted for each in yes), default=None),
+        "held_out_as_fitted_percent_median": float(np.median([100 * each.held_out_as_fitted for each in yes]))
+        if yes
+        else None,
         "cpu_seconds_median": float(np.median(cpu)),
         "cpu_seconds_p95": float(np.quantile(cpu, 0.95)),
         "arm_seconds_median": float(np.median([each.arm_seconds for each in outcomes])),

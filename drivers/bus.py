@@ -38,7 +38,7 @@ _SHARE, _MOST_SHARE = 0.6, 0.9
 """Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer."""
 
 MOST_STRANGERS = 2
-"""Tolerated number of foreign instructions heard during an experiment; a corrupted reply can look like one."""
+"""Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
 
 
 @dataclass(frozen=True)
@@ -317,7 +317,7 @@ class ServoBus:
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:
-            raise shared(f"has sent {exchange.strangers} instructions")
+            raise shared(f"has sent {exchange.strangers} packets, or made servos send them,")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def read_status_next(self) -> None:

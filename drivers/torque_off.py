@@ -34,7 +34,7 @@ _INTERRUPTS_BORNE = 5
 _TRIP_S = WATCHDOG_UNIT + 5e-3
 """Delay with which a watchdog may act after its time is over, since it counts in steps [s]."""
 
-_REPEATS, _REPEAT_S = 2, 0.003
+_REPEATS, _REPEAT_S = 2, 0.001
 """Further torque-off packets and the time between them [s]: one that meets a reply on the wire is lost."""
 
 

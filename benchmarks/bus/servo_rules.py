@@ -67,7 +67,6 @@ _COMMON = (
     Row(88, 2, 0, 16383, 0),
     Row(90, 2, 0, 16383, 0),
     Row(100, 2, -885, 885, limit=36),
-    Row(104, 4, -1023, 1023, limit=44),
     Row(108, 4, 0, 32767, 0),
     Row(112, 4, 0, 32767, 0),
     Row(116, 4, -1_048_575, 1_048_575, moves=True),
@@ -86,6 +85,7 @@ XM430_W350 = (
     Row(38, 2, 0, 1193, 1193),
     Row(44, 4, 0, 1023, 200),
     Row(102, 2, -1193, 1193, limit=38),
+    Row(104, 4, -1023, 1023, limit=44),
 )
 
 XL330_M288 = (
@@ -97,6 +97,7 @@ XL330_M288 = (
     Row(38, 2, 0, 1750, 1750),
     Row(44, 4, 0, 2047, 445),
     Row(102, 2, -1750, 1750, limit=38),
+    Row(104, 4, -2047, 2047, limit=44),
 )
 
 MODES = {0, 1, 3, 4, 5, 16}
@@ -128,8 +129,8 @@ class Rules:
         if row is None or wrong:
             return wrong
         value = int.from_bytes(data, "little", signed=(row.low or 0) < 0)
-        if address == OPERATING_MODE and value != self.held.get(address):
-            self._forget(FORGOTTEN_WITH_MODE)
+        if address == OPERATING_MODE:
+            self._switch_mode(value)
         if address in (36, 38, 44):
             self._forget((100, 102, 104))
         if address == TORQUE_ENABLE:
@@ -141,6 +142,14 @@ class Rules:
             return {FINE, DATA_LIMIT, DATA_RANGE}
         self.held[address] = value
         return {FINE}
+
+    def _switch_mode(self, mode: int) -> None:
+        """Switching resets gains to those of the mode, the profile to 0, goals to their limits."""
+        before = self.held.get(OPERATING_MODE)
+        self._forget(FORGOTTEN_WITH_MODE)
+        if before is not None and before != mode:  # whether the same mode again is a switch, nobody says
+            self.held |= {108: 0, 112: 0}
+            self.held |= {goal: self.held[limit] for goal, limit in ((100, 36), (102, 38)) if limit in self.held}
 
     def _wrong(self, address: int, data: bytes) -> set[int]:
         """Every reason to refuse a write of one register; which of several is answered, no manual says."""
@@ -183,8 +192,7 @@ class Rules:
         self.held = before
         if errors == {FINE}:
             self.waiting = address, data
-        elif FINE in errors:
-            self.waiting = None
+        elif FINE in errors:  # the caller knows which
             self._forget([address])
         return errors
 

@@ -1,6 +1,5 @@
 """Attacks on the servos, their motors and the program itself rather than on bytes."""
 
-import contextlib
 import os
 import resource
 import signal
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.fault_campaign.attack import ON_MOTORS, Attack, Kind
 from benchmarks.fault_campaign.witness import Witness
+from hil.drivers.packet import Instruction, encode
 from hil.fakes.servo.backup import RESET_ALL, factory_reset
 from hil.fakes.servo.servo import EmulatedServo
 
@@ -74,13 +74,18 @@ def overwrite_goals(attack: Attack, port: "Middle") -> None:
     """Write another goal, as a second master does that answers each of the program's commands."""
     for servo in port.bus._servos:
         if attack.concerns(servo.id) and servo.torque_enabled:
-            _write_goal(attack, servo)
+            address, goal = _write_goal(attack, servo)
+            if attack.kind == Kind.RIVAL:  # the program hears it as well
+                said = encode(servo.id, Instruction.WRITE, address.to_bytes(2, "little") + goal)
+                port.bus._wire.put(said, port.bus.time)
 
 
-def _write_goal(attack: Attack, servo: EmulatedServo) -> None:
-    with contextlib.suppress(KeyError):
-        goal = round(attack.amount * servo.value("Current Limit" if servo.operating_mode == 0 else "PWM Limit"))
-        servo.write(102 if servo.operating_mode == 0 else 100, goal.to_bytes(2, "little", signed=True))
+def _write_goal(attack: Attack, servo: EmulatedServo) -> tuple[int, bytes]:
+    address, limit = (102, "Current Limit") if servo.operating_mode == 0 else (100, "PWM Limit")
+    goal = round(attack.amount * servo.value(limit)) if limit in servo.memory else 0
+    data = goal.to_bytes(2, "little", signed=True)
+    servo.write(address, data)
+    return address, data
 
 
 def _touch(attack: Attack, servo: EmulatedServo, now: float) -> Undo | None:

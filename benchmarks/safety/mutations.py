@@ -41,7 +41,7 @@ TESTS = {
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
     "hil/experiment/stream.py": [f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"],
-    "hil/drivers/torque_off.py": ["tests/drivers/test_torque.py"],
+    "hil/drivers/torque_off.py": ["tests/drivers/test_torque_off.py"],
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
 }
 """Modules, and the tests that should detect mutations."""

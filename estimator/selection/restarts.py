@@ -47,16 +47,26 @@ def _ripple(
         yield found | {f"ripple_sin_{joint}": 0.0, f"ripple_cos_{joint}": 0.0}
 
 
+def bristles(estimate: Estimate, bend: float) -> list[dict[str, float]]:
+    """Return presliding parameters of each joint, by name, for bristles that slip when deflected by `bend` [rad]."""
+    parameters = estimate.parameters
+    return [
+        {
+            f"presliding_stiffness_{joint}": parameters[f"coulomb_{joint}"] / bend,
+            f"presliding_damping_{joint}": parameters[f"viscous_{joint}"],
+        }
+        for joint in range(1, estimate.model.joints + 1)
+    ]
+
+
 def _standstill(estimate: Estimate, joint: int, options: SelectionOptions) -> Iterator[Mapping[str, float]]:
     parameters = estimate.parameters
-    stiffness, damping, width = (
-        f"{kind}_{joint}" for kind in ("presliding_stiffness", "presliding_damping", "coulomb_width")
-    )
+    stiffness, width = f"presliding_stiffness_{joint}", f"coulomb_width_{joint}"
     if stiffness in estimate.names:
         for bend in options.initial_bends:
-            guess = parameters[f"coulomb_{joint}"] / bend
-            if abs(np.log(guess / parameters[stiffness])) > np.log(ALIKE_STIFFNESS):
-                yield {stiffness: guess, damping: parameters[f"viscous_{joint}"]}
+            guess = bristles(estimate, bend)[joint - 1]
+            if abs(np.log(guess[stiffness] / parameters[stiffness])) > np.log(ALIKE_STIFFNESS):
+                yield guess
     elif width in estimate.names:
-        for guess in options.initial_widths:
-            yield {width: guess}
+        for initial in options.initial_widths:
+            yield {width: initial}

@@ -23,7 +23,7 @@ from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_o
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
 from hil.estimator.selection.drift import Drift, friction_change
-from hil.estimator.selection.restarts import restarts
+from hil.estimator.selection.restarts import bristles, restarts
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
 
@@ -155,8 +155,20 @@ class Selection:
             if not self._is_explained(best):
                 best = self._better(self._with_ripple(near), best) or best
         best = self._steadied(best) or best
-        again = self._restarted(best)
+        again = self._with_bristles(self._restarted(best))
         return self._converged(best if again is best else self._steadied(again) or again)
+
+    def _with_bristles(self, best: Trial) -> Trial:
+        """Add presliding to a model that explains nearly everything, from where it is: a search would find no more."""
+        if best.estimate is None or "presliding" in best.model.options:
+            return best
+        richer = best.model.having("presliding")
+        for bend in self._options.initial_bends:
+            if self._is_explained(best):
+                break
+            values = {name: value for each in bristles(best.estimate, bend) for name, value in each.items()}
+            best = self._better(self._try_or_none(richer, best, values, coarse=True), best) or best
+        return best
 
     def _closest(self) -> list[Trial]:
         """Return the trials that explain most, with and without presliding, the best first.

@@ -56,7 +56,12 @@ class Evidence:
     """Evidence in addition to the estimate and its validation."""
 
     held_out: Array | None = None
-    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,)."""
+    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,).
+
+    Where friction has changed since the fitted motion, with one factor per joint taken from the held-out motion itself.
+    """
+    held_out_as_fitted: Array | None = None
+    """The same with friction as it was in the fitted motion (joints,); None where it has not changed."""
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None
@@ -76,7 +81,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         _noise(validation) if explained else _unexplained(estimate, validation, evidence),
         *(() if explained else _distorted(validation)),
         *_drifted(evidence.drift),
-        *_predicted(evidence.held_out),
+        *_predicted(evidence.held_out, evidence.held_out_as_fitted),
         *evidence.doubts,
         *evidence.notes,
         *_weak(validation),
@@ -198,11 +203,17 @@ def _warm_up(seconds: float) -> int:
     return int(WARM_UP_ROUNDING * np.ceil(WARM_UP_TIMES * seconds / WARM_UP_ROUNDING))
 
 
-def _predicted(held_out: Array | None) -> tuple[str, ...]:
+def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ...]:
     if held_out is None:
         return ("No held-out motion validated it: set experiment.held_out = true.",)
     worst = 100.0 * float(held_out.max())
-    return (f"It predicts a held-out motion to within {worst:.2g} % of that motion's RMS.",)
+    said = f"It predicts a held-out motion to within {worst:.2g} % of that motion's RMS"
+    if as_fitted is None:
+        return (f"{said}.",)
+    return (
+        f"{said} with friction as it was by then, one factor per joint taken from that motion itself; with friction as "
+        f"it was in the fitted motion, to within {100.0 * float(as_fitted.max()):.2g} %.",
+    )
 
 
 def _weak(validation: Validation) -> tuple[str, ...]:

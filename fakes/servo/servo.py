@@ -36,7 +36,7 @@ from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.power import Powered
 from hil.fakes.servo.present import Present
 from hil.fakes.servo.registers import BAUD_RATES, EmulatedModel, Register
-from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, WATCHDOG_TRIPPED, refusal
+from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, PROFILE, WATCHDOG_TRIPPED, refusal
 
 BOOT_S = 0.25
 """Time after Reboot during which a servo does not respond [s].
@@ -356,7 +356,7 @@ class EmulatedServo(Powered):
         self._forget_turns_in_position_mode()
         self.present.derive(self.supply_share)  # the mode determines whether Homing Offset applies
         self._reset_goals()
-        for name in GAINS:
+        for name in (*GAINS, *PROFILE):
             if name in self.memory:
                 self.memory.set(name, self.memory.registers[name].initial)
 

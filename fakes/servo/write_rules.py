@@ -19,6 +19,8 @@ GAINS = (
     "Feedforward 1st Gain",
 )
 
+PROFILE = ("Profile Acceleration", "Profile Velocity")
+
 WATCHDOG_TRIPPED = 0xFF
 
 _MULTI_TURN_LIMIT_TICKS = 256 * TICKS_PER_TURN

@@ -3,7 +3,8 @@
 The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from hil import strict_json
 from hil.cli.options import ConfigPath, Json, OutPath
 
 if TYPE_CHECKING:
+    from hil.api.progress import OnProgress, Progress
     from hil.api.run import Estimation, Identification
 
 TakeOver = Annotated[
@@ -21,6 +23,14 @@ TakeOver = Annotated[
 StartFrom = Annotated[
     Path | None,
     typer.Option("--from", metavar="RUN", help="Earlier run of the same arm: its result replaces the pilot's prior."),
+]
+Live = Annotated[
+    str,
+    typer.Option(
+        "--live",
+        metavar="WHERE",
+        help="Where to watch: terminal, or rerun (its viewer), rerun:FILE.rrd, rerun:URL; see docs/commands.md.",
+    ),
 ]
 Recordings = Annotated[
     list[Path],
@@ -43,31 +53,57 @@ def identify(
     out: OutPath = None,
     start_from: StartFrom = None,
     take_over: TakeOver = False,
+    live: Live = "terminal",
     json_only: Json = False,
 ) -> None:
     """Excite the arm, record one settled period, and print its parameters with error bars."""
     from hil.api.experiment import identify as identify_arm
-    from hil.cli.terminal import Terminal
 
-    with Terminal(quiet=json_only).following(config) as follow:
+    with _watching(config, live, json_only) as follow:
         result = identify_arm(config, out=out, take_over=take_over, start_from=start_from, on_progress=follow)
     _show(result, json_only)
 
 
-def record(config: ConfigPath, out: OutPath = None, take_over: TakeOver = False, json_only: Json = False) -> None:
+def record(
+    config: ConfigPath,
+    out: OutPath = None,
+    take_over: TakeOver = False,
+    live: Live = "terminal",
+    json_only: Json = False,
+) -> None:
     """Play the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
-    from hil.cli.terminal import Terminal
     from hil.next_step import next_step
     from hil.results.json_form import to_json
 
-    with Terminal(quiet=json_only).following(config) as follow:
+    with _watching(config, live, json_only) as follow:
         run = record_arm(config, out=out, take_over=take_over, on_progress=follow)
     if json_only:
         recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
         print(strict_json.dumps(recorded))
         return
     print(f"Run folder: {run.path}, {len(run.samples)} samples.\n{next_step('estimate', run.path)}")
+
+
+@contextmanager
+def _watching(config: Path, live: str, json_only: bool) -> "Iterator[OnProgress]":
+    """Show progress on the terminal and, if wanted, in the Rerun viewer."""
+    from hil.cli.terminal import Terminal
+    from hil.cli.views.rerun_view import rerun_view, wants_rerun
+
+    if live != "terminal" and not wants_rerun(live):
+        raise typer.BadParameter(f"--live {live}: known are terminal, rerun, rerun:FILE.rrd and rerun:URL.")
+    with Terminal(quiet=json_only).following(config) as follow:
+        if live == "terminal":
+            yield follow
+            return
+        with rerun_view(live, config) as show:
+
+            def both(report: "Progress") -> None:
+                follow(report)
+                show(report)
+
+            yield both
 
 
 def estimate(

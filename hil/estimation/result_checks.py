@@ -17,12 +17,17 @@ from hil.results.parts import (
 )
 
 
-def describe_validation(found: validation.Validation, held_out: NDArray[np.float64] | None) -> Validation:
-    """Convert the validation; held_out: relative prediction error of the held-out multisine (joints,), or None."""
+def describe_validation(
+    found: validation.Validation,
+    held_out: NDArray[np.float64] | None,
+    held_out_as_fitted: NDArray[np.float64] | None = None,
+) -> Validation:
+    """Convert the validation; held_out, held_out_as_fitted: as in `hil.estimator.selection.verdict.Evidence`."""
     first, second, correlation = found.confounded
     levels, lines = found.levels, found.levels.lines
     return Validation(
         held_out_rms=_listed(held_out),
+        held_out_as_fitted_rms=_listed(held_out_as_fitted),
         free_run_rms=_listed(found.free_run),
         residual_over_floor=_listed(found.residual_over_floor),
         correlated_lags=_listed(found.correlated_lags),

@@ -19,6 +19,7 @@ from hil.estimation.result_checks import describe_choice, describe_validation, d
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.supply import supply_notes, supply_sag
+from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.parameters import Physics
@@ -70,12 +71,13 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     if other is not None and drift is not None:
         played[HELD_OUT] = _predicted(estimate, other, drift, is_corrected)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
+    as_fitted = _as_fitted(estimate, other, drift)
     validation = validate(period, estimate)
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
     notes = supply_notes(config, supply_sag(config, samples))
-    evidence = Evidence(held_out, left_out, drift, wrong, notes, tried_all=choice is not None)
+    evidence = Evidence(held_out, as_fitted, left_out, drift, wrong, notes, tried_all=choice is not None)
     checks = Checks(
-        describe_validation(validation, held_out),
+        describe_validation(validation, held_out, as_fitted),
         describe_verdict(judge(estimate, validation, evidence)),
         (*warnings_of(config, facts, samples, period), *cut_short),
         None if choice is None else describe_choice(choice),
@@ -116,6 +118,13 @@ def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift, is_correc
     later = drift.at_the_later(estimate) if drift.is_seen else estimate
     predicted = predict_period(later, steadied(other, later, drift) if is_corrected else other)
     return PlayedPeriod(other.rate, other.torque, other.position, predicted)
+
+
+def _as_fitted(estimate: Estimate, other: SettledPeriod | None, drift: Drift | None) -> NDArray[np.float64] | None:
+    """Relative prediction error of the held-out period with the friction of the fitted one, where it has changed."""
+    if other is None or drift is None or not drift.is_seen:
+        return None
+    return relative_error(other.position, predict_period(estimate, other))
 
 
 def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:

@@ -33,7 +33,7 @@ from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
-from hil.plan.stabiliser import Stabiliser
+from hil.plan.stabiliser import Stabiliser, must_balance
 from hil.runs.recording import Phase, Recorder, missed
 from hil.setup.servo_session import has_moved
 
@@ -147,6 +147,8 @@ class Stream:
             self._note(f"{segment.role}: ramp out")
             self._play(self._ramps[number][1], Phase.RAMP_OUT)
         self._come_to_rest()
+        if self._stabiliser is not None and must_balance(self._config):
+            self._balance(self._stabiliser)
 
     def _rest(self) -> None:
         self._note("rest")
@@ -245,6 +247,18 @@ class Stream:
                 return
         told = ", ".join(f"{speed:.2f}" for speed in fastest)
         self._note(f"still moving at {told} rad/s after {self._safety.rest_time:g} s without current")
+
+    def _balance(self, stabiliser: Stabiliser) -> None:
+        """Bring an upright arm as close to balance as friction allows, or it falls over when torque is cut."""
+        window = rest_window(self._plan.rate)
+        state = self._play(self._silence(window), Phase.COMING_TO_REST)
+        stabiliser.balance()
+        for _ in range(window, self._plan.end_samples, window):
+            if stabiliser.is_balanced(self._config, state) and not self._moving(state):
+                self._note("balanced")
+                return
+            state = self._play(self._silence(window), Phase.COMING_TO_REST)
+        self._note("not balanced: without torque, friction may not hold the arm upright")
 
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
         """Send goal currents (samples, joints) [A], one row per tick; return the last state."""

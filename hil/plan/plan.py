@@ -88,7 +88,7 @@ class Plan:
         """Largest possible number of samples."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
-        still = self.rest_samples + 2 * self.end_samples
+        still = self.rest_samples + 3 * self.end_samples
         return still + self.warm_up_samples + played + self.brake_samples + self.lower_samples
 
     @property

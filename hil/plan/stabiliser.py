@@ -17,6 +17,18 @@ from hil.results.parts import StabiliserShare
 DELAY_SAMPLES = 1.5
 """Mean age of the state that a torque is based on: it is one sample old when sent, and is held for one more."""
 
+INTEGRAL_TIME_S = 1.0
+"""Time after which the integral of a constant deviation adds as much current as the spring."""
+
+BALANCED_RAD = 0.02
+"""Deviation from the rest pose up to which nothing is added any more: friction holds an arm that close to balance."""
+
+
+def must_balance(config: Config) -> bool:
+    """Whether gravity drives the arm away from its rest pose: once torque is off, only friction holds it there."""
+    above = np.sin(np.cumsum(config.arm.rest_pose)) > 0.0
+    return config.stabiliser is not None and not config.is_chain and config.arm.gravity > 0.0 and bool(above.any())
+
 
 class Stabiliser:
     """Adds spring and damper currents to a goal. A joint whose reply is missing keeps its previous contribution."""
@@ -34,15 +46,32 @@ class Stabiliser:
             )
         ]
         self._added = [0.0] * len(self._gains)
+        self._integral: list[float] | None = None
+        self._share = 1.0 / (INTEGRAL_TIME_S * config.experiment.rate)
+
+    def balance(self) -> None:
+        """From now on, add integral currents that bring the arm to its rest pose against friction and gravity."""
+        self._integral = [0.0] * len(self._gains)
+
+    @staticmethod
+    def is_balanced(config: Config, state: State) -> bool:
+        """Whether every joint is close enough to its rest pose for friction to hold it there."""
+        away = zip(state.position, config.arm.rest_pose, strict=True)
+        return all(abs(position - pose) <= BALANCED_RAD for position, pose in away)
 
     def add(self, goal: list[float], former: State | None) -> list[float]:
         """Goal currents [A] with the stabiliser's contribution added; former: the sample before this command."""
         if former is None:
             return goal
-        added = self._added
+        added, integral = self._added, self._integral
         for index, (spring, damper, pose) in enumerate(self._gains):
             if not former.missing[index]:
-                added[index] = spring * (pose - former.position[index]) - damper * former.velocity[index]
+                away = pose - former.position[index]
+                added[index] = spring * away - damper * former.velocity[index]
+                if integral is not None:
+                    if abs(away) > BALANCED_RAD:
+                        integral[index] += self._share * spring * away
+                    added[index] += integral[index]
         return [wanted + more for wanted, more in zip(goal, added, strict=True)]
 
 

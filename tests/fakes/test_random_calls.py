@@ -1,37 +1,51 @@
-"""dynamixel_sdk in random order against rules from the manual: the same answers, and the comparison is sharp."""
+"""dynamixel_sdk in random order against rules from the manual: the same answers, and the comparison is sharp.
 
-from dataclasses import replace
+In virtual time; `benchmarks/bus/random_calls.py` does the same over a terminal.
+"""
 
 import pytest
 
 from benchmarks.bus import random_calls
-from benchmarks.bus.servo_rules import XM430_W350, Rules
+from benchmarks.bus.random_calls import Client, call, servos
+from benchmarks.bus.servo_rules import XM430_W350, Row, Rules
+from hil.drivers.port import Port
+from hil.drivers.sdk_port import SdkPort
+from hil.fakes.protocol_fake import open_fake
 
-CALLS = 60
-
-
-def test_a_servo_answers_as_the_manual_says() -> None:
-    found, calls, _ = random_calls.differences(CALLS, seed=3)
-    assert found == []
-    assert len(calls) >= 12 and sum(calls.values()) > 3 * CALLS
+CALLS = 400
 
 
-def test_a_servo_that_holds_something_else_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = tuple(replace(row, initial=15) if row.address == 24 else row for row in XM430_W350)
-    monkeypatch.setitem(random_calls.TABLES, "XM430-W350", other)
-    monkeypatch.setattr(Rules, "learn", lambda *_: None)
+def client(seed: int) -> Client:
+    serial = open_fake(servos())
+    clock = serial.clock
+    return Client(SdkPort(Port("fake://", 1_000_000, serial)), seed, lambda s: clock.wait_until(clock.now() + s))
 
-    def factory_reset(client: random_calls.Client) -> None:
-        client.handler.factoryReset(client.port, 1, 2)
-        random_calls.time.sleep(random_calls.BOOT_S)
-        client.servos[1].factory_reset(())
 
-    monkeypatch.setattr(random_calls.Client, "step", factory_reset)
-    found, _, _ = random_calls.differences(1, seed=3)
-    assert found == []  # nothing has been compared since
-    monkeypatch.setattr(random_calls, "WHOLE_EVERY", 1)
-    found, _, _ = random_calls.differences(1, seed=3)
-    assert any("read 1 24, expected 15" in each for each in found)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_servo_answers_as_the_manual_says(seed: int) -> None:
+    asking = client(seed)
+    call(asking, CALLS)
+    assert asking.differences == []
+    assert len(asking.calls) >= 16 and sum(asking.calls.values()) > 3 * CALLS
+
+
+def changed(address: int, row: Row) -> tuple[Row, ...]:
+    return tuple(row if each.address == address else each for each in XM430_W350)
+
+
+@pytest.mark.parametrize(
+    ("address", "row", "named"),
+    [
+        (24, Row(24, 4, 0, 5000, 10), "expected {0}"),  # a wider range
+        (84, Row(84, 4, 0, 16383), "(2, 0"),  # longer
+    ],
+)
+def test_a_servo_that_differs_is_found(address: int, row: Row, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(random_calls.TABLES, "XM430-W350", changed(address, row))
+    asking = client(3)
+    call(asking, CALLS)
+    assert any(str(address) in each for each in asking.differences)
+    assert named.startswith("(") or any(named in each for each in asking.differences)
 
 
 @pytest.mark.parametrize(
@@ -48,3 +62,9 @@ def test_a_servo_that_holds_something_else_is_found(monkeypatch: pytest.MonkeyPa
 )
 def test_rules(address: int, data: bytes, torque: int, wanted: set[int]) -> None:
     assert Rules(XM430_W350, {64: torque}).write(address, data) == wanted
+
+
+def test_switching_the_mode_resets_the_profile() -> None:
+    rules = Rules(XM430_W350, {11: 3, 36: 885, 38: 1193, 108: 5, 112: 7, 84: 900})
+    rules.write(11, b"\x00")
+    assert [rules.expected(each) for each in (11, 84, 100, 102, 108, 112)] == [0, None, 885, 1193, 0, 0]

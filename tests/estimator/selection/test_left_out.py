@@ -121,3 +121,14 @@ def test_friction_that_fell_is_told(
     assert any("Friction of joint 1 fell by 8" in sentence or "fell by 7.9" in sentence for sentence in said)
     same = friction_change(recorded(ideal_arm, wave(2, PEAKS)), estimate, 30.0)
     assert not same.is_seen
+
+
+def test_a_prediction_that_takes_friction_from_the_held_out_motion_says_so(ideal_period: SettledPeriod) -> None:
+    estimate = identify(ideal_period, Model(2, "coulomb", "delay"))
+    validation = validate(ideal_period, estimate)
+    evidence = Evidence(held_out=np.array([0.001, 0.002]), held_out_as_fitted=np.array([0.03, 0.001]))
+    verdict = judge(estimate, validation, evidence)
+    (said,) = [each for each in verdict.sentences if "held-out" in each]
+    assert "0.2 %" in said and "from that motion itself" in said
+    assert "as it was in the fitted motion, to within 3 %" in said
+    assert verdict.trust == "yes"

@@ -164,3 +164,15 @@ def test_a_standstill_elsewhere_is_infinitely_different() -> None:
     played(repetition, np.full((1, 10), 0.5))
     played(repetition, np.full((1, 10), 0.6))
     assert repetition.difference == math.inf
+
+
+@pytest.mark.parametrize(("count", "unlike"), [(2, None), (3, 0)])
+def test_a_period_begins_without_a_doubt_from_the_one_before(count: int, unlike: int | None) -> None:
+    repetition = Repetition(10, 1, INTERVAL)
+    still = np.zeros((1, 10))
+    for _ in range(3):
+        played(repetition, still)
+    repetition.begin(10)
+    for index in range(count):  # 30 ms are three samples
+        repetition.add(index, [0.06])
+    assert repetition.unlike == unlike

@@ -4,13 +4,14 @@ from collections.abc import Callable
 
 import pytest
 
-from hil.config.schema import Config
+from hil.config.schema import Config, load_config
 from hil.drivers.state import Status
 from hil.errors import Cause
 from hil.experiment.status_check import StatusCheck
+from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
-FINE = Status(watchdog=3, goal=0.1, tick=1.0, torque=True, hardware_error=0)
+FINE = Status(watchdog=4, goal=0.1, tick=1.0, torque=True, hardware_error=0)
 
 
 @pytest.mark.parametrize(
@@ -18,8 +19,8 @@ FINE = Status(watchdog=3, goal=0.1, tick=1.0, torque=True, hardware_error=0)
     [
         ({"torque": False}, Cause.TORQUE_OFF, "Torque Enable reads 0"),
         ({"hardware_error": 32}, Cause.ALERT, "overload"),
-        ({"watchdog": 255}, Cause.WATCHDOG, "received nothing for 60 ms"),
-        ({"watchdog": 0}, Cause.WATCHDOG, "no longer protected: its Bus Watchdog reads 0 but was set to 3"),
+        ({"watchdog": 255}, Cause.WATCHDOG, "received nothing for 80 ms"),
+        ({"watchdog": 0}, Cause.WATCHDOG, "no longer protected: its Bus Watchdog reads 0 but was set to 4"),
         ({"watchdog": 5}, Cause.WATCHDOG, "no longer protected"),
     ],
 )
@@ -159,3 +160,32 @@ def test_a_clock_that_nobody_has_learnt_is_not_another_servos(arm: Arm) -> None:
     clocked(check, [6.5] * 3)
     wrong = [check.look_at_clock(0, 5.3 + now, now) for now in (0.4, 0.5)][-1]
     assert wrong is not None and "another servo's" not in wrong[1]
+
+
+def test_an_early_request_that_was_late_counts_for_nothing(arm: Arm) -> None:
+    """The clock is learnt anew from three readings after it."""
+    assert clocked(StatusCheck(arm()), [1.3, 1.0, 1.0, 0.9, 0.9]) == [False] * 5
+    check = StatusCheck(arm())
+    clocked(check, [1.3, 1.0])
+    assert not check.is_in_doubt
+
+
+def test_half_a_tick_of_a_voltage_is_that_of_12_volts() -> None:
+    """A goal of 1 tick of PWM is 12 V / 885."""
+    driven = load_config(CONFIGS / "xl430_two_link.toml")
+    tick = 12.0 / 885
+    for share, is_taken in ((0.45, True), (0.55, False)):
+        check = StatusCheck(driven)
+        for _ in range(2):
+            wrong = check.look(0, FINE._replace(goal=1.0 + share * tick), 1.0, 1.0)
+        assert (wrong is None) is is_taken
+
+
+def test_another_servos_clock_may_have_drifted_since_its_last_reading(arm: Arm) -> None:
+    """Two seconds after its last reading it may be 24 ms off."""
+    for lead, is_anothers in ((5.323, True), (5.326, False), (5.277, True), (5.274, False)):
+        check = StatusCheck(arm())
+        clocked(check, [5.3] * 5, joint=1)  # until 0.4 s
+        clocked(check, [6.5] * 3)
+        wrong = [check.look_at_clock(0, lead + now, now) for now in (2.3, 2.4)][-1]
+        assert wrong is not None and ("another servo's" in wrong[1]) is is_anothers

@@ -99,3 +99,22 @@ def test_a_signal_while_torque_is_being_cut_is_not_lost(
     assert "Torque is off on all 2 servos" in stop.value.__notes__[0]
     assert not any(servo.torque_enabled for servo in ports[0].bus.servos.values())
     assert "Torque is off on all 2 servos" in (run.path / "events.jsonl").read_text(encoding="utf-8")
+
+
+def test_after_the_torque_is_off_a_signal_ends_the_work_at_once_again() -> None:
+    with pytest.raises(StopRequested), StopRequest() as stop:
+        for _ in range(2):
+            with stop.only_noted():
+                pass
+        send()
+        raise AssertionError("it went on")
+
+
+def test_while_an_arm_is_lowered_only_a_further_signal_cuts_its_torque() -> None:
+    with pytest.raises(StopRequested), StopRequest() as stop, stop.only_noted():
+        send()
+        stop.check_again(stop.count)
+        send()
+        with pytest.raises(StopRequested):
+            stop.check_again(1)
+        stop.check_again(2)

@@ -1,14 +1,18 @@
 """Recordings of killed runs, stopped runs, and runs on a full disk; closing needs no further disk space."""
 
 import errno
+import mmap
 import os
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hil.drivers.state import Slow, State
 from hil.errors import RunFolderError
+from hil.runs import recording
 from hil.runs.recording import Phase, Recorder, load_samples, missed, sample_type
 
 NAN = float("nan")
@@ -104,3 +108,81 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     np.save(path, np.zeros(3))
     with pytest.raises(RunFolderError, match="does not have the row type of a recording of 2 joints"):
         load_samples(path, 2)
+
+
+def test_phases_are_numbered_as_in_recordings_made_before() -> None:
+    names = [
+        "NOT_RECORDED",
+        "REST",
+        "RAMP_IN",
+        "PERIODIC",
+        "RAMP_OUT",
+        "COMING_TO_REST",
+        "BRAKING",
+        "LOWERING",
+        "WARM_UP",
+    ]
+    assert [(phase.name, phase.value) for phase in Phase] == [(name, number) for number, name in enumerate(names)]
+
+
+class AtOnce:
+    """A background thread that does its work when it is told."""
+
+    made: list["AtOnce"]
+
+    def __init__(self, act: Callable[[int], None], most: int) -> None:
+        self.act, self.most, self.patience = act, most, 0.0
+        self.asked: list[int] = []
+        AtOnce.made.append(self)
+
+    def put(self, item: int) -> None:
+        self.asked.append(item)
+        self.act(item)
+
+    def close(self, patience: float) -> None:
+        self.patience = patience
+
+
+def test_pages_are_mapped_a_chunk_ahead_by_the_background(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mapped: list[tuple[int, int, int]] = []
+    kernel = SimpleNamespace(madvise=lambda start, size, advice: mapped.append((start.value, size.value, advice)))
+    AtOnce.made = []
+    monkeypatch.setattr(recording, "_libc", kernel)
+    monkeypatch.setattr(recording, "Background", AtOnce)
+    row = sample_type(2).itemsize
+    chunk = (1 << 20) // row
+    with Recorder(tmp_path / "samples.npy", 2, 2 * chunk + 5) as recorder:
+        (background,) = AtOnce.made
+        assert background.most == 4 and len(mapped) == 1, "the first chunk is mapped before the experiment"
+        first = recorder._samples.ctypes.data
+        for number in range(2 * chunk + 5):
+            recorder.keep(0.0, Phase.REST, 0, -1, state(number))
+            assert background.asked == [chunk * each for each in range(1, number // chunk + 2)]
+    assert background.patience == 1.0
+    starts = [first + chunk * row * each for each in range(3)]
+    ends = [*starts[1:], first + (2 * chunk + 5) * row]
+    assert len(mapped) == 3, "there is nothing beyond the last row"
+    for (page, size, advice), start, end in zip(mapped, starts, ends, strict=True):
+        assert page == start - start % mmap.PAGESIZE and page + size == end and advice == 23
+
+
+def test_rows_larger_than_a_chunk_are_mapped_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    AtOnce.made = []
+    monkeypatch.setattr(recording, "Background", AtOnce)
+    monkeypatch.setattr(recording, "_CHUNK_BYTES", 1)
+    with Recorder(tmp_path / "samples.npy", 2, 3) as recorder:
+        recorder.keep(0.0, Phase.REST, 0, -1, state(0))
+        recorder.keep(0.0, Phase.REST, 0, -1, state(1))
+    assert AtOnce.made[0].asked == [1, 2]
+
+
+def test_the_whole_file_is_reserved_and_an_empty_one_is_not_mapped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "posix_fallocate", lambda _, start, size: asked.append((start, size)))
+    path = tmp_path / "samples.npy"
+    recorder = Recorder(path, 2, 100)
+    assert asked == [(0, path.stat().st_size)]
+    recorder.close()
+    assert recorder.samples.shape == (0,) and recorder.samples.dtype == sample_type(2)

@@ -1,0 +1,164 @@
+"""Cutting torque, packet by packet: what is sent when, to a port and servos that only take notes."""
+
+import signal
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from hil.drivers.control_table import load_control_table
+from hil.drivers.errors import DriverError, NoReply, PortLost
+from hil.drivers.joint import Joint
+from hil.drivers.packet import BROADCAST_ID, Instruction, encode
+from hil.drivers.servo_model import Mode, servo_model
+from hil.drivers.torque_off import TorqueOff, cut_torque, disarm_watchdogs, signals_held_back
+from hil.fakes.bus.clock import VirtualClock
+
+WATCHDOG_S = 0.1
+OFF = 2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((64, 0, 1, 0, 1, 0, 2, 0)))
+ALL, FIRST, SECOND = "all", 1, 2
+JOINTS = [
+    Joint(name, number, servo_model("XM430-W350"), 1, 2048, Mode.CURRENT) for number, name in ((1, "a"), (2, "b"))
+]
+
+
+class Bench:
+    """A port and two servos. fails: what each write to a servo raises, in order; none after that."""
+
+    def __init__(self, **fails: list[BaseException]) -> None:
+        self.sent: list[tuple[object, float]] = []
+        self.attempts: list[int | None] = []
+        clock = VirtualClock()
+        self.port: Any = SimpleNamespace(clock=clock, write=self._note)
+        self.servos: dict[Joint, Any] = {}
+        for joint, name in zip(JOINTS, ("first", "second"), strict=True):
+            self.servos[joint] = self._servo(joint.id, fails.get(name, []))
+
+    def _note(self, data: bytes) -> None:
+        assert data == OFF
+        self.sent.append((ALL, round(self.port.clock.now(), 6)))
+
+    def _servo(self, number: int, failures: list[BaseException]) -> Any:
+        def write(register: str, value: int, attempts: int | None = None) -> None:
+            assert (register, value) in (("Torque Enable", 0), ("Bus Watchdog", 0))
+            self.sent.append((number, round(self.port.clock.now(), 6)))
+            self.attempts.append(attempts)
+            if failures:
+                raise failures.pop(0)
+
+        return SimpleNamespace(id=number, table=load_control_table("XM430-W350"), write=write)
+
+    def cut(self, *silent: Joint) -> Any:
+        self.interrupts: list[BaseException] = []
+        return cut_torque(self.port, self.servos, silent, WATCHDOG_S, self.interrupts)
+
+
+def test_all_are_told_twice_at_once_and_each_is_polled_once() -> None:
+    bench = Bench()
+    assert bench.cut() == (tuple(JOINTS), ())
+    assert [who for who, _ in bench.sent] == [ALL, FIRST, SECOND]
+    assert bench.attempts == [1, 1]
+
+
+def test_a_servo_that_does_not_answer_is_told_again_left_to_its_watchdog_and_polled_longer() -> None:
+    bench = Bench(first=[NoReply("nothing")])
+    assert bench.cut() == (tuple(JOINTS), ())
+    quiet = 0.002 + WATCHDOG_S + 0.025  # the watchdog counts in steps of 20 ms
+    assert bench.sent == [
+        *((who, 0.0) for who in (ALL, FIRST, ALL, SECOND)),
+        (ALL, 0.001),
+        (ALL, 0.002),
+        (ALL, quiet),
+        (FIRST, quiet),
+    ]
+    assert bench.attempts == [1, 1, None]
+
+
+def test_a_servo_that_was_silent_before_is_not_polled_until_its_watchdog_has_acted() -> None:
+    bench = Bench()
+    assert bench.cut(JOINTS[1]) == (tuple(JOINTS), ())
+    assert [who for who, _ in bench.sent] == [ALL, FIRST, ALL, ALL, ALL, SECOND]
+
+
+def test_one_that_is_never_confirmed_is_named_with_the_last_reason() -> None:
+    bench = Bench(second=[NoReply("silent"), DriverError()])
+    assert bench.cut() == ((JOINTS[0],), ((JOINTS[1], "DriverError"),))
+
+
+def test_on_a_lost_port_nothing_waits_and_the_silent_ones_are_tried_once() -> None:
+    bench = Bench(first=[PortLost("gone")])
+    confirmed, unconfirmed = bench.cut(JOINTS[1])
+    assert confirmed == (JOINTS[1],) and unconfirmed == ((JOINTS[0], "gone"),)
+    assert bench.sent == [(who, 0.0) for who in (ALL, FIRST, ALL, ALL, SECOND)]
+    assert bench.attempts == [1, 1]
+
+
+@pytest.mark.parametrize(("count", "confirmed"), [(4, True), (5, False)])
+def test_an_interrupted_write_is_repeated_five_times_at_most(count: int, confirmed: bool) -> None:
+    bench = Bench(first=[KeyboardInterrupt() for _ in range(count)])
+    assert (JOINTS[0] in bench.cut()[0]) is True, "it is tried again after the watchdog's time"
+    assert len(bench.interrupts) == count
+    assert [who for who, _ in bench.sent].count(FIRST) == (5 if confirmed else 6)
+
+
+def test_watchdogs_are_switched_off_whatever_fails() -> None:
+    bench = Bench(first=[NoReply("nothing")], second=[KeyboardInterrupt()])
+    interrupts: list[BaseException] = []
+    disarm_watchdogs(bench.servos, interrupts)
+    assert [who for who, _ in bench.sent] == [FIRST, SECOND, SECOND] and len(interrupts) == 1
+
+
+def test_what_is_said_of_one_servo_of_two_and_of_those_without_a_watchdog() -> None:
+    first, second = JOINTS
+    assert str(TorqueOff((first,), ())) == "Torque is off on the servo, read back."
+    assert str(TorqueOff((first, second), ())) == "Torque is off on all 2 servos, read back."
+    watched = str(TorqueOff((first,), ((second, "It is silent."),), frozenset((first,))))
+    assert (
+        "NOT CONFIRMED for JOINT 'B' (ID 2, XM430-W350): It is silent." in watched and "Bus Watchdog stops" in watched
+    )
+    unwatched = str(TorqueOff((first,), ((second, "It is silent."),), frozenset((second,))))
+    assert "NOTHING STOPS JOINT 'B' (ID 2, XM430-W350), which has no Bus Watchdog" in unwatched
+
+
+def test_the_result_cannot_be_changed() -> None:
+    with pytest.raises(AttributeError):
+        TorqueOff((), ()).confirmed = ()  # type: ignore[misc]
+
+
+def test_signals_are_raised_once_after_the_block() -> None:
+    came: list[int] = []
+    former = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    try:
+        with signals_held_back():
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
+            assert not came
+        assert came == [signal.SIGTERM]
+        signal.raise_signal(signal.SIGTERM)
+        assert len(came) == 2, "its handler is the former one"
+    finally:
+        signal.signal(signal.SIGTERM, former)
+
+
+def test_handlers_that_python_did_not_install_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed: list[int] = []
+    monkeypatch.setattr(signal, "getsignal", lambda number: None if number == signal.SIGHUP else signal.SIG_DFL)
+    monkeypatch.setattr(signal, "signal", lambda number, _: installed.append(number))
+    with signals_held_back():
+        pass
+    assert sorted(installed) == sorted(2 * [signal.SIGINT, signal.SIGTERM])
+
+
+def test_other_threads_touch_no_handler() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    inside: list[object] = []
+
+    def work() -> None:
+        with signals_held_back():
+            inside.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert inside == [before]
