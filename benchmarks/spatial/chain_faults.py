@@ -9,10 +9,10 @@ record, which the program never sees, decides:
 
 can command     the faults are of kinds that leave commands and readings true (`COMMANDABLE`), the record shows no
                 servo that was silent, disobeyed or told something false, and nothing held the arm by force
-unsafe          current that lasted longer than the bound: the time of the foreseen lowering if they could be commanded
-                or the arm was laid down, otherwise 100 ms (or the servos' watchdog, where one cannot be reached); or
-                links that
-                came closer to each other while motors drove them than in the undisturbed run, and touched
+unsafe          current that lasted longer than the bound: 100 ms, or the servos' watchdog, after a servo was silent or
+                the cable unplugged; otherwise the time in which the arm is lowered, which is watched all the way.
+                Links that came closer to each other while motors drove them than in the undisturbed run, and touched.
+                A joint that went further beyond its limits meanwhile than a lowering may
 lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
                 current was only switched off there
 """
@@ -59,9 +59,14 @@ CANNOT = (
 )
 """Reasons after which the arm cannot be commanded reliably."""
 
+UNREACHED = ("was not heard", "the cable was unplugged")
+"""Reasons after which a servo cannot be commanded at all."""
+
+MOST_BEYOND_RAD = 0.2
+
 _BY_FORCE = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.OBSTACLE, Kind.SNAG, Kind.LOAD_CHANGED})
 COMMANDABLE = _BY_FORCE | {
-    *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP, Kind.CLOCK_RATE),
+    *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP),
     *(Kind.RAISED_LIMIT, Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG),
 }
 """Kinds after which every servo still hears, obeys and tells the truth."""
@@ -82,7 +87,8 @@ class ChainOutcome:
 
     owed: why the run had to end, "" if there was no reason. can_command: see above; None if nothing stopped the run.
     lies: whether it ended lying in its rest pose. late_ms: how long current flowed after the reason. clearance: least
-    distance while motors drove the arm, beyond that of the undisturbed run if that is negative [m].
+    distance while motors drove the arm, beyond that of the undisturbed run if that is negative [m]. beyond: largest
+    overshoot beyond a position limit meanwhile [rad].
     """
 
     setting: Setting
@@ -92,6 +98,7 @@ class ChainOutcome:
     bound_ms: float
     lower_ms: float
     clearance: float
+    beyond: float
     stopped: bool
     can_command: bool
     lies: bool
@@ -104,7 +111,7 @@ class ChainOutcome:
     @property
     def unsafe(self) -> bool:
         is_late = self.late_ms > (self.lower_ms if self.lies else self.bound_ms)
-        return is_late or self.clearance < 0.0
+        return is_late or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
 
     @property
     def dropped(self) -> bool:
@@ -156,11 +163,14 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
     config, record = ready.config, story.record
     reasons = reasons_of(config, drawn, story, ready.undisturbed)
     time, driven = record["time"][:, 0], np.asarray(record["driven"].any(axis=1))
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    moved = record["position"][driven] if driven.any() else record["position"][:1]
     unheard = bool(set(drawn.kinds) & UNHEARD)
     cut_ms = max(BOUND_MS, 1e3 * config.safety.watchdog + TRIP_MS) if unheard else BOUND_MS
     lower_ms = 1e3 * (longest_lowering(ready.path) + SETTLES_S)
     cannot = [reason for reason in reasons if any(word in reason[0] for word in CANNOT)]
-    (owed, since), bound = _owed(reasons, cannot, cut_ms, lower_ms)
+    unreached = [reason for reason in cannot if any(word in reason[0] for word in UNREACHED)]
+    (owed, since), bound = _owed(reasons, unreached, cut_ms, lower_ms)
     flowed = time[driven & (time >= since)]
     stopped = bool(story.code)
     named, misleading = judge_words(drawn, story.text) if stopped else (True, False)
@@ -173,6 +183,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
         bound,
         lower_ms,
         _clearance(config, record) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
+        float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
         stopped,
         not cannot and _leaves_command(drawn, story.ended),
         _lies(config, record["position"][last[-1] if last.size else -1]),
@@ -184,9 +195,9 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
     )
 
 
-def _owed(reasons: list[Reason], cannot: list[Reason], cut_ms: float, lower_ms: float) -> tuple[Reason, float]:
+def _owed(reasons: list[Reason], unreached: list[Reason], cut_ms: float, lower_ms: float) -> tuple[Reason, float]:
     """The reason whose bound ends first, and the bound [ms]."""
-    ends = [(each, cut_ms if each in cannot else lower_ms) for each in reasons]
+    ends = [(each, cut_ms if each in unreached else lower_ms) for each in reasons]
     return min(ends, key=lambda pair: pair[0][1] + 1e-3 * pair[1], default=(("", np.inf), cut_ms))
 
 

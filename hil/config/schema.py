@@ -320,8 +320,11 @@ def _all_different(key: str, values: Sequence[int | str]) -> None:
 def _check_rest_pose(joint: JointConfig, rest: float) -> None:
     low, high = joint.position_limit
     if not low < rest < high:
+        where = "at the end of" if rest in (low, high) else "outside"
+        room = "; leave some room there" if rest in (low, high) else ""
         raise ValueError(
-            f"arm.rest_pose: {rest:g} rad for joint {joint.name!r} is outside its position_limit [{low:g}, {high:g}]"
+            f"arm.rest_pose: {rest:g} rad for joint {joint.name!r} is {where} its position_limit "
+            f"[{low:g}, {high:g}]{room}"
         )
 
 
