@@ -1,10 +1,15 @@
 """Random faults in every bundled configuration and rate; benchmarks/faults.py draws thousands."""
 
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from benchmarks.fault_campaign.arms import RATES, Setting, names, settings
+from benchmarks.fault_campaign.campaign import prepare
+from benchmarks.fault_campaign.judge import received
+from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.faults import campaign, figures
 
 INJECTIONS = 300
@@ -51,3 +56,17 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
 def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:
     assert {(each.name, each.rate) for each in settings()} == {(name, rate) for name in names() for rate in RATES}
     assert len(names()) >= 11
+
+
+def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_one_that_freezes_in_motion() -> None:
+    ready = prepare(Setting("fake_pendulum", 100), PERIOD_S)
+    heard = received(ready.config, ready.undisturbed)
+    assert has_healthy_twin(ready.config, heard, 2.0)
+    stuck = replace(heard, angle=np.full_like(heard.angle, heard.angle[0]), velocity=np.zeros_like(heard.velocity))
+    assert has_healthy_twin(ready.config, stuck, 2.0), "its friction may be as large"
+    moves = heard.time[:, None] < 1.2
+    at = int(moves.sum())
+    frozen = replace(
+        heard, angle=np.where(moves, heard.angle, heard.angle[at]), velocity=np.where(moves, heard.velocity, 0.0)
+    )
+    assert has_healthy_twin(ready.config, frozen, 1.2) and not has_healthy_twin(ready.config, frozen, 1.3)
