@@ -12,9 +12,9 @@ from benchmarks.fault_campaign.judge import received
 from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.faults import campaign, figures
 
-INJECTIONS = 300
+INJECTIONS = 312
 
-PERIOD_S = 1.0
+PERIOD_S = 1.2
 """Of the multisines: shorter than in the script's campaign, for the processor's sake."""
 
 PARTS = 2
