@@ -59,7 +59,7 @@ def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:
 
 
 def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_one_that_freezes_in_motion() -> None:
-    ready = prepare(Setting("fake_pendulum", 100), PERIOD_S)
+    ready = prepare(Setting("fake_pendulum", 100), 1.0)
     heard = received(ready.config, ready.undisturbed)
     assert has_healthy_twin(ready.config, heard, 2.0)
     stuck = replace(heard, angle=np.full_like(heard.angle, heard.angle[0]), velocity=np.zeros_like(heard.velocity))
