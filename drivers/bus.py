@@ -326,12 +326,9 @@ class ServoBus:
         """What was received in the last tenth of a second instead of complete replies in time; "" for nothing."""
         exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
         if exchange.late_at > since:
-            return "Replies came later than they were awaited, or twice: check the adapter, its latency and its driver."
+            return "Replies came later than they were awaited, or twice."
         if exchange.damaged_at > since:
-            return (
-                "Bytes came, but damaged, incomplete or late: check the cable, its ground and its length, the adapter, "
-                "and for a second servo with the same ID."
-            )
+            return "Bytes came, but damaged, incomplete or late."
         return ""
 
     def read_status_next(self) -> None:

@@ -25,9 +25,9 @@ NAMED = 0.95
 REFUSED = re.compile(r"fake_inverted at 20 Hz .*experiment\.rate = 20 is too low for the stabiliser", re.DOTALL)
 """A software spring that acts 75 ms late cannot hold an arm upright."""
 
-UNSAFE = 0.02
-"""Largest share of unsafe runs; the aim is 0. What is left: joints pushed or held by a hand in the first period of an
-arm without `arm.link_lengths`, of which nothing says how it should have moved (docs/safety.md).
+MOST_UNSAFE = 1
+"""Unsafe runs of each part; the aim is 0. What is left: a hand that pushes a heavy arm without `arm.link_lengths` from its
+first second on, of which little says how it should have moved (docs/safety.md).
 """
 
 EVERY_THIRD = 3
@@ -47,7 +47,7 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
     late = [each for each in outcomes if each.verdict.unsafe or each.beyond_limit]
     told = "\n\n".join(map(str, [*bad, *late]))
     assert not bad, told
-    assert len(late) <= UNSAFE * len(outcomes), told
+    assert len(late) <= MOST_UNSAFE, told
     counted = figures(outcomes)
     assert counted["unnamed"] <= (1 - NAMED) * counted["stopped"]
     assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it meets stops and runs that go on"
