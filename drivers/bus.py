@@ -39,7 +39,7 @@ _SHARE, _MOST_SHARE = 0.6, 0.9
 
 _RECENT_S = 0.1
 MOST_STRANGERS = 2
-"""Tolerated number of foreign instructions heard during an experiment; a corrupted reply can look like one."""
+"""Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
 
 
 @dataclass(frozen=True)
@@ -318,7 +318,7 @@ class ServoBus:
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:
-            raise shared(f"has sent {exchange.strangers} instructions")
+            raise shared(f"has sent {exchange.strangers} packets, or made servos send them,")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     @property

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from fastcrc import crc16
 
 from hil.drivers.control_table import Register
-from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction
+from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
 from hil.drivers.port import Port
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
@@ -97,13 +97,14 @@ class Exchange:
         self.damaged_at = self.late_at = -math.inf
         """When more bytes came than complete replies, and when a reply that was not awaited [s on the port's clock]."""
         self.strangers = 0
-        """Number of instruction packets received that this program did not send: another master is on the bus."""
+        """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
         self._write, *self._more_writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
         ]
         every = [*spans] if status is None else [*spans, status]
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
+        self._expected = frozenset().union(*(read.expected for read in self._reads))
         self._slow_spans = len(spans) - 1
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
         self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
@@ -232,7 +233,13 @@ class Exchange:
 
     def _look_for_strangers(self, received: bytes) -> None:
         if not self._echoes:
-            self.strangers += sum(not packet.is_status for packet in Framer().feed(received))
+            self.strangers += sum(self._is_strange(packet) for packet in _packets_within(received))
+
+    def _is_strange(self, packet: Packet) -> bool:
+        """Whether this is an instruction, or the answer to one, of another master. A refusal has no data."""
+        if not packet.is_status:
+            return True
+        return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _overhear(self, received: bytes) -> None:
         """Look at bytes that were pending before the request: another master's, or a late or second reply."""
@@ -283,6 +290,18 @@ class _GoalWrite:
         fields[2::2] = goal_ticks
         packet = self._pack(*fields)
         return packet + _pack_crc(_crc(packet))
+
+
+def _packets_within(received: bytes) -> list[Packet]:
+    """Return all whole packets, also those behind or within one that was cut off by a collision."""
+    found: list[Packet] = []
+    at = received.find(HEADER)
+    while at >= 0:
+        end = at + 7 + int.from_bytes(received[at + 5 : at + 7], "little")
+        packets = list(Framer().feed(received[at:end])) if end <= len(received) else []
+        found += packets
+        at = received.find(HEADER, end if packets else at + 1)
+    return found
 
 
 def _front(goal: Register, count: int) -> bytes:

@@ -1,6 +1,7 @@
 """The [fake] table of an arm's TOML file: the fake servos on the bus, and what they move."""
 
 import tomllib
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -185,6 +186,14 @@ def found_beside(folder: Path, name: str) -> Path:
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 
 
+def _known_names(name: str) -> str:
+    """What to say of a bare name that is no arm's."""
+    if "." in name or "/" in name:
+        return ""
+    close = get_close_matches(name, arm_names(), 1)
+    return f"; did you mean {close[0]}?" if close else f"; arms known by name: {', '.join(arm_names())}"
+
+
 def load_fake(path: Path | str) -> FakeArm:
     """Return the [fake] table of a TOML file or of a bundled arm given by name (see `hil.fakes.names`).
 
@@ -193,8 +202,8 @@ def load_fake(path: Path | str) -> FakeArm:
     try:
         text = find_arm(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        known = "" if "." in str(path) or "/" in str(path) else f"; arms known by name: {', '.join(arm_names())}"
-        raise DescriptionError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}{known}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise DescriptionError(f"{path}: cannot be read: {reason}{_known_names(str(path))}") from error
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -85,7 +85,7 @@ class Verdict:
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
     """Judge the run of `story`, into which `drawn` was injected."""
-    reasons = _reasons(config, drawn, story, undisturbed)
+    reasons = reasons_of(config, drawn, story, undisturbed)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
     driven = np.asarray(story.record["driven"].any(axis=1))
     time = story.record["time"][:, 0]
@@ -138,7 +138,7 @@ def causes_in(text: str) -> set[str]:
 Reason = tuple[str, float]
 
 
-def _reasons(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> list[Reason]:
+def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> list[Reason]:
     """Reasons why the current had to end, each with its time [s]."""
     record = story.record
     time = record["time"][:, 0]

@@ -141,7 +141,8 @@ def _check_shapes(recording: Recording) -> None:
     if recording.position_step.shape != position.shape[:1]:
         raise ShapeError(f"position_step has shape {recording.position_step.shape}; it must be {position.shape[:1]}")
     if time.size < FEWEST_SAMPLES:
-        raise RecordingError(f"the recording has {time.size} samples; at least {FEWEST_SAMPLES} are needed")
+        count = f"{time.size} sample{'' if time.size == 1 else 's'}"
+        raise RecordingError(f"the recording has {count}; at least {FEWEST_SAMPLES} are needed")
 
 
 def _check_times(recording: Recording) -> None:

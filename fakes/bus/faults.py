@@ -18,7 +18,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from hil.toml_errors import Described
+from hil.toml_errors import Described, describe
 
 
 class FaultKind(StrEnum):
@@ -266,6 +266,4 @@ def parse_fault(text: str) -> Fault:
     try:
         return Fault.model_validate(values)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        key = ".".join(map(str, detail["loc"]))
-        raise ValueError(f'fault "{text}": {key} = {detail["input"]!r}: {detail["msg"]}') from None
+        raise ValueError(describe(error, f'fault "{text}"', Fault)) from None

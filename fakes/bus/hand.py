@@ -5,7 +5,7 @@
     bus.hand.release(2)
 
 Moves can also be given in TOML, as `[[fake.moves]]` with the same keys, on the command line, as `--move 2:to=0.5,at=4`,
-and while a fake terminal is being served, with `hil fake --at /tmp/arm --move 2:to=0.5`.
+and while a fake terminal is being served, with `hil hand /tmp/arm 2:to=0.5`.
 
 The hand overcomes friction and gravity but never opposes motor torque: it releases a joint as soon as the torque of one
 of its servos comes on, and does not grip a joint whose torque is on.
@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from hil.fakes.bus.joints import Joints
 from hil.fakes.plants.plant import CanBeHeld, Plant, PlantError
-from hil.toml_errors import Described
+from hil.toml_errors import Described, describe
 
 _PULL_S = 0.01
 """Time constant with which the hand corrects the joint's deviation from the planned path [s]."""
@@ -176,6 +176,4 @@ def parse_move(text: str) -> Move:
     try:
         return Move.model_validate(values)
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        about = ".".join(map(str, detail["loc"]))
-        raise ValueError(f'move "{text}": {about + ": " if about else ""}{detail["msg"]}') from None
+        raise ValueError(describe(error, f'move "{text}"', Move)) from None

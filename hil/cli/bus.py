@@ -37,6 +37,8 @@ def scan(
     if port is None:
         print_ports(scanning.serial_ports(), json_only)
         return
+    for each in baud or ():
+        _check_baud(each)
     bauds = tuple(baud or BAUD_RATES)
     terminal = Terminal(quiet=json_only)
     opened = open_port(port_url(port), bauds[0])
@@ -48,6 +50,13 @@ def scan(
     print(json.dumps(scanned(heard))) if json_only else print_scan(heard, port)
     if not any(each.servos for each in heard):
         raise typer.Exit(1)
+
+
+def _check_baud(baud: int) -> None:
+    from hil.drivers.servo_model import BAUD_RATES
+
+    if baud not in BAUD_RATES:
+        raise typer.BadParameter(f"{baud}: servos support {', '.join(map(str, BAUD_RATES))}.")
 
 
 def check(config: ConfigPath, json_only: Json = False) -> None:
@@ -119,12 +128,12 @@ def setup(
     from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
-    from hil.drivers.servo_model import BAUD_RATES
     from hil.setup.servo_session import recover
     from hil.setup.servo_settings import open_servo, set_up
 
-    if new_baud is not None and new_baud not in BAUD_RATES:
-        raise typer.BadParameter(f"{new_baud}: servos support {', '.join(map(str, BAUD_RATES))}.")
+    for each in (baud, new_baud):
+        if each is not None:
+            _check_baud(each)
     if json_only and not yes:
         raise typer.BadParameter("--json cannot ask for confirmation: add --yes.")
     opened = open_port(port_url(port), baud)

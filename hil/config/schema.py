@@ -8,6 +8,7 @@ import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,7 +21,7 @@ from pydantic import (
 )
 
 from hil import fakes
-from hil.config.bundled import find_config, meant
+from hil.config.bundled import bundled_configs, find_config, meant
 from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.clearance import ClearanceConfig
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
@@ -32,7 +33,8 @@ from hil.drivers.bus import BusConfig
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode
 from hil.errors import ConfigError
 from hil.fakes.description import FakeArm, beside, found_beside
-from hil.fakes.names import find_arm
+from hil.fakes.names import arm_names, find_arm
+from hil.next_step import command
 from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
@@ -286,6 +288,13 @@ def parse_config(text: str, path: Path) -> Config:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
+    if "joints" not in values and "study" in values:
+        raise ConfigError(f"{path}: it describes a study, not an arm. Type: {command('study', path)}")
+    if "joints" not in values and "columns" in values:
+        raise ConfigError(
+            f"{path}: it describes the columns of a recording, not an arm. Type: "
+            f"{command('estimate', 'FILE.csv', '--config', path)}"
+        )
     if isinstance(values.get("fake"), dict):
         values["fake"] = beside(values["fake"], path.parent)
     arm = values.get("arm")
@@ -344,4 +353,9 @@ def _url_of(port: str) -> str:
     if config.suffix == ".toml" or config.is_file():
         return load_config(config).url
     arm = find_arm(port)
-    return f"{FAKE_URL}{arm}" if arm.suffix == ".toml" else port
+    if arm.suffix == ".toml":
+        return f"{FAKE_URL}{arm}"
+    close = get_close_matches(port, [*arm_names(), *bundled_configs()], 1, 0.8)
+    if close and not Path(port).exists():
+        raise ConfigError(f"{port}: there is no such port, file or arm; did you mean {close[0]}?")
+    return port

@@ -129,7 +129,8 @@ def _play(
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
-        note(f"stopped: {error} {bus.torque_off_report}")
+        cause = error.__context__ if isinstance(error, TorqueNotOff) else error
+        note(f"stopped: {cause or 'at its end:'} {bus.torque_off_report}")
         raise
 
 

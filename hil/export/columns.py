@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.export.source import Source
+from hil.export.source import Recorded
 
 COLUMN_UNITS = {
     "deadline": "s",
@@ -19,7 +19,7 @@ COLUMN_UNITS = {
 }
 
 
-def columns(source: Source) -> dict[str, NDArray[np.generic]]:
+def columns(source: Recorded) -> dict[str, NDArray[np.generic]]:
     """Columns (samples,) by name; columns that exist per joint are numbered from the base: position_1, position_2."""
     samples = source.samples
     found: dict[str, NDArray[np.generic]] = {}

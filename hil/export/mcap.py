@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hil import __version__, strict_json
+from hil import __version__
 from hil.errors import ExportError, RunFolderError
 from hil.export.columns import COLUMN_UNITS
 from hil.export.foxglove import (
@@ -22,7 +22,7 @@ from hil.export.foxglove import (
     transforms_schema,
 )
 from hil.export.moving_scene import moving_scene
-from hil.export.source import Source
+from hil.export.source import Recorded
 
 _SHOWN_HZ = 50.0
 """Rate of the frames [Hz]: as smooth as a screen shows."""
@@ -35,7 +35,7 @@ _PER_JOINT = (
 )
 
 
-def export_mcap(source: Source, path: Path) -> list[str]:
+def export_mcap(source: Recorded, path: Path) -> list[str]:
     """Write `path`. Each message is stamped with its sample's deadline relative to the start of the run. Needs mcap."""
     try:
         from mcap.writer import CompressionType, Writer
@@ -52,9 +52,9 @@ def export_mcap(source: Source, path: Path) -> list[str]:
     return []
 
 
-def _write(writer: Any, source: Source) -> None:
+def _write(writer: Any, source: Recorded) -> None:
     schema = writer.register_schema(name="hil.Sample", encoding="jsonschema", data=json.dumps(_schema()).encode())
-    topics = [f"/{joint.name}" for joint in source.model.joints]
+    topics = [f"/{name}" for name in source.joints]
     channels = [writer.register_channel(topic=topic, message_encoding="json", schema_id=schema) for topic in topics]
     samples = source.samples
     start = int(source.started * 1e9)
@@ -68,13 +68,14 @@ def _write(writer: Any, source: Source) -> None:
             data = json.dumps(message, allow_nan=False).encode()
             writer.add_message(channel_id=channel, log_time=stamp, publish_time=stamp, data=data, sequence=row)
     _write_scene(writer, source, start)
-    result = strict_json.dumps(source.result.to_json(), indent=2).encode()
-    writer.add_attachment(
-        create_time=start, log_time=start, name="result.json", media_type="application/json", data=result
-    )
+    if source.result is not None:
+        result = source.result_json.encode()
+        writer.add_attachment(
+            create_time=start, log_time=start, name="result.json", media_type="application/json", data=result
+        )
 
 
-def _write_scene(writer: Any, source: Source, start: int) -> None:
+def _write_scene(writer: Any, source: Recorded, start: int) -> None:
     """Write the arm's shapes once, and its frames wherever all joints were read."""
     scene = moving_scene(source.config)
     samples = source.samples

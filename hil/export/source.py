@@ -1,4 +1,4 @@
-"""The input of all exporters: one run folder, read once."""
+"""The input of all exporters, read once: the arm of a run folder, or its recording."""
 
 import json
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hil import strict_json
 from hil.arm_model import ArmModel
 from hil.config.schema import Config
 from hil.errors import RunFolderError
@@ -32,18 +33,43 @@ class Source:
         result = read_usable_result(run)
         return cls(run, result, model_of(result, run), link_length)
 
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording, whether or not it has been estimated.
+
+    joints: their names. result: what was estimated from it, None if nothing was.
+    """
+
+    run: Path
+    joints: tuple[str, ...]
+    result: Result | None
+
+    @classmethod
+    def open(cls, run: Path) -> "Recorded":
+        """Read a run folder; raises RunFolderError, and ResultError for a damaged result."""
+        from hil.runs.recording_folder import is_recording_folder
+
+        if is_recording_folder(run):
+            raise RunFolderError(
+                f"{run} is an estimate from another tool's recording: the samples are in its files. Export the "
+                "arm: urdf, mjcf, toml or json."
+            )
+        folder = RunFolder.open(run)
+        result = read_usable_result(run) if (folder.path / "result.json").is_file() else None
+        return cls(folder.path, tuple(joint.name for joint in folder.load_config().joints), result)
+
+    @property
+    def result_json(self) -> str:
+        """The result as JSON; an empty object if there is none."""
+        return strict_json.dumps({} if self.result is None else self.result.to_json(), indent=2)
+
     @cached_property
     def samples(self) -> NDArray[np.void]:
         """The recording's rows (hil.runs.recording.sample_type). Raises RunFolderError."""
         from hil.runs.recording import load_samples
-        from hil.runs.recording_folder import is_recording_folder
 
-        if is_recording_folder(self.run):
-            raise RunFolderError(
-                f"{self.run} is an estimate from another tool's recording: the samples are in its files. Export the "
-                "arm: urdf, mjcf, toml or json."
-            )
-        return load_samples(self.run / "samples.npy", len(self.model.joints))
+        return load_samples(self.run / "samples.npy", len(self.joints))
 
     @cached_property
     def config(self) -> Config:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hil import strict_json
 from hil.errors import ExportError, RunFolderError
 from hil.export.columns import columns, unit
-from hil.export.source import Source, write_text
+from hil.export.source import Recorded, write_text
+from hil.model_file import model_of
 
 
-def export_csv(source: Source, path: Path) -> list[str]:
+def export_csv(source: Recorded, path: Path) -> list[str]:
     """Write `path` with all digits; missing values are written as nan."""
     table = columns(source)
     text = io.StringIO()
@@ -26,7 +26,7 @@ def export_csv(source: Source, path: Path) -> list[str]:
     ]
 
 
-def export_parquet(source: Source, path: Path) -> list[str]:
+def export_parquet(source: Recorded, path: Path) -> list[str]:
     """Write `path` with the unit in each column's metadata and result.json in the file's. Needs pyarrow."""
     try:
         import pyarrow as pa
@@ -37,7 +37,7 @@ def export_parquet(source: Source, path: Path) -> list[str]:
     fields = [
         pa.field(name, pa.from_numpy_dtype(col.dtype), metadata={"unit": unit(name)}) for name, col in table.items()
     ]
-    schema = pa.schema(fields, metadata={"hil_result": strict_json.dumps(source.result.to_json())})
+    schema = pa.schema(fields, metadata={"hil_result": source.result_json})
     arrays = [pa.array(np.ascontiguousarray(column)) for column in table.values()]
     try:
         parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), path)
@@ -46,18 +46,19 @@ def export_parquet(source: Source, path: Path) -> list[str]:
     return []
 
 
-def export_mat(source: Source, path: Path) -> list[str]:
+def export_mat(source: Recorded, path: Path) -> list[str]:
     """Write `path` for MATLAB and Octave: structs `samples`, `units`, `parameters`, `std`, and result.json as text."""
     from scipy.io import savemat
 
     table = columns(source)
-    content = {
+    content: dict[str, object] = {
         "samples": dict(table),
         "units": {name: unit(name) for name in table},
-        "parameters": dict(source.model.values),
-        "std": dict(source.model.stds),
-        "result_json": strict_json.dumps(source.result.to_json()),
+        "result_json": source.result_json,
     }
+    if source.result is not None:
+        model = model_of(source.result, source.run)
+        content |= {"parameters": dict(model.values), "std": dict(model.stds)}
     try:
         savemat(path, content, oned_as="column", do_compression=True, long_field_names=True)
     except OSError as error:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hil.config.csv_columns import TICKS, Columns
 from hil.errors import CsvError
 from hil.estimator.data.recording import FEWEST_SAMPLES, LONGEST_GAP, Recording
+from hil.estimator.errors import RecordingError
 from hil.recordings.clean import Rows, cleaned
 from hil.recordings.encoder import encoder_step
 from hil.recordings.guess import guessed, said
@@ -61,7 +62,10 @@ def convert(table: Table, columns: Columns) -> Converted:
             f"{table.source}: no piece without a gap of more than {LONGEST_GAP:g} s is as long as a segment, "
             f"{whole.segment:g} s: record longer, or set columns.segment."
         )
-    recordings = tuple(Recording(each.time, each.torque, each.position, step, whole.between) for each in long)
+    try:
+        recordings = tuple(Recording(each.time, each.torque, each.position, step, whole.between) for each in long)
+    except RecordingError as error:
+        raise RecordingError(f"{table.source}: {error}") from error
     names = tuple(
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)
     )

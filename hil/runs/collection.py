@@ -76,7 +76,9 @@ def summarise(path: Path) -> RunSummary:
 
 
 def read_note(path: Path) -> Note:
-    """The note of a run, empty if there is none. Raises RunFolderError if it is damaged."""
+    """The note of a run, empty if there is none. Raises RunFolderError if it is damaged, or there is no run."""
+    if not _is_run(path):
+        raise RunFolderError(f"{path} is not a run folder: it has neither run.json nor samples.npy.")
     file = path / NOTE_FILE
     if not file.is_file():
         return Note()

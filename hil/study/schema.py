@@ -173,6 +173,11 @@ def load_study(path: Path) -> Study:
         raise ConfigError(f"{path}: not valid TOML: {error}.") from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
+    if "study" not in values and "joints" in values:
+        raise ConfigError(
+            f"{path}: it describes an arm, not a study. A study is a file of its own, with a [study] table that names "
+            "the arm's: see docs/scale.md."
+        )
     try:
         return Study(path=path, **values)
     except ValidationError as error:

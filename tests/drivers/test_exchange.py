@@ -122,6 +122,23 @@ def test_goals_that_cannot_be_sent_are_not_sent(goals: list[int]) -> None:
 
 # What comes back
 
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_what_another_master_sends_and_asks_for_is_counted_and_ones_own_late_replies_are_not(fast: bool) -> None:
+    own = fast_answer((1, 0, state(1, 2, 3)), (2, 0, state(4, 5, 6))) if fast else answer(1, 1, 2, 3)
+    refusal = encode_status(1, 7)
+    foreign = [
+        encode(1, Instruction.READ, b"\x84\x00\x04\x00"),
+        encode_status(1, 0, b"\0\x08\0\0"),
+        encode_status(9, 0, bytes(10)),
+    ]
+    cut_off = [own[:12] + packet for packet in foreign]  # where two transmissions meet, the first loses its end
+    for received, count in ((own, 0), (refusal, 0), (own[:-3], 0), *((packet, 1) for packet in foreign + cut_off)):
+        exchanging = exchange(Wire([received]), fast=fast)
+        exchanging.cycle([0, 0])
+        assert exchanging.strangers == count, received.hex()
+
+
 ticks16 = st.integers(-(2**15), 2**15 - 1)
 ticks32 = st.integers(-(2**31), 2**31 - 1)
 alerts = st.sampled_from([0, 0x80])

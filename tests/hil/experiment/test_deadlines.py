@@ -173,7 +173,7 @@ def test_waiting_for_a_slow_adapter_is_listening(arm: Arm) -> None:
 
 @pytest.mark.parametrize(
     ("late", "alone", "replies"),
-    [(0.0, False, 6), (0.0009, False, 6), (0.001, False, 20), (0.001, True, 6)],
+    [(0.0, False, 6), (0.0009, False, 6), (0.001, False, round(RATE * FAKE.safety.late_time)), (0.001, True, 6)],
 )
 def test_while_this_program_is_late_silence_of_all_may_be_the_computers(
     arm: Arm, late: float, alone: bool, replies: int

@@ -97,7 +97,7 @@ def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> No
     with pytest.raises(SafetyStop, match="other programs keep this computer busy: this program was late just before"):
         for number in range(1, 30):
             guard.look(at(number, silent))
-    assert number == 20, "50 ms, as for missed deadlines"
+    assert number == round(400 * arm().safety.late_time), "as for missed deadlines"
     guard.look(at(30, STILL))
     guard.woke_up(30 / 400, 0.0011)
     with pytest.raises(SafetyStop, match=r"Check its cable and its supply.$"):

@@ -10,7 +10,7 @@ import pytest
 from hil import load_model
 from hil.export.columns import columns
 from hil.export.formats import export
-from hil.export.source import Source
+from hil.export.source import Recorded
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_csv(run: Path) -> None:
     written = export(run, "csv")
     with written.path.open(encoding="utf-8", newline="") as file:
         head, *rows = csv.reader(file)
-    expected = columns(Source.open(run))
+    expected = columns(Recorded.open(run))
     assert head == list(expected)
     for name, text in zip(head, zip(*rows, strict=True), strict=True):
         found = np.array(text, dtype=np.float64).astype(expected[name].dtype)
@@ -56,7 +56,7 @@ def test_csv(run: Path) -> None:
 def test_parquet(run: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed: pip install 'hil[export]'")
     table = parquet.read_table(export(run, "parquet").path)
-    expected = columns(Source.open(run))
+    expected = columns(Recorded.open(run))
     assert table.column_names == list(expected)
     for name, column in expected.items():
         found = table[name].to_numpy()
@@ -71,7 +71,7 @@ def test_mat(run: Path) -> None:
     from scipy.io import loadmat
 
     file = loadmat(export(run, "mat").path, squeeze_me=True, simplify_cells=True)
-    expected = columns(Source.open(run))
+    expected = columns(Recorded.open(run))
     for name, column in expected.items():
         assert file["samples"][name].dtype == column.dtype
         np.testing.assert_array_equal(file["samples"][name], column)
@@ -82,7 +82,7 @@ def test_mat(run: Path) -> None:
 
 def test_mcap(run: Path) -> None:
     reader = pytest.importorskip("mcap.reader", reason="mcap is not installed: pip install 'hil[export]'")
-    samples = Source.open(run).samples
+    samples = Recorded.open(run).samples
     with export(run, "mcap").path.open("rb") as file:
         opened = reader.make_reader(file)
         found: dict[str, list[dict[str, float]]] = {"/shoulder": [], "/elbow": []}
@@ -101,3 +101,9 @@ def test_mcap(run: Path) -> None:
         for name in shared:
             np.testing.assert_array_equal([message[name] for message in found[topic]], samples[name])
     assert np.ptp(stamps) * 1e-9 == pytest.approx(np.ptp(samples["deadline"]), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["csv", "parquet", "mat", "mcap"])
+def test_a_recording_is_exported_before_it_is_estimated(run: Path, name: str) -> None:
+    (run / "result.json").unlink()
+    assert export(run, name).path.stat().st_size > 10_000
