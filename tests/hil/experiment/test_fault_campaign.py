@@ -26,8 +26,8 @@ REFUSED = re.compile(r"fake_inverted at 20 Hz .*experiment\.rate = 20 is too low
 """A software spring that acts 75 ms late cannot hold an arm upright."""
 
 MOST_UNSAFE = 1
-"""Unsafe runs of each part; the aim is 0. What is left: a hand that pushes a heavy arm without `arm.link_lengths` from its
-first second on, of which little says how it should have moved (docs/safety.md).
+"""Unsafe runs of each part; the aim is 0. What is left: a hand that pushes a heavy arm without `arm.link_lengths` from
+its first second on, of which little says how it should have moved (docs/safety.md).
 """
 
 EVERY_THIRD = 3
