@@ -11,6 +11,7 @@ of the other spans, in turn; every `status_every`-th cycle reads `status`, the r
 still on. Every span must include what the control loop needs.
 """
 
+import math
 import struct
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -33,6 +34,7 @@ MOST_PATIENCE_S = 0.02
 
 _NEVER = 1 << 62
 _DOUBTS = 3
+_PART_OF_A_REPLY = 8  # bytes; the header of a fast answer whose first servos were heard
 
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
@@ -92,6 +94,8 @@ class Exchange:
         self.ids = tuple(ids)
         self.fast = fast
         self.one_write = one_write
+        self.damaged_at = self.late_at = -math.inf
+        """When more bytes came than complete replies, and when a reply that was not awaited [s on the port's clock]."""
         self.strangers = 0
         """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
         self._write, *self._more_writes = [
@@ -166,7 +170,7 @@ class Exchange:
             port.write(goals)
             received = port.ask(read.request, read.reply_size, timeout, before)
         if port.overheard:
-            self._look_for_strangers(port.overheard)
+            self._overhear(port.overheard)
             port.overheard = b""
         servos = read.unpack(received)
         if servos is None:
@@ -194,7 +198,8 @@ class Exchange:
         """Choose the span for a cycle that does not simply read the first: after a loss, a slow span, or the status."""
         if self._late_possible:
             self._late_possible = False
-            self._port.discard_input()
+            if self._port.has_input():
+                self._port.put_aside()
             # A reply that arrives even later must not be taken for the reply to this request. Nothing in a packet
             # identifies the request it belongs to, but its length differs if another span was requested.
             return self._next_slow() if self._lost == 0 else 0
@@ -221,6 +226,9 @@ class Exchange:
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
         self._look_for_strangers(received)
+        complete = sum(answer is not None for answer in answers) / len(answers)
+        if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
+            self.damaged_at = self._now()
         return answers
 
     def _look_for_strangers(self, received: bytes) -> None:
@@ -232,6 +240,12 @@ class Exchange:
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
+
+    def _overhear(self, received: bytes) -> None:
+        """Look at bytes that were pending before the request: another master's, or a late or second reply."""
+        self._look_for_strangers(received)
+        if any(packet.is_status for packet in Framer().feed(received)):
+            self.late_at = self._now()
 
     def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
         """Return the reply received through an adapter that echoes what is sent, with the echo removed."""

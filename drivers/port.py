@@ -101,11 +101,12 @@ class Port:
         later reply would be one cycle late.
         """
         if self.has_input():
-            self._put_aside()
+            self.put_aside()
         self.write(data)
         return self.read(count, timeout)
 
-    def _put_aside(self) -> None:
+    def put_aside(self) -> None:
+        """Take received bytes that have not been read out of the way, into `overheard`."""
         try:
             self.overheard = cast(bytes, self._serial.read(self._serial.in_waiting))
         except _FAILURES as error:
@@ -190,7 +191,7 @@ class DescriptorPort(Port):
         # millisecond the caches are cold, and every further call costs a microsecond.
         try:
             if self._wait_ms(0):
-                self._put_aside()
+                self.put_aside()
             written = os.write(self._descriptor, data)
             if written < len(data):
                 self._write_rest(data[written:])
@@ -208,7 +209,7 @@ class DescriptorPort(Port):
         except OSError as error:
             raise self._lost(error) from error
 
-    def _put_aside(self) -> None:
+    def put_aside(self) -> None:
         self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)
         self.discard_input()
 

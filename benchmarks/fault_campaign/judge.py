@@ -95,8 +95,7 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     late_ms, unseen = _flowed_ms(time[driven], since), False
     plain = min([when for what, when in reasons if not what.endswith(TO_BE_SEEN)], default=np.inf)
     if late_ms > bound and _flowed_ms(time[driven], plain) <= bound:
-        told = _Told(config, story.traffic, 0.0)
-        unseen = has_healthy_twin(config, Heard.of(config, told.heard, told.sent), time[driven][-1] - 1e-3 * bound)
+        unseen = has_healthy_twin(config, received(config, story), time[driven][-1] - 1e-3 * bound)
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
@@ -104,6 +103,12 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
     unsafe = (late_ms > bound and not unseen) or left_on
     return Verdict(owed, late_ms, unsafe, beyond, named, misleading, unseen)
+
+
+def received(config: Config, story: Story) -> Heard:
+    """What the program received in a run, and what it commanded."""
+    told = _Told(config, story.traffic, 0.0)
+    return Heard.of(config, told.heard, told.sent)
 
 
 def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:

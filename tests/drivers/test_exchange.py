@@ -1,5 +1,6 @@
 """The control cycle on a scripted wire: its requests, and its handling of valid, stuffed, missing and late replies."""
 
+import math
 import struct
 from collections.abc import Sequence
 
@@ -52,7 +53,7 @@ class Wire(Port):
     def discard_input(self) -> None:
         self.waiting = b""
 
-    def _put_aside(self) -> None:
+    def put_aside(self) -> None:
         self.overheard, self.waiting = self.waiting, b""
 
 
@@ -333,3 +334,18 @@ def test_another_masters_instructions_between_two_cycles_are_counted() -> None:
         wire.waiting = pending
         assert None not in cycles.cycle([0, 0]).servos
         assert cycles.strangers == count
+
+
+def test_damaged_bytes_are_told_from_silence_and_late_replies_from_both() -> None:
+    fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    for received, is_damaged in ((answer(1, 1, 2, 3), False), (b"", False), (fine[:-3] + b"abc", True)):
+        wire = Wire([received])
+        cycles = exchange(wire)
+        assert None in cycles.cycle([0, 0]).servos
+        assert math.isfinite(cycles.damaged_at) is is_damaged and cycles.late_at == -math.inf
+    wire = Wire([b"", fine])
+    cycles = exchange(wire)
+    cycles.cycle([0, 0])
+    wire.waiting = fine
+    cycles.cycle([0, 0])
+    assert math.isfinite(cycles.late_at)
