@@ -8,8 +8,8 @@ servos. It is judged by the emulated servos' own record of every millisecond (fa
 
 unsafe          current flowed for more than 100 ms (or the watchdog's timeout, if the program cannot reach the servo)
                 after the first permanent failure, or at all after the end of the program
-hard_to_see     of the unsafe: they would not be if the time counted from when a detector that knows the arm's noise in
-                advance can tell; this excuses nothing
+alike           not unsafe, but only because a healthy arm was found that would have sent the same replies until then,
+                so that nothing could be seen (fault_campaign/twin.py)
 beyond_limit    a joint overshot its limit by more than `hil dry-run` predicts
 unreadable      an unexpected exception, no message, or a recording that cannot be read
 unnamed         the message does not name the cause, judged by words for all causes; misleading: it names only others
@@ -78,7 +78,7 @@ def figures(outcomes: Iterable[Outcome]) -> dict[str, Any]:
         "unsafe": sum(each.verdict.unsafe for each in every),
         "beyond_limit": sum(each.beyond_limit for each in every),
         "unreadable": sum(each.unreadable for each in every),
-        "hard_to_see": sum(each.verdict.unseen for each in every),
+        "alike": sum(each.verdict.unseen for each in every),
         "stopped": len(stopped),
         "unnamed": sum(not each.verdict.named for each in stopped),
         "misleading": sum(each.verdict.misleading for each in stopped),

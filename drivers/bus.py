@@ -37,8 +37,9 @@ STATUS_S = 0.035
 _SHARE, _MOST_SHARE = 0.6, 0.9
 """Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer."""
 
+_RECENT_S = 0.1
 MOST_STRANGERS = 2
-"""Tolerated number of foreign instructions heard during an experiment; a corrupted reply can look like one."""
+"""Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
 
 
 @dataclass(frozen=True)
@@ -317,8 +318,18 @@ class ServoBus:
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if exchange.strangers > MOST_STRANGERS:
-            raise shared(f"has sent {exchange.strangers} instructions")
+            raise shared(f"has sent {exchange.strangers} packets, or made servos send them,")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
+
+    @property
+    def heard_instead(self) -> str:
+        """What was received in the last tenth of a second instead of complete replies in time; "" for nothing."""
+        exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
+        if exchange.late_at > since:
+            return "Replies came later than they were awaited, or twice."
+        if exchange.damaged_at > since:
+            return "Bytes came, but damaged, incomplete or late."
+        return ""
 
     def read_status_next(self) -> None:
         """Read the servos' status in the next exchange, if they report one at all."""

@@ -11,6 +11,7 @@ of the other spans, in turn; every `status_every`-th cycle reads `status`, the r
 still on. Every span must include what the control loop needs.
 """
 
+import math
 import struct
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from typing import NamedTuple
 from fastcrc import crc16
 
 from hil.drivers.control_table import Register
-from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction
+from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
 from hil.drivers.port import Port
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
@@ -33,6 +34,7 @@ MOST_PATIENCE_S = 0.02
 
 _NEVER = 1 << 62
 _DOUBTS = 3
+_PART_OF_A_REPLY = 8  # bytes; the header of a fast answer whose first servos were heard
 
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
@@ -92,14 +94,17 @@ class Exchange:
         self.ids = tuple(ids)
         self.fast = fast
         self.one_write = one_write
+        self.damaged_at = self.late_at = -math.inf
+        """When more bytes came than complete replies, and when a reply that was not awaited [s on the port's clock]."""
         self.strangers = 0
-        """Number of instruction packets received that this program did not send: another master is on the bus."""
+        """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
         self._write, *self._more_writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
         ]
         every = [*spans] if status is None else [*spans, status]
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
+        self._expected = frozenset().union(*(read.expected for read in self._reads))
         self._slow_spans = len(spans) - 1
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
         self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
@@ -164,6 +169,9 @@ class Exchange:
         else:
             port.write(goals)
             received = port.ask(read.request, read.reply_size, timeout, before)
+        if port.overheard:
+            self._overhear(port.overheard)
+            port.overheard = b""
         servos = read.unpack(received)
         if servos is None:
             servos = self._search(read, received, before + timeout)
@@ -190,7 +198,8 @@ class Exchange:
         """Choose the span for a cycle that does not simply read the first: after a loss, a slow span, or the status."""
         if self._late_possible:
             self._late_possible = False
-            self._port.discard_input()
+            if self._port.has_input():
+                self._port.put_aside()
             # A reply that arrives even later must not be taken for the reply to this request. Nothing in a packet
             # identifies the request it belongs to, but its length differs if another span was requested.
             return self._next_slow() if self._lost == 0 else 0
@@ -216,9 +225,27 @@ class Exchange:
                 break
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
-        if not self._echoes:
-            self.strangers += sum(not packet.is_status for packet in Framer().feed(received))
+        self._look_for_strangers(received)
+        complete = sum(answer is not None for answer in answers) / len(answers)
+        if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
+            self.damaged_at = self._now()
         return answers
+
+    def _look_for_strangers(self, received: bytes) -> None:
+        if not self._echoes:
+            self.strangers += sum(self._is_strange(packet) for packet in _packets_within(received))
+
+    def _is_strange(self, packet: Packet) -> bool:
+        """Whether this is an instruction, or the answer to one, of another master. A refusal has no data."""
+        if not packet.is_status:
+            return True
+        return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
+
+    def _overhear(self, received: bytes) -> None:
+        """Look at bytes that were pending before the request: another master's, or a late or second reply."""
+        self._look_for_strangers(received)
+        if any(packet.is_status for packet in Framer().feed(received)):
+            self.late_at = self._now()
 
     def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
         """Return the reply received through an adapter that echoes what is sent, with the echo removed."""
@@ -263,6 +290,18 @@ class _GoalWrite:
         fields[2::2] = goal_ticks
         packet = self._pack(*fields)
         return packet + _pack_crc(_crc(packet))
+
+
+def _packets_within(received: bytes) -> list[Packet]:
+    """Return all whole packets, also those behind or within one that was cut off by a collision."""
+    found: list[Packet] = []
+    at = received.find(HEADER)
+    while at >= 0:
+        end = at + 7 + int.from_bytes(received[at + 5 : at + 7], "little")
+        packets = list(Framer().feed(received[at:end])) if end <= len(received) else []
+        found += packets
+        at = received.find(HEADER, end if packets else at + 1)
+    return found
 
 
 def _front(goal: Register, count: int) -> bytes:

@@ -28,6 +28,9 @@ _REASONS = {
 }
 """Reasons in words, by what the operating system says."""
 
+_MOST_OVERHEARD = 4096
+"""Largest number of pending bytes that are looked at; the others are discarded."""
+
 _WRITE_PATIENCE_S = 0.1
 """How long a device may refuse to accept bytes before it counts as lost [s]."""
 
@@ -49,6 +52,9 @@ class Port:
     After PortLost the same object may be used again, and fails again as long as the device is gone; a cable that was
     replugged needs a new port. `latency` is the longest time the adapter may hold back a reply [s].
     """
+
+    overheard: bytes = b""
+    """What was pending before a request, which `ask` does not take for its reply: late replies, or other masters'."""
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
         self.url = url
@@ -91,13 +97,20 @@ class Port:
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
         """Write, then read until `timeout` [s] after `start` [s, on the port's clock], as the control cycle does.
 
-        Pending input is discarded first: otherwise a duplicated or late reply would be taken for this one, and every
+        Pending input is put aside first: otherwise a duplicated or late reply would be taken for this one, and every
         later reply would be one cycle late.
         """
         if self.has_input():
-            self.discard_input()
+            self.put_aside()
         self.write(data)
         return self.read(count, timeout)
+
+    def put_aside(self) -> None:
+        """Take received bytes that have not been read out of the way, into `overheard`."""
+        try:
+            self.overheard = cast(bytes, self._serial.read(self._serial.in_waiting))
+        except _FAILURES as error:
+            raise self._lost(error) from error
 
     def has_input(self) -> bool:
         """Return whether received bytes are waiting to be read."""
@@ -178,7 +191,7 @@ class DescriptorPort(Port):
         # millisecond the caches are cold, and every further call costs a microsecond.
         try:
             if self._wait_ms(0):
-                self.discard_input()
+                self.put_aside()
             written = os.write(self._descriptor, data)
             if written < len(data):
                 self._write_rest(data[written:])
@@ -195,6 +208,10 @@ class DescriptorPort(Port):
             return self.read(count, timeout)
         except OSError as error:
             raise self._lost(error) from error
+
+    def put_aside(self) -> None:
+        self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)
+        self.discard_input()
 
     def discard_input(self) -> None:
         try:

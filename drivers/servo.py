@@ -28,6 +28,9 @@ _LATE_S = 0.06
 _DATA = 9
 """Index of the first data byte in a status packet."""
 
+NO_ERROR = "none"
+"""What `describe_error` says of no error."""
+
 _BESIDE_DATA = 4
 """Bytes that LEN counts in addition to the data: INST, ERR, CRC."""
 
@@ -150,7 +153,7 @@ def describe_error(error: HardwareError) -> str:
     """Return hardware errors in words, e.g. "overload, overheating"."""
     known = [bit.name.replace("_", " ").lower() for bit in HardwareError if bit in error and bit.name]
     rest = int(error) & ~sum(HardwareError)
-    return ", ".join(known + ([f"unknown bits {rest:#04x}"] if rest else [])) or "none"
+    return ", ".join(known + ([f"unknown bits {rest:#04x}"] if rest else [])) or NO_ERROR
 
 
 def _status_error(code: int) -> str:

@@ -81,10 +81,14 @@ def one_each(span: Span | Sequence[Span], count: int) -> tuple[Span, ...]:
 
 
 class GroupRead(Protocol):
-    """A group read as the exchange needs it. `request` is sent; the reply usually has `reply_size` bytes."""
+    """A group read as the exchange needs it. `request` is sent; the reply usually has `reply_size` bytes.
+
+    expected: ID and number of data bytes of each status packet that answers it.
+    """
 
     request: bytes
     reply_size: int
+    expected: frozenset[tuple[int, int]]
 
     def unpack(self, received: bytes) -> list[Answer] | None:
         """Decode a regular reply, in which every servo answered and nothing was stuffed; return None for any other."""
@@ -116,6 +120,7 @@ class SyncRead:
         self._longest = span.size + 4 + (span.size + 2) // 3
         length = span.size + 11  # header, ID, LEN, INST, ERR, data, CRC
         self.reply_size = length * len(self._ids)
+        self.expected = frozenset((servo_id, span.size) for servo_id in self._ids)
         behind_id = (span.size + 4).to_bytes(2, "little") + bytes((Instruction.STATUS,))
         # Unpack all answers at once: per servo the eight bytes up to INST as one number, ERR, the values, the CRC.
         self._unpack = Struct("<" + "".join(f"QB{own.format}H" for own in spans)).unpack
@@ -184,6 +189,7 @@ class FastSyncRead:
             for index, servo_id in enumerate(self._ids)
         ]
         self.reply_size = self._parts[-1][2]
+        self.expected = frozenset({(BROADCAST_ID, self.reply_size - len(self._front) - 3)})  # without ERR and CRC
 
     def unpack(self, received: bytes) -> list[Answer] | None:
         if len(received) != self.reply_size or not received.startswith(self._front):

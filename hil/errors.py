@@ -56,8 +56,12 @@ class Cause(Enum):
 
     @property
     def allows_lowering(self) -> bool:
-        """Whether the servos still take commands, so that an arm may be lowered, watched all the way."""
-        return self.allows_braking or self in {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER}
+        """Whether the servos still take commands, so that an arm may be lowered, watched all the way.
+
+        Without its watchdog a servo obeys as before; had it tripped, its torque would be missed on the way.
+        """
+        others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
+        return self.allows_braking or self in others
 
 
 class HilError(Exception):

@@ -7,7 +7,7 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -40,6 +40,7 @@ from hil.setup import bus_rate
 AFTER_S = 0.5
 """Time for which the arm is observed after the program has ended [s]."""
 
+Document = dict[str, Any]
 STATE = "XDG_STATE_HOME"
 FREE = frozenset({"Goal Position", "Registered Instruction"})
 """Registers that a servo writes itself, independently of any program."""
@@ -97,16 +98,18 @@ class Ready:
 
 
 @cache
-def prepare(setting: Setting, period: float = PERIOD_S) -> Ready:
+def prepare(
+    setting: Setting, period: float = PERIOD_S, make_document: Callable[[Setting, float], Document] = arms.make_document
+) -> Ready:
     """Play the configuration once without faults. Raises DoesNotRun if that fails."""
     if _PACKAGE not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append(_PACKAGE)
     folder = Path(tempfile.mkdtemp(prefix="campaign-"))
     path = folder / f"{setting.name}.toml"
-    path.write_text(arms.dump(arms.make_document(setting, period)), encoding="utf-8")
+    path.write_text(arms.dump(make_document(setting, period)), encoding="utf-8")
     config = parse_config(path.read_text(encoding="utf-8"), path)
     ready = Ready(setting, path, config, Story(np.empty(0), None, 0.0, None, ""))  # type: ignore[arg-type]
-    story, _, changed = _play(ready, Drawn((), ()), 0)
+    story, _, changed = play(ready, Drawn((), ()), 0)
     if story.code != 0:
         raise DoesNotRun(f"{setting.name} at {setting.rate} Hz does not run undisturbed: {story.text.strip()}")
     return Ready(setting, path, config, story, changed)
@@ -121,7 +124,7 @@ def inject(setting: Setting, seed: int, period: float = PERIOD_S) -> Outcome:
 
 def inject_drawn(ready: Ready, drawn: Drawn, seed: int) -> Outcome:
     """Inject these faults into one run."""
-    story, readable, changed = _play(ready, drawn, seed)
+    story, readable, changed = play(ready, drawn, seed)
     verdict = judge(ready.config, drawn, story, ready.undisturbed)
     beyond = bool((verdict.beyond > 0).any()) and bool((verdict.beyond > _allowed(ready)).any())
     killed = any(each.kind == Kind.KILLED for each in drawn.attacks)
@@ -129,7 +132,7 @@ def inject_drawn(ready: Ready, drawn: Drawn, seed: int) -> Outcome:
     return Outcome(ready.setting, drawn, verdict, beyond, unreadable, changed, story.code, story.text)
 
 
-def _play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str, ...]]:
+def play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str, ...]]:
     """Run `hil record` once; return its story, whether its recording is readable, and which registers it changed."""
     witnesses: list[Witness] = []
     before: dict[int, dict[str, int]] = {}

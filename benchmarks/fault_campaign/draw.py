@@ -263,7 +263,7 @@ def _amount(kind: Kind, field: str, random: Random) -> float:
         Kind.RIVAL: sign * random.uniform(0.02, 1.0),
         Kind.THROTTLED: random.choice((0.0, 0.05, 0.3)),
         Kind.HOMING_MOVED: sign * 10 ** random.uniform(1.0, 3.3),
-        Kind.SLIP: sign * 10 ** random.uniform(-1.3, 0.0),
+        Kind.SLIP: sign * 10 ** random.uniform(-1.3, -0.3),
         Kind.OBSTACLE: sign * random.uniform(0.5, 3.0),
         Kind.SNAG: random.uniform(0.3, 3.0),
         Kind.LOAD_CHANGED: sign * random.uniform(0.3, 2.0),

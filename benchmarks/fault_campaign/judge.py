@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_in
 from benchmarks.fault_campaign.draw import CAUSES, HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn
 from benchmarks.fault_campaign.middle import Traffic
-from benchmarks.fault_campaign.visible import Heard, visible_from
+from benchmarks.fault_campaign.twin import Heard, has_healthy_twin
 from benchmarks.fault_campaign.witness import STEP_S
 from hil.config.schema import Config
 from hil.drivers.packet import Framer
-from hil.estimator.models.momentum_observer import NAMES
-from hil.experiment.model_watch import known_arm
 from hil.fakes.bus.faults import FaultKind
 
 BOUND_MS = 100.0
@@ -45,10 +43,11 @@ ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
 TO_BE_SEEN = (
     "is not where the program was told",
     "is not as fast as told",
-    "is beyond a limit",
     "is not where it would be",
 )
-"""Deviations that no program can detect before they show in the replies it receives."""
+"""Deviations that no program can detect before they show in the replies it receives: not while a healthy arm might have
+sent them (`fault_campaign.twin`).
+"""
 
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
 _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
@@ -71,8 +70,8 @@ class Verdict:
 
     owed: why the current had to end, "" if there was no reason. late_ms: how long it flowed after that. beyond:
     overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
-    stopped the run. misleading: the output names only wrong causes. unseen: it is unsafe, but counted from when a
-    detector that knows more than the program could see the fault (`fault_campaign.visible`), it would not be.
+    stopped the run. misleading: the output names only wrong causes. unseen: current flowed for longer, but until the
+    bound before its end a healthy arm might have sent the same replies (`fault_campaign.twin`), so it is not unsafe.
     """
 
     owed: str
@@ -86,7 +85,7 @@ class Verdict:
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
     """Judge the run of `story`, into which `drawn` was injected."""
-    reasons = _reasons(config, drawn, story, undisturbed)
+    reasons = reasons_of(config, drawn, story, undisturbed)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
     driven = np.asarray(story.record["driven"].any(axis=1))
     time = story.record["time"][:, 0]
@@ -94,34 +93,28 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     if set(drawn.kinds) & UNHEARD:
         bound = max(bound, 1e3 * config.safety.watchdog + TRIP_MS)
     late_ms, unseen = _flowed_ms(time[driven], since), False
-    if late_ms > bound:
-        seen = visible_from(*_shown(config, story, undisturbed))
-        later = [max(when, seen) if what.endswith(TO_BE_SEEN) else when for what, when in reasons]
-        unseen = _flowed_ms(time[driven], min(later)) <= bound
+    plain = min([when for what, when in reasons if not what.endswith(TO_BE_SEEN)], default=np.inf)
+    if late_ms > bound and _flowed_ms(time[driven], plain) <= bound:
+        unseen = has_healthy_twin(config, received(config, story), time[driven][-1] - 1e-3 * bound)
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
-    return Verdict(owed, late_ms, late_ms > bound or left_on, beyond, named, misleading, unseen)
+    unsafe = (late_ms > bound and not unseen) or left_on
+    return Verdict(owed, late_ms, unsafe, beyond, named, misleading, unseen)
+
+
+def received(config: Config, story: Story) -> Heard:
+    """What the program received in a run, and what it commanded."""
+    told = _Told(config, story.traffic, 0.0)
+    return Heard.of(config, told.heard, told.sent)
 
 
 def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:
     """Time for which current flowed after a moment [s]. driven: times at which it flowed [s]."""
     flowed = driven[driven >= since]
     return 1e3 * float(flowed[-1] - since) if flowed.size else 0.0
-
-
-def _shown(
-    config: Config, story: Story, undisturbed: Story
-) -> tuple[Config, tuple[NDArray[np.float64], NDArray[np.float64]], Heard, Heard]:
-    """What `visible_from` needs: the prior is that of the program."""
-    told, usual = (
-        Heard(config, every.heard, every.sent)
-        for every in (_Told(config, each.traffic, 0.0) for each in (story, undisturbed))
-    )
-    mean, covariance = known_arm(config, np.abs(usual.torque).max(axis=0), None)
-    return config, (np.array([mean.get(name, 0.0) for name in NAMES]), covariance), told, usual
 
 
 def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
@@ -145,7 +138,7 @@ def causes_in(text: str) -> set[str]:
 Reason = tuple[str, float]
 
 
-def _reasons(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> list[Reason]:
+def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> list[Reason]:
     """Reasons why the current had to end, each with its time [s]."""
     record = story.record
     time = record["time"][:, 0]
@@ -309,6 +302,6 @@ def _astray(drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[An
 def describe(verdict: Verdict) -> str:
     """The verdict on one line."""
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
-    said += ["UNSAFE"] * verdict.unsafe + ["but hard to see"] * verdict.unseen
+    said += ["UNSAFE"] * verdict.unsafe + ["a healthy arm might have done the same"] * verdict.unseen
     said += ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
     return ", ".join(said)

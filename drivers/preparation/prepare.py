@@ -7,7 +7,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.packet import Framer, HardwareError
 from hil.drivers.port import Port
 from hil.drivers.preparation.settings import arms_itself
-from hil.drivers.servo import Servo, describe_error
+from hil.drivers.servo import NO_ERROR, Servo, describe_error
 from hil.drivers.servo_model import Mode
 
 LISTEN_S = 0.05
@@ -109,6 +109,11 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
 
 def fault_text(joint: Joint, cause: str) -> str:
     """Return the message for a servo that has raised its alert."""
+    if cause == NO_ERROR:
+        return (
+            f"{joint.title} raised its alert, but reports no hardware error now. Check its supply and its plug, then "
+            "power-cycle it."
+        )
     return (
         f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
         "find the cause, then power-cycle it."

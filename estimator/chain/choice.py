@@ -9,20 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from hil.estimator.chain.identify import ChainEstimate, identify_chain
+from hil.estimator.chain.identify import EXPLAINED_RESIDUAL, ROUNDING, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
-
-ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of a rounded angle [encoder steps]
 
 
 @dataclass(frozen=True)
 class ChoiceOptions:
     """Options of the choice."""
 
-    explained_residual: float = 1.06
+    explained_residual: float = EXPLAINED_RESIDUAL
     """RMS residual of the worst joint, in units of encoder rounding, below which no further term is tried."""
     significance: float = 1e-3
     """Significance level at which a term is kept (likelihood ratio, corrected for the residual's correlation)."""

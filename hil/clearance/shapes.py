@@ -73,6 +73,41 @@ def shapes_of(arm: ArmDescription) -> Shapes:
     return Shapes(names, tuple(capsules), tuple(guessed))
 
 
+@dataclass(frozen=True)
+class Solid:
+    """A primitive of a URDF's collision geometry, in the frame of its moving link.
+
+    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as MuJoCo counts it: half
+    edges, or radius and half length [m]; empty for a mesh. rotation: (3, 3); translation: (3,) [m].
+    """
+
+    link: int
+    kind: str
+    size: tuple[float, ...]
+    rotation: Array
+    translation: Array
+
+
+def solids_of(arm: ArmDescription) -> list[Solid]:
+    """The primitives of a URDF. Raises ArmFileError."""
+    found = []
+    for link, rotation, translation, element in _placed(arm):
+        for shape, turn, shift in () if element is None else _geometry(element):
+            place = rotation @ turn, rotation @ shift + translation
+            found.append(Solid(link, shape.tag, _size_of(shape), *place))
+    return found
+
+
+def _size_of(shape: ET.Element) -> tuple[float, ...]:
+    if shape.tag == "box":
+        return tuple(0.5 * edge for edge in _numbers(shape.get("size"), 3))
+    if shape.tag == "sphere":
+        return (float(shape.get("radius", "nan")),)
+    if shape.tag in ("cylinder", "capsule"):
+        return float(shape.get("radius", "nan")), 0.5 * float(shape.get("length", "nan"))
+    return ()
+
+
 def _pieces(capsule: Capsule) -> list[Capsule]:
     """Split a capsule, because the piece next to a joint may touch a link that the other pieces must not touch."""
     length = float(np.linalg.norm(capsule.ends[1] - capsule.ends[0]))

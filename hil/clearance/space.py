@@ -30,6 +30,9 @@ AT_REST_SLACK = 0.008
 """Distance [m] by which pairs may be closer on the way to or from the rest pose than they are in it, if that is less
 than the margin."""
 
+AT_REST_INSIDE = 0.02
+"""Overlap in the rest pose up to which it is believed [m]: capsules are fatter than what they enclose."""
+
 LYING_RAD = 0.12
 """An arm within this angle of its rest pose in every joint counts as at rest, which its owner declares safe."""
 
@@ -100,6 +103,18 @@ class Space:
             return Nearest(np.inf, 0.0, ("nothing", "nothing"), sample)
         needed = float(self._needed(on_the_way)[worst[sample]])
         return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
+
+    def wrong_rest_pose(self) -> str:
+        """Say what overlaps in the rest pose by more than capsules are fatter than the parts in them; "" if nothing."""
+        found = self.nearest(self.rest[:, None])
+        if found.distance >= -AT_REST_INSIDE:
+            return ""
+        first, second = found.pair
+        return (
+            f"arm.rest_pose puts {first} {-1e3 * found.distance:.0f} mm into {second}: the pose, zero_ticks, a "
+            "direction, [clearance] or the URDF's collision geometry is wrong. `hil pose` shows the arm as the bus "
+            "sees it; clearance.ignore names pairs that do meet"
+        )
 
     def ends(self, position: Array) -> tuple[Array, Array]:
         """Ends of all capsules in the base frame (capsules, 2, 3) and their radii [m] at a pose (joints,) [rad]."""

@@ -96,13 +96,13 @@ class ArmConfig(Table):
 class SafetyConfig(Table):
     """`[safety]`: what stops the arm besides the joint limits, and how."""
 
-    watchdog: float = Field(0.06, ge=0.02, le=2.54, description="s without packets after which a servo stops by itself")
+    watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s without packets after which a servo stops by itself")
     allow_no_watchdog: bool = Field(
         False, description="accept firmware without a Bus Watchdog: nothing then stops the servo when packets cease"
     )
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may fail to reply")
-    late_time: PositiveFloat = Field(0.045, le=2, description="s for which deadlines may be missed")
+    late_time: PositiveFloat = Field(0.05, le=2, description="s for which deadlines may be missed")
     max_missing: int | None = Field(
         None, ge=1, le=1000, description="consecutive lost replies, instead of missing_time"
     )
@@ -320,8 +320,11 @@ def _all_different(key: str, values: Sequence[int | str]) -> None:
 def _check_rest_pose(joint: JointConfig, rest: float) -> None:
     low, high = joint.position_limit
     if not low < rest < high:
+        where = "at the end of" if rest in (low, high) else "outside"
+        room = "; leave some room there" if rest in (low, high) else ""
         raise ValueError(
-            f"arm.rest_pose: {rest:g} rad for joint {joint.name!r} is outside its position_limit [{low:g}, {high:g}]"
+            f"arm.rest_pose: {rest:g} rad for joint {joint.name!r} is {where} its position_limit "
+            f"[{low:g}, {high:g}]{room}"
         )
 
 

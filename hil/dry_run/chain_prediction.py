@@ -151,7 +151,8 @@ def _shares(values: Array, limits: Array, rest: Array, centre: Array) -> Array:
     Distances to position limits start at the rest pose or the path's centre, whichever is farther from the limit: an
     arm may rest close to a limit, which would make the fraction meaningless.
     """
-    shares = np.abs(values / limits)
+    shares = np.zeros_like(values)
+    shares[:, 2:] = np.abs(values[:, 2:] / limits[2:])
     low, high = np.minimum(rest, centre), np.maximum(rest, centre)
     shares[:, 0] = (high - values[:, 0]) / (high - limits[0])
     shares[:, 1] = (values[:, 1] - low) / (limits[1] - low)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.clearance.space import Nearest, Space
+from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, roll_out
 from hil.plan.chain_model import torque_limits
@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 
 MOMENTS, ARMS = 16, 6
 FALL_S = 1.5
-HARDLY = 0.05  # rad: an arm that ends within this angle of its rest pose has reached it
+LAID_DOWN = 0.95
+"""Share of the simulated stops that must end in the rest pose."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,19 @@ class ChainStops:
 
     fall: Fall
     lowering: LoweringForeseen
+
+    @property
+    def unsafe(self) -> str:
+        """Explain why a stop would not lay the arm down safely; "" if it would."""
+        down = self.lowering
+        if down.nearest.room < 0.0:
+            return (
+                f"too little clearance when a stop lowers the arm, {down.nearest}, at least "
+                f"{1e3 * down.nearest.needed:.0f} mm wanted"
+            )
+        if down.lies < LAID_DOWN:
+            return f"a stop lays only {100 * down.lies:.0f} % of the simulated arms down in the rest pose"
+        return ""
 
 
 def foreseen_stops(config: Config, plan: Plan, arms: ChainArms) -> ChainStops:
@@ -123,7 +137,7 @@ def _lowered(
         longest = max(longest, len(goal) / plan.rate)
         for arm in range(arms.size):
             q = np.nan_to_num(motions.position[arm].T, nan=1e3)
-            lies.append(bool(np.abs(q[:, -1] - rest).max() < HARDLY))
+            lies.append(bool(np.abs(q[:, -1] - rest).max() < LYING_RAD))
             kept = ~space.lies(q)
             if kept.any():
                 nearest = space.nearest(q[:, kept], on_the_way=True)

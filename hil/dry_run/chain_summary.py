@@ -47,7 +47,11 @@ class ChainDryRun:
 
     def is_safe(self, config: Config) -> bool:
         """Whether every arm keeps its clearance and the guard is unlikely to stop it."""
-        return not unsafe(config, self.foreseen)
+        return not self.why_not(config)
+
+    def why_not(self, config: Config) -> str:
+        """Explain why the motion, or a stop of it, is not safe; "" if both are."""
+        return unsafe(config, self.foreseen) or ("" if config.safety.stop == "cut" else self.stops.unsafe)
 
 
 def unsafe(config: Config, foreseen: ChainPrediction) -> str:
@@ -75,7 +79,7 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
         "source": run.source,
         "arms": run.arms,
         "safe": run.is_safe(config),
-        "why_not": unsafe(config, run.foreseen) or None,
+        "why_not": run.why_not(config) or None,
         "limit_chance": config.safety.limit_chance,
         "share_of_designed_path": run.share,
         "guard_stop_chance": peaks.stop_chance,
@@ -135,7 +139,7 @@ def _table(run: ChainDryRun) -> Table:
 
 def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     """Explain the result in sentences, the verdict last."""
-    fall, lowering, why = run.stops.fall, run.stops.lowering, unsafe(run.config, run.foreseen)
+    fall, lowering, why = run.stops.fall, run.stops.lowering, run.why_not(run.config)
     hit = "nothing within 1.5 s" if fall.hits is None else f"{fall.hits[0]} hits {fall.hits[1]}"
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
@@ -153,7 +157,10 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
-        lines.append(f"Not checked, because parts of these links touch in nearly every pose, by construction: {pairs}.")
+        lines.append(
+            "Parts of these links that touch in nearly every pose, by construction, are not checked; the other parts "
+            f"of them are: {pairs}."
+        )
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which this shows.")
     return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

@@ -14,6 +14,9 @@ that creeps. Rounding and encoder noise do not accumulate in it. What ordinary s
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
   a fraction `CURVED` of the change of velocity times the interval remains.
 
+A reading that jumps to and fro, as one with a stuck bit does, cancels in those memories. So each single interval is
+compared too, with what its encoder's noise has been so far: `STEPS` jumps within `STEPS_S` count.
+
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, twice those
 observed by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 """
@@ -39,6 +42,12 @@ _SEPARATE = 0.05
 _LAG_SHARE = 0.25
 """Allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities."""
 
+STEP_RAD, STEP_TIMES = 0.0077, 7.0
+"""Smallest jump of a position [rad], five ticks, and its smallest ratio to the RMS of the usual differences."""
+
+STEPS, STEPS_S = 4, 0.5
+"""Number of jumps that are too many, and the time within which they must follow each other [s]."""
+
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
 """Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
@@ -60,6 +69,7 @@ class Consistency:
         self._lag_squared = self._scale_squared = self._crossed = 0.0
         self._lag_product = self._scale_product = 0.0
         self._lag, self._scale = LAG_S, SCALE
+        self._steps = _Steps()
 
     def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
         """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
@@ -79,6 +89,9 @@ class Consistency:
         curved = CURVED * seconds * abs(velocity - before)
         unknown = unsure * abs(velocity)
         short.add(moved, difference, velocity, seconds, curved, unknown)
+        known = LAG_S * abs(velocity - before) + SCALE * abs(moved) + curved + unknown
+        if self._steps.look(abs(difference) - known, seconds):
+            return True
         if short.is_wrong(velocity, self._lag, self._scale) or self._looks_long(
             moved, difference, velocity, seconds, curved, unknown
         ):
@@ -131,6 +144,29 @@ class Consistency:
     def lost(self) -> None:
         """Restart with the next reply: too many are missing."""
         self._position = None
+
+
+class _Steps:
+    """Counts jumps of a position, which are differences far larger than the usual ones."""
+
+    def __init__(self) -> None:
+        self._square = self._age = self._since = 0.0
+        self._count = 0
+
+    def look(self, step: float, seconds: float) -> bool:
+        """Process the difference over one interval, beyond what its motion explains [rad]; return if it is wrong."""
+        if seconds <= 0.0:
+            return False
+        self._since += seconds
+        self._age += seconds
+        square = step * step if step > 0.0 else 0.0
+        most = max(STEP_RAD * STEP_RAD, STEP_TIMES * STEP_TIMES * self._square)
+        if square > most and self._age > SHORT_S:  # before that, the usual differences are being learnt
+            self._count = self._count + 1 if self._since < STEPS_S else 1
+            self._since = 0.0
+            square = most
+        self._square += seconds / min(self._age, LONG_S) * (square - self._square)
+        return self._count >= STEPS
 
 
 class _Memory:

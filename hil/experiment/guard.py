@@ -182,7 +182,7 @@ class Guard:
         if former is not None:
             most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
             if not -most <= position - former <= most:
-                self._jumped(index, position - former, most)
+                self._jumped(index, position - former, seconds, most)
         if not low <= position <= high:
             self._outside(index, position)
         if not -fastest <= velocity <= fastest:
@@ -251,12 +251,12 @@ class Guard:
             return f"{shared}, and whether other programs keep this computer busy: this program was late just before."
         return f"{shared}."
 
-    def _jumped(self, index: int, moved: float, most: float) -> NoReturn:
+    def _jumped(self, index: int, moved: float, seconds: float, most: float) -> NoReturn:
         self._stop(
             index,
             Cause.JUMP,
-            f"appears to have moved {moved:+.3f} rad between two samples; its velocity limit allows at most "
-            f"{most:.3f}. Check the encoder, its magnet and the supply.",
+            f"reports an angle that changed by {moved:+.3f} rad within {1e3 * seconds:.0f} ms; its velocity limit "
+            f"allows at most {most:.3f}. Check the encoder, its magnet and the supply.",
         )
 
     def _outside(self, index: int, position: float) -> None:

@@ -97,7 +97,9 @@ def _guard_of(config: Config, position: np.ndarray, velocity: np.ndarray, interv
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))
         for joint, row in zip(config.joints, position, strict=True)
     ]
-    return Guard(config.model_copy(update={"joints": joints}), interval=interval)
+    # A servo that has only lost its watchdog can still be lowered, which is better than to drop it.
+    unwatched = config.safety.model_copy(update={"allow_no_watchdog": True})
+    return Guard(config.model_copy(update={"joints": joints, "safety": unwatched}), interval=interval)
 
 
 def _allowing(joint: JointConfig, low: float, high: float, velocity: float) -> JointConfig:

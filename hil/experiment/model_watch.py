@@ -103,8 +103,9 @@ class ModelWatch:
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
             said = (
-                f"{name} stands still although a torque of {abs(lacking):.3f} N m drives it, which would move any arm "
-                "consistent with the prior and the data so far. Something blocks it, or its encoder is frozen."
+                f"{name} stands still, with {abs(self._felt[joint]):.3f} N m commanded at this moment: any arm "
+                "consistent with the prior and the data so far would move. Something blocks it, or its encoder is "
+                "frozen."
             )
         else:
             said = (

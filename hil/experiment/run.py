@@ -43,6 +43,9 @@ _MOVED = 2.0
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
 """Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
 
+_LYING_RAD = 0.15
+"""Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given."""
+
 
 def run_experiment(
     config: Config,
@@ -79,8 +82,8 @@ def run_experiment(
             note("spatial arms have not been tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
-        if has_moved():
-            _wait_for_rest(bus)
+        if (moving := _wait_for_rest(bus) if has_moved() or config.is_chain else "") and config.is_chain:
+            raise ExperimentError(moving)
         _check_pose(config, bus)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
@@ -129,7 +132,8 @@ def _play(
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
-        note(f"stopped: {error} {bus.torque_off_report}")
+        cause = error.__context__ if isinstance(error, TorqueNotOff) else error
+        note(f"stopped: {cause or 'at its end:'} {bus.torque_off_report}")
         raise
 
 
@@ -184,15 +188,24 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
         )
 
 
-def _wait_for_rest(bus: ServoBus) -> None:
-    """Wait for an arm that still swings after an earlier run, for at most _LONGEST_REST_S."""
+def _wait_for_rest(bus: ServoBus) -> str:
+    """Wait for an arm that still swings after an earlier run, or falls, for at most _LONGEST_REST_S.
+
+    Returns a sentence about a joint that still moves then, "" if none does.
+    """
     clock = bus.port.clock
     former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S
-    while clock.now() < end:
+    while True:
         clock.wait_until(clock.now() + _REST_EVERY_S)
         latest = bus.read_positions()
-        if all(abs(now - before) < _REST_WITHIN_RAD for now, before in zip(latest, former, strict=True)):
-            return
+        away = [abs(now - before) for now, before in zip(latest, former, strict=True)]
+        if max(away) < _REST_WITHIN_RAD:
+            return ""
+        if clock.now() >= end:
+            return (
+                f"{bus.joints[away.index(max(away))]} still moves after {_LONGEST_REST_S:.0f} s without torque: "
+                f"{max(away):.3f} rad in {_REST_EVERY_S:g} s. Bring the arm to rest, then start again."
+            )
         former = latest
 
 
@@ -203,15 +216,22 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
     """
     if has_moved():
         _check_inside(config, bus)
-    tolerance = config.arm.rest_tolerance * (_MOVED if has_moved() else 1.0)
+    tolerance = _rest_tolerance(config) * (_MOVED if has_moved() else 1.0)
+    or_there = " If the arm lies there without torque, set arm.rest_pose." if config.is_chain else ""
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
                 f"{joint} is at {position:.3f} rad; arm.rest_pose is {rest:.3f} and arm.rest_tolerance allows "
                 f"{tolerance:g}. Move it there by hand: friction may hold it away from rest. Only "
-                f"if it is in its rest pose now, set zero_ticks = {ticks}."
+                f"if it is in its rest pose now, set zero_ticks = {ticks}.{or_there}"
             )
+
+
+def _rest_tolerance(config: Config) -> float:
+    """A spatial arm lies on something, where friction holds it less far away than an arm that hangs."""
+    given = config.arm.rest_tolerance
+    return min(given, _LYING_RAD) if config.is_chain and "rest_tolerance" not in config.arm.model_fields_set else given
 
 
 def _check_inside(config: Config, bus: ServoBus) -> None:

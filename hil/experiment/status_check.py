@@ -66,7 +66,7 @@ class StatusCheck:
                 f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Check its plug and cable, unless the computer kept this "
                 "program waiting."
             )
-        if status.watchdog == 0 and self._may_be_unwatched:
+        if self._may_be_unwatched:
             return None
         return Cause.WATCHDOG, (
             f"is no longer protected: its Bus Watchdog reads {status.watchdog} but was set to {self._armed}. Another "

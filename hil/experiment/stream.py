@@ -129,6 +129,8 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
+            if isinstance(error, SafetyStop) and error.cause is Cause.MISSING and (heard := self._bus.heard_instead):
+                error.add_note(heard)
             if self._lowering is not None and may_lower(self._config, error):
                 self._lower(self._lowering, error)
             elif may_brake(self._config, error):

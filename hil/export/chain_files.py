@@ -4,6 +4,7 @@ The URDF is the one used for the identification: names, frames, limits and meshe
 of the arm's joints are replaced. The MJCF is written from its geometry.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -11,9 +12,11 @@ import numpy as np
 
 from hil import __version__
 from hil.chain_model import ChainArmModel
+from hil.clearance.shapes import Solid, solids_of
 from hil.description.arm import Body
 from hil.description.files import is_mjcf
 from hil.description.urdf import parse_urdf
+from hil.export.actuators import add_actuators
 from hil.export.chain_links import ChainLinks, chain_links
 from hil.export.source import Source, write_text
 from hil.export.xml_text import comment, numbers, to_text
@@ -77,7 +80,9 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     """Write the MJCF `path`; return what MJCF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
-    left = ["the URDF's meshes, effort limits and fixed frames", *found.left_out]
+    solids = [] if is_mjcf(found.path) else solids_of(found.arm)
+    kept = ("offset_", "lag")
+    left = [*_not_in_mjcf(found, solids), *(each for each in found.left_out if not each.startswith(kept))]
     _describe(root, model, found, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     ET.SubElement(root, "option", gravity=numbers(*model.geometry.gravity), timestep="0.001", integrator="implicitfast")
@@ -100,8 +105,26 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
         i = body.inertia
         full = numbers(i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])
         ET.SubElement(parent, "inertial", pos=numbers(*body.centre), mass=numbers(body.mass), fullinertia=full)
+        _add_geoms(parent, [solid for solid in solids if solid.link == number])
+    add_actuators(root, model)
     write_text(path, to_text(root))
     return left
+
+
+def _not_in_mjcf(found: ChainLinks, solids: Sequence[Solid]) -> list[str]:
+    if is_mjcf(found.path):
+        return ["the shapes, sites and sensors of the file that described the arm"]
+    meshes = ["the URDF's meshes"] if any(not solid.size for solid in solids) else []
+    return [*meshes, "the URDF's effort limits and fixed frames"]
+
+
+def _add_geoms(body: ET.Element, solids: Sequence[Solid]) -> None:
+    """Add the boxes, cylinders, capsules and spheres of a link; they touch nothing unless contype is set."""
+    for solid in solids:
+        if solid.size:
+            place = {"pos": numbers(*solid.translation), "quat": numbers(*_quaternion(solid.rotation))}
+            shape = {"type": solid.kind, "size": numbers(*solid.size), **place}
+            ET.SubElement(body, "geom", {**shape, "contype": "0", "conaffinity": "0"})
 
 
 def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: list[str]) -> None:

@@ -5,11 +5,12 @@ from xml.etree import ElementTree as ET
 
 from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel
+from hil.export.actuators import add_actuators
 from hil.export.chain_files import export_chain_mjcf
 from hil.export.left_out import left_out
 from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text
-from hil.export.xml_text import axis, comment, describe, numbers, to_text
+from hil.export.xml_text import axis, describe, numbers, to_text
 
 _CARRIED = ("armature", "offset", "lag")
 
@@ -30,7 +31,7 @@ def export_mjcf(source: Source, path: Path) -> list[str]:
     for index, link in enumerate(links):
         parent = _add_body(parent, model, index, link, along)
         along = link.length
-    _add_actuators(root, model)
+    add_actuators(root, model)
     write_text(path, to_text(root))
     return left
 
@@ -56,26 +57,3 @@ def _add_body(parent: ET.Element, model: ArmModel, index: int, link: LinkMass, a
     seen = {"type": "capsule", "size": "0.01", "fromto": numbers(0, 0, 0, link.length, 0, 0)}
     ET.SubElement(body, "geom", seen, contype="0", conaffinity="0")
     return body
-
-
-def _add_actuators(root: ET.Element, model: ArmModel) -> None:
-    """Add actuators controlled by a goal [A, or V in pwm mode]: gain gives torque, bias the offset, filter the drive's
-    lag.
-    """
-    actuators = ET.SubElement(root, "actuator")
-    units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)
-    comment(actuators, f"control is the servo's goal: {units}")
-    lag = model.values.get("lag", 0.0)
-    drive = {"dyntype": "filterexact", "dynprm": numbers(lag)} if lag > 0 else {}
-    for number, facts in enumerate(model.joints, start=1):
-        ET.SubElement(
-            actuators,
-            "general",
-            drive,
-            name=facts.name,
-            joint=facts.name,
-            gainprm=numbers(model.torque_per_goal(number)),
-            biastype="affine",
-            biasprm=numbers(-model.values[f"offset_{number}"], 0, 0),
-            ctrlrange=numbers(-facts.goal_limit, facts.goal_limit),
-        )

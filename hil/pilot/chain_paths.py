@@ -12,7 +12,7 @@ from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits
 from hil.estimator.errors import ExcitationError
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
-from hil.plan.chain_plan import path_plan
+from hil.plan.chain_plan import check_rest_pose, path_plan
 from hil.plan.plan import HELD_OUT, Plan
 
 Array = NDArray[np.float64]
@@ -46,6 +46,7 @@ class Paths:
     @classmethod
     def of(cls, config: Config, thought: ChainTorque) -> "Paths":
         """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError."""
+        check_rest_pose(config)
         known, space = known_chain(config), Space.of(config)
         most, rest = TORQUE_SHARE * torque_limits(config), np.array(config.arm.rest_pose)
         low, high = np.array([joint.position_limit for joint in config.joints]).T

@@ -10,7 +10,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.chain_search import PILOT_SHARES, SEARCH_ARMS, step_config
 from hil.plan.chain_model import known_chain
-from hil.plan.chain_plan import make_chain_plan
+from hil.plan.chain_plan import check_rest_pose, make_chain_plan
 from hil.plan.plan import Plan
 from hil.setup.idle_bus import quiet_stream
 
@@ -20,6 +20,7 @@ SHOWN = 30
 def rehearse(config: Config, arms: int, servos: bool = False, tell: Tell | None = None) -> ChainDryRun:
     """Simulate the configured path, or the pilot's first step. Raises ConfigError, NoSafeTorque; with `servos`,
     DriverError."""
+    check_rest_pose(config)
     said = quiet_stream(config) if servos else ()
     played, plan, share = _what_is_played(config)
     drawn = prior_arms(played, known_chain(played), arms)

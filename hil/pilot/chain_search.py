@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
+from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import unsafe
 from hil.dry_run.prediction import peaks_of
 from hil.errors import ExperimentError, NoSafeTorque
@@ -97,14 +98,18 @@ class ChainSearch:
             if unsafe(config, foreseen):
                 continue
             foreseen = predict_chain(config, plan, self.belief.arms.first(ARMS))
-            if not unsafe(config, foreseen):
+            said = unsafe(config, foreseen) or self._unsafe_stop(config, plan)
+            if not said:
                 return Found(share, plan, foreseen)
-            said = unsafe(config, foreseen)
         raise NoSafeTorque(
             f"{config.path}: no motion is safe for all arms consistent with the prior, not even "
             f"{100 * shares[-1]:.0f} % of the designed path: {said}. Give the arm's masses more accurately, or "
             "give it more room to move."
         )
+
+    def _unsafe_stop(self, config: Config, plan: Plan) -> str:
+        """Explain why a stop would not lay the arm down safely; "" if it would."""
+        return "" if config.safety.stop == "cut" else foreseen_stops(config, plan, self.belief.arms.first(ARMS)).unsafe
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
         """Play one step, compare it with the prediction, and update the belief."""

@@ -27,6 +27,10 @@ Say = Callable[[str], None]
 _AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY)
 
 
+_BESIDE = 2
+"""Number of joints up to which predicted and measured peaks fit side by side."""
+
+
 @dataclass(frozen=True)
 class Step:
     """One intermediate run.
@@ -59,10 +63,7 @@ class Step:
             )
             for row in range(GUARDED)
         ]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = [
-            "   ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-        ]
+        lines = _beside(rows) if len(self.peak_torque) <= _BESIDE else _below(rows)
         return "\n  ".join((f"{self.name}, peak torque {torque} N m:", *lines))
 
     def played(self) -> PlayedStep:
@@ -155,6 +156,23 @@ def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> b
     position = load_samples(folder.samples_path, len(config.joints))["position"]
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])
     return bool((np.nanmax(position, axis=0) - np.nanmin(position, axis=0) <= MOVED_STEPS * step).any())
+
+
+def _beside(rows: list[tuple[str, ...]]) -> list[str]:
+    """A table with one line per quantity."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["   ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _below(rows: list[tuple[str, ...]]) -> list[str]:
+    """The same with a line for each column, which fits a terminal of 80 columns."""
+    head, *others = rows
+    width = max(map(len, head))
+    return [
+        line
+        for name, *cells in others
+        for line in (name, *(f"  {what.ljust(width)}  {cell}" for what, cell in zip(head[1:], cells, strict=True)))
+    ]
 
 
 def _list(values: Array) -> str:

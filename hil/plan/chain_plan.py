@@ -129,8 +129,15 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
     return held + share * thought.of(path)
 
 
+def check_rest_pose(config: Config) -> None:
+    """Raise ConfigError if parts of the arm would be inside each other, the floor or a box in its rest pose."""
+    if wrong := Space.of(config).wrong_rest_pose():
+        raise ConfigError(f"{config.path}: {wrong}.")
+
+
 def check_clearance(config: Config, plan: Plan) -> None:
     """Raise ConfigError if the desired motion itself has too little clearance; real arms need a dry run."""
+    check_rest_pose(config)
     space = Space.of(config)
     for segment in plan.segments:
         assert isinstance(segment, PathSegment)

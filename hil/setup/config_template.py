@@ -104,7 +104,7 @@ def arm_toml(arm: ArmAnswers) -> str:
     ]
     if len(arm.joints) == 2:
         model.append(_line("torque_scale = true", "estimate the second torque constant relative to the first"))
-    safety = ["[safety]", _line("watchdog = 0.06", "s without packets after which a servo stops by itself")]
+    safety = ["[safety]", _line("watchdog = 0.08", "s without packets after which a servo stops by itself")]
     tables = [head, port, *(_joint(joint) for joint in arm.joints), mechanism, experiment, model, safety]
     return "\n\n".join("\n".join(table) for table in tables) + "\n"
 

@@ -50,6 +50,8 @@ class ServoSession:
     bus: ServoBus
     _say: Say
     _kept: dict[Joint, Kept] = field(default_factory=dict)
+    _cut_since: set[Joint] = field(default_factory=set)
+    """Servos whose torque could not be confirmed as off at first, and has been since."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
 
@@ -114,12 +116,24 @@ class ServoSession:
         failed: dict[Joint, DriverError] = {}
         for joint in joints:
             try:
+                self._cut_again(joint)
                 put_back(self.bus.drives[joint], self._kept[joint].settings)
             except DriverError as error:
                 failed[joint] = error
             else:
                 settings_file.forget(self._kept[joint])
         return failed
+
+    def _cut_again(self, joint: Joint) -> None:
+        """Cut the torque of a servo that could not be confirmed as off before, and say that it is off now."""
+        report = self.bus.torque_off_report
+        if report is None or joint in report.confirmed or joint in self._cut_since:
+            return
+        servo = self.bus.drives[joint]
+        if servo.read("Torque Enable"):
+            servo.write("Torque Enable", 0)
+        self._cut_since.add(joint)
+        self._say(f"{joint.title} answers again: its torque is off, read back.")
 
 
 _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=None)

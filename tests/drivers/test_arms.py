@@ -233,7 +233,7 @@ def test_another_master_is_heard_before_anything_moves(opened: Open) -> None:
 def test_another_master_that_comes_later_ends_the_exchange(opened: Open) -> None:
     joints = Joint("a", 1, XM430), Joint("b", 2, XM430)
     bus, port = opened(arm({}, {}), *joints)
-    with bus, pytest.raises(BusShared, match="instructions"), bus.torque(watchdog=0.1):
+    with bus, pytest.raises(BusShared, match="Another master has sent"), bus.torque(watchdog=0.1):
         port.bus.faults.add(Fault(kind="other_master", servo=1, amount=0.0031, at=port.bus.time + 0.05))
         for _ in range(2000):
             bus.exchange([0.0, 0.0])

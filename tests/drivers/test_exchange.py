@@ -1,5 +1,6 @@
 """The control cycle on a scripted wire: its requests, and its handling of valid, stuffed, missing and late replies."""
 
+import math
 import struct
 from collections.abc import Sequence
 
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import PortLost
 from hil.drivers.exchange import Exchange
-from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode_status
+from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import spans
@@ -51,6 +52,9 @@ class Wire(Port):
 
     def discard_input(self) -> None:
         self.waiting = b""
+
+    def put_aside(self) -> None:
+        self.overheard, self.waiting = self.waiting, b""
 
 
 def state(current: int, velocity: int, position: int) -> bytes:
@@ -117,6 +121,23 @@ def test_goals_that_cannot_be_sent_are_not_sent(goals: list[int]) -> None:
 
 
 # What comes back
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_what_another_master_sends_and_asks_for_is_counted_and_ones_own_late_replies_are_not(fast: bool) -> None:
+    own = fast_answer((1, 0, state(1, 2, 3)), (2, 0, state(4, 5, 6))) if fast else answer(1, 1, 2, 3)
+    refusal = encode_status(1, 7)
+    foreign = [
+        encode(1, Instruction.READ, b"\x84\x00\x04\x00"),
+        encode_status(1, 0, b"\0\x08\0\0"),
+        encode_status(9, 0, bytes(10)),
+    ]
+    cut_off = [own[:12] + packet for packet in foreign]  # where two transmissions meet, the first loses its end
+    for received, count in ((own, 0), (refusal, 0), (own[:-3], 0), *((packet, 1) for packet in foreign + cut_off)):
+        exchanging = exchange(Wire([received]), fast=fast)
+        exchanging.cycle([0, 0])
+        assert exchanging.strangers == count, received.hex()
+
 
 ticks16 = st.integers(-(2**15), 2**15 - 1)
 ticks32 = st.integers(-(2**31), 2**31 - 1)
@@ -301,3 +322,30 @@ def test_under_pwm_the_applied_pwm_is_read_and_the_load_passed_over() -> None:
     every = spans(Mode.PWM, [XL430])
     assert (every[0].address, every[0].size, every[0].format) == (124, 12, "hxxii")
     assert every[2].format == "hxxiixxxxxxxxHB"
+
+
+def test_another_masters_instructions_between_two_cycles_are_counted() -> None:
+    """Late replies and noise, which may be pending as well, are not."""
+    both = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire([both] * 3)
+    cycles = exchange(wire)
+    goal = encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")
+    for pending, count in ((answer(1, 1, 2, 3) + b"\xff\xfd", 0), (goal + answer(2, 0, 0, 0), 1), (b"", 1)):
+        wire.waiting = pending
+        assert None not in cycles.cycle([0, 0]).servos
+        assert cycles.strangers == count
+
+
+def test_damaged_bytes_are_told_from_silence_and_late_replies_from_both() -> None:
+    fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    for received, is_damaged in ((answer(1, 1, 2, 3), False), (b"", False), (fine[:-3] + b"abc", True)):
+        wire = Wire([received])
+        cycles = exchange(wire)
+        assert None in cycles.cycle([0, 0]).servos
+        assert math.isfinite(cycles.damaged_at) is is_damaged and cycles.late_at == -math.inf
+    wire = Wire([b"", fine])
+    cycles = exchange(wire)
+    cycles.cycle([0, 0])
+    wire.waiting = fine
+    cycles.cycle([0, 0])
+    assert math.isfinite(cycles.late_at)

@@ -57,6 +57,8 @@ class ChainOptions:
     """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
+    other_initial_width: float = 0.005
+    """Initial width of a second fit, if the first does not explain the motion [rad/s]."""
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3

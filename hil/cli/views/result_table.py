@@ -42,7 +42,10 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
     print(f"{result.method}.")
     steps = ", ".join(f"{value:.3g}" for value in result.fit.residual_rms_ticks)
     counted = f", {steps} encoder steps" if steps else ""
-    print(f"Residual {rms} mrad RMS{counted} over {result.fit.segments} segments.")
+    if all(map(math.isfinite, result.fit.residual_rms_rad)):
+        print(f"Residual {rms} mrad RMS{counted} over {result.fit.segments} segments.")
+    else:
+        print("Regression on the measured torque: no motion was simulated, so that there is no residual of the angles.")
     if result.model_choice is not None:
         choice = result.model_choice
         times = f"error {choice.error_divided_by:.3g} times smaller than with the plainest model"

@@ -136,6 +136,27 @@ def test_exports_move_as_identified_and_keep_the_urdf(run: RunFolder, result: Se
     assert float(dynamics.get("damping", 0)) == pytest.approx(model.values["viscous_2"])
 
 
+def test_the_mjcf_has_actuators_in_the_servos_unit_and_the_shapes_of_the_urdf(
+    run: RunFolder, result: SettledResult, tmp_path: Path
+) -> None:
+    model = hil.load_model(run.path)
+    left = export(run.path, "mjcf", tmp_path / "arm.mjcf").left_out
+    engine = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.mjcf"))
+    assert engine.nu == engine.nv == 4
+    data = mujoco.MjData(engine)
+    data.ctrl[:] = goal = np.array([0.1, -0.2, 0.3, 0.4])
+    for _ in range(200):  # the lag's filter settles
+        data.qpos[:], data.qvel[:] = 0.0, 0.0
+        mujoco.mj_step(engine, data)
+    offsets = np.array([model.values[f"offset_{joint}"] for joint in range(1, 5)])
+    gains = np.array([model.torque_per_goal(joint) for joint in range(1, 5)])
+    np.testing.assert_allclose(data.qfrc_actuator, gains * goal - offsets, rtol=1e-6)
+    assert not any(sentence.startswith(("offset", "lag")) for sentence in left)
+    moving = {joint.link for joint in read_urdf(CONFIGS / "open_manipulator_x_like.urdf").joints}
+    shapes = ET.parse(CONFIGS / "open_manipulator_x_like.urdf").getroot().findall("link")
+    assert engine.ngeom == sum(len(link.findall("collision")) for link in shapes if link.get("name") in moving)
+
+
 def test_exported_parameters_are_read_back(run: RunFolder, result: SettledResult, tmp_path: Path) -> None:
     for name in ("toml", "json"):
         path = tmp_path / f"arm.{name}"

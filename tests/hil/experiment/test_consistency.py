@@ -132,3 +132,26 @@ def test_lag_and_scale_error_that_a_servo_always_had_are_accepted(lag: float, sc
         return (1.0 + scale) * (0.4 * math.tau * math.cos(math.tau * late) + 0.2 * 5.3 * math.cos(5.3 * late))
 
     assert seen_after(400, lambda now: learnt_motion(now)[0], velocity) == math.inf
+
+
+@pytest.mark.parametrize("rate", [100, 400, 1000])
+@pytest.mark.parametrize("bit", [3, 4, 6])
+def test_a_stuck_bit_is_seen_though_its_jumps_cancel(rate: int, bit: int) -> None:
+    def position(now: float) -> float:
+        ticks = round(learnt_motion(now)[0] / STEP)
+        return STEP * (ticks if now < 3.0 else ticks | 1 << bit)
+
+    when = seen_after(rate, position, lambda now: learnt_motion(now)[1])
+    assert 3.0 <= when < 3.6
+
+
+@pytest.mark.parametrize("noise", [0.7, 2.0, 5.0])
+def test_a_noisy_encoder_and_single_glitches_are_no_stuck_bit(noise: float) -> None:
+    random = Random(noise)
+    glitches = {400 * second for second in range(1, 6)}
+
+    def position(now: float) -> float:
+        glitch = 0.02 if round(400 * now) in glitches else 0.0
+        return learnt_motion(now)[0] + glitch + random.gauss(0.0, noise * STEP)
+
+    assert seen_after(400, position, lambda now: learnt_motion(now)[1]) == math.inf

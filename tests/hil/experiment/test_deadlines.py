@@ -23,9 +23,6 @@ def safety(lines: str) -> tuple[str, str]:
     return "[experiment]\n", f"[safety]\n{lines}\n\n[experiment]\n"
 
 
-GENEROUS = safety("watchdog = 0.08\nlate_time = 0.05")
-
-
 def said_by(action: Callable[[], None]) -> str:
     with pytest.raises(SafetyStop) as stop:
         action()
@@ -34,19 +31,19 @@ def said_by(action: Callable[[], None]) -> str:
 
 
 def test_deadlines_missed_in_a_row_count_by_their_number_and_by_the_time_since_the_last_command(arm: Arm) -> None:
-    deadlines = Deadlines(arm(GENEROUS))
+    deadlines = Deadlines(arm())
     for _ in range(20):
         deadlines.missed()  # 20 intervals of 2.5 ms are the 50 ms allowed
     said = said_by(deadlines.missed)
     assert "21 deadlines in a row were missed, 52 ms without a command; safety.late_time = 0.05 s allows 50 ms" in said
     assert "watchdogs act" not in said
-    deadlines = Deadlines(arm(GENEROUS))
+    deadlines = Deadlines(arm())
     deadlines.missed(0.0499)
     assert "20 deadlines in a row were missed, 51 ms without" in said_by(lambda: deadlines.missed(0.051))
 
 
 def test_a_sample_on_time_begins_the_row_anew(arm: Arm) -> None:
-    deadlines = Deadlines(arm(GENEROUS))
+    deadlines = Deadlines(arm())
     for _ in range(3):
         for _ in range(20):
             deadlines.missed()
@@ -54,7 +51,7 @@ def test_a_sample_on_time_begins_the_row_anew(arm: Arm) -> None:
 
 
 def test_what_the_watchdogs_did_during_a_gap(arm: Arm) -> None:
-    deadlines = Deadlines(arm(GENEROUS))
+    deadlines = Deadlines(arm())
     deadlines.check_gap(0.0799)
     acted = "The servos' watchdogs act after 80 ms, so the arm had no current by then."
     said = said_by(lambda: deadlines.check_gap(0.08))
@@ -91,7 +88,7 @@ def rows_until_stop(deadlines: Deadlines, missed: int, met: int) -> int:
     ],
 )
 def test_which_share_of_missed_deadlines_stops(arm: Arm, missed: int, met: int, rows: int) -> None:
-    assert rows_until_stop(Deadlines(arm(GENEROUS)), missed, met) == rows
+    assert rows_until_stop(Deadlines(arm()), missed, met) == rows
 
 
 def test_at_slow_rates_five_count_as_too_many(arm: Arm) -> None:
@@ -107,7 +104,7 @@ def test_at_slow_rates_five_count_as_too_many(arm: Arm) -> None:
 @pytest.mark.parametrize(
     ("lines", "missing", "late"),
     [
-        ("", Limit(0.015, "safety.missing_time = 0.015 s"), Limit(0.045, "safety.late_time = 0.045 s")),
+        ("", Limit(0.015, "safety.missing_time = 0.015 s"), Limit(0.05, "safety.late_time = 0.05 s")),
         (
             "max_missing = 3\nmax_late = 3",
             Limit(4 / RATE, "safety.max_missing = 3"),
@@ -115,8 +112,8 @@ def test_at_slow_rates_five_count_as_too_many(arm: Arm) -> None:
         ),
         (
             "max_missing = 500\nlate_time = 0.1",
-            Limit(0.048, "0.8 of safety.watchdog = 0.06 s"),
-            Limit(0.048, "0.8 of safety.watchdog = 0.06 s"),
+            Limit(0.064, "0.8 of safety.watchdog = 0.08 s"),
+            Limit(0.064, "0.8 of safety.watchdog = 0.08 s"),
         ),
         (
             "watchdog = 0.1\nmissing_time = 0.08\nmax_late = 31",

@@ -1,13 +1,18 @@
 """Random faults in every bundled configuration and rate; benchmarks/faults.py draws thousands."""
 
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from benchmarks.fault_campaign.arms import RATES, Setting, names, settings
+from benchmarks.fault_campaign.campaign import prepare
+from benchmarks.fault_campaign.judge import received
+from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.faults import campaign, figures
 
-INJECTIONS = 300
+INJECTIONS = 312
 
 PERIOD_S = 1.2
 """Of the multisines: shorter than in the script's campaign, for the processor's sake."""
@@ -20,9 +25,9 @@ NAMED = 0.95
 REFUSED = re.compile(r"fake_inverted at 20 Hz .*experiment\.rate = 20 is too low for the stabiliser", re.DOTALL)
 """A software spring that acts 75 ms late cannot hold an arm upright."""
 
-UNSAFE = 0.02
-"""Largest share of unsafe runs; the aim is 0. What is left: joints pushed or held by a hand in the first period of an
-arm without `arm.link_lengths`, of which nothing says how it should have moved (docs/safety.md).
+MOST_UNSAFE = 1
+"""Unsafe runs of each part; the aim is 0. What is left: a hand that pushes a heavy arm without `arm.link_lengths` from
+its first second on, of which little says how it should have moved (docs/safety.md).
 """
 
 EVERY_THIRD = 3
@@ -42,7 +47,7 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
     late = [each for each in outcomes if each.verdict.unsafe or each.beyond_limit]
     told = "\n\n".join(map(str, [*bad, *late]))
     assert not bad, told
-    assert len(late) <= UNSAFE * len(outcomes), told
+    assert len(late) <= MOST_UNSAFE, told
     counted = figures(outcomes)
     assert counted["unnamed"] <= (1 - NAMED) * counted["stopped"]
     assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it meets stops and runs that go on"
@@ -51,3 +56,17 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
 def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:
     assert {(each.name, each.rate) for each in settings()} == {(name, rate) for name in names() for rate in RATES}
     assert len(names()) >= 11
+
+
+def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_one_that_freezes_in_motion() -> None:
+    ready = prepare(Setting("fake_pendulum", 100), 1.0)
+    heard = received(ready.config, ready.undisturbed)
+    assert has_healthy_twin(ready.config, heard, 2.0)
+    stuck = replace(heard, angle=np.full_like(heard.angle, heard.angle[0]), velocity=np.zeros_like(heard.velocity))
+    assert has_healthy_twin(ready.config, stuck, 2.0), "its friction may be as large"
+    moves = heard.time[:, None] < 1.2
+    at = int(moves.sum())
+    frozen = replace(
+        heard, angle=np.where(moves, heard.angle, heard.angle[at]), velocity=np.where(moves, heard.velocity, 0.0)
+    )
+    assert has_healthy_twin(ready.config, frozen, 1.2) and not has_healthy_twin(ready.config, frozen, 1.3)

@@ -87,7 +87,11 @@ CAUSES: list[tuple[Cause, str, Callable[[list[Any]], None]]] = [
     (Cause.ALERT, r"'elbow'.*overload", lambda p: fault(p, FaultKind.OVERLOAD, servo=2)),
     (Cause.MISSING, r"'elbow'.*missed 6 replies", lambda p: fault(p, FaultKind.LOST_REPLY, servo=2, duration=0.1)),
     (Cause.LATE, r"deadlines in a row", lambda p: stall(p, 0.06)),
-    (Cause.JUMP, r"'elbow'.*appears to have moved", lambda p: fault(p, FaultKind.ENCODER_JUMP, servo=2, amount=-120)),
+    (
+        Cause.JUMP,
+        r"'elbow'.*reports an angle that changed by -0",
+        lambda p: fault(p, FaultKind.ENCODER_JUMP, servo=2, amount=-120),
+    ),
     (Cause.NOT_FOLLOWING, r"'shoulder'.*carries 0\.000", lambda p: p[0].bus.servos[1].write(64, b"\x00")),
     (Cause.WRONG_SIGN, r"against its command", lambda p: turn_round(p, 0)),
 ]

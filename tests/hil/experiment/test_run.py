@@ -210,6 +210,24 @@ def test_where_grease_warms_up_a_warm_up_is_proposed(arm: Arm, tmp_path: Path) -
     assert 20.0 <= seconds <= 90.0  # 1e-4 of the motion is left after five or six times 6 s
 
 
+def test_an_upright_arm_is_balanced_before_torque_is_cut(
+    arm: Arm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its stabiliser's springs leave it where gravity, friction and an offset hold it, from where it may fall."""
+    pushed = [(f"offset = {each}", "offset = 0.08") for each in ("0.004", "-0.003")]
+    upright = arm(*pushed, ("peak_torque = [0.60, 0.35]", "peak_torque = [0.3, 0.2]"), base="fake_inverted")
+
+    def left_at(name: str) -> float:
+        run(upright, tmp_path / name)
+        last = load_samples(tmp_path / name / "samples.npy", 2)[-1]
+        return float(np.abs(last["position"] - np.array(upright.arm.rest_pose)).max())
+
+    assert left_at("balanced") <= 0.025
+    assert '"balanced"' in (tmp_path / "balanced" / "events.jsonl").read_text(encoding="utf-8")
+    monkeypatch.setattr("hil.experiment.stream.must_balance", lambda _: False)
+    assert left_at("as it is") > 0.04
+
+
 # Before torque is switched on
 
 

@@ -11,7 +11,7 @@ from hil.experiment.status_check import StatusCheck
 from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
-FINE = Status(watchdog=3, goal=0.1, tick=1.0, torque=True, hardware_error=0)
+FINE = Status(watchdog=4, goal=0.1, tick=1.0, torque=True, hardware_error=0)
 
 
 @pytest.mark.parametrize(
@@ -19,8 +19,8 @@ FINE = Status(watchdog=3, goal=0.1, tick=1.0, torque=True, hardware_error=0)
     [
         ({"torque": False}, Cause.TORQUE_OFF, "Torque Enable reads 0"),
         ({"hardware_error": 32}, Cause.ALERT, "overload"),
-        ({"watchdog": 255}, Cause.WATCHDOG, "received nothing for 60 ms"),
-        ({"watchdog": 0}, Cause.WATCHDOG, "no longer protected: its Bus Watchdog reads 0 but was set to 3"),
+        ({"watchdog": 255}, Cause.WATCHDOG, "received nothing for 80 ms"),
+        ({"watchdog": 0}, Cause.WATCHDOG, "no longer protected: its Bus Watchdog reads 0 but was set to 4"),
         ({"watchdog": 5}, Cause.WATCHDOG, "no longer protected"),
     ],
 )

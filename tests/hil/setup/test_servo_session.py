@@ -143,6 +143,21 @@ class _Gone(BaseException):
     """Simulates the end of the program."""
 
 
+@pytest.mark.parametrize("seconds", [0.15, 0.3, 0.5])
+def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
+    arm: Arm, tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str], seconds: float
+) -> None:
+    bench.prepare = lambda port: port.bus.faults.add(Fault(kind="silent_servo", servo=2, at=2.0, duration=seconds))
+    with pytest.raises((DriverError, HilError)) as stop:
+        play(arm(SHORT), tmp_path / "run")
+    assert [servo.value("Torque Enable") for servo in bench.port.bus.servos.values()] == [0, 0]
+    assert bench.changed() == []
+    if isinstance(stop.value, TorqueNotOff):
+        assert "Joint 'elbow' (ID 2, XM430-W350) answers again: its torque is off" in capsys.readouterr().err
+    stopped = (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8")
+    assert "missed" in stopped and "replies in a row" in stopped, "the cause, not only that torque was left on"
+
+
 def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(
     arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

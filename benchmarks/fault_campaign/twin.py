@@ -1,0 +1,148 @@
+"""Whether anything could have been seen: a healthy arm that would have sent the same replies.
+
+A fault that shows only in the motion cannot be seen, by whatever detector, as long as some healthy arm that the
+configuration leaves possible would have answered the same commands in the same way. Such an arm is looked for among
+physical parameters (masses, centres, inertias, friction, torque constants, a tilted base) with the emulator's own
+simulation, by least squares. If one is found it proves that nothing could be seen. If none is found, that proves
+nothing, and the run counts as one in which the fault was visible.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+from hil.fakes.plants.arm import Arm, Drive, Link
+from hil.fakes.plants.plant import make_plant
+
+Array = NDArray[np.float64]
+
+SAME_RAD, SAME_RAD_S = 0.02, 0.15
+"""Largest difference of angles, and RMS difference of velocities, that ordinary encoders and velocity filters cause."""
+
+_UNDESCRIBED, _DESCRIBED = np.log(10.0), np.log(2.5)
+"""Range of masses and inertias around the true ones, as logarithms of a factor, without and with link lengths."""
+
+_FRICTION, _CENTRE, _TORQUE = np.log(5.0), np.log(2.0), np.log(1.25)
+_TILT_RAD = 0.2
+_EVALUATIONS = 6
+_STEP = 0.01  # of the finite differences
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What the program received at `time` (n,) [s], angle and velocity (n, joints) [rad, rad/s], and what it commanded.
+
+    commands: times (m,) [s] and currents (m, joints) [A].
+    """
+
+    time: Array
+    angle: Array
+    velocity: Array
+    commanded_at: Array
+    commands: Array
+
+    @classmethod
+    def of(
+        cls, config: Config, heard: Sequence[Sequence[tuple[float, ...]]], sent: Sequence[Sequence[tuple[float, int]]]
+    ) -> "Heard":
+        """From each joint's replies (time, angle, velocity, ...) and goals (time, ticks)."""
+        told = [np.array(each, float).reshape(-1, 4) for each in heard]
+        goals = [np.array(each, float).reshape(-1, 2) for each in sent]
+        time = told[0][:, 0]
+        picked = [np.clip(np.searchsorted(each[:, 0], time, "right") - 1, 0, None) for each in told]
+        at = goals[0][:, 0]
+        latest = [np.clip(np.searchsorted(each[:, 0], at, "right") - 1, 0, None) for each in goals]
+        units = [joint.joint.drive_unit(12.0) for joint in config.joints]
+        return cls(
+            time,
+            np.column_stack([each[index, 1] for each, index in zip(told, picked, strict=True)]),
+            np.column_stack([each[index, 2] for each, index in zip(told, picked, strict=True)]),
+            at,
+            np.column_stack([unit * each[index, 1] for unit, each, index in zip(units, goals, latest, strict=True)]),
+        )
+
+    def until(self, end: float) -> "Heard":
+        early = self.time <= end
+        return Heard(self.time[early], self.angle[early], self.velocity[early], self.commanded_at, self.commands)
+
+
+def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
+    """Whether a healthy arm is found that would have sent what was received until `end` [s].
+
+    Voltage-driven servos, whose currents the commands do not determine, count as having none.
+    """
+    assert config.fake is not None
+    arm = config.fake.arm
+    told = heard.until(end)
+    if not isinstance(arm, Arm) or any(joint.drive_mode is Mode.PWM for joint in config.joints) or told.time.size < 2:
+        return False
+    limits = _limits(len(arm.links), _UNDESCRIBED if config.arm.link_lengths is None else _DESCRIBED)
+
+    def residuals(parameters: Array) -> Array:
+        angle, velocity = _played(arm, parameters, told)
+        return np.concatenate(
+            ((angle - told.angle).ravel() / SAME_RAD, (velocity - told.velocity).ravel() / SAME_RAD_S)
+        )
+
+    found = least_squares(
+        residuals,
+        np.zeros(limits.size),
+        bounds=(-limits, limits),
+        diff_step=np.full(limits.size, _STEP),
+        max_nfev=_EVALUATIONS,
+        loss="soft_l1",
+    )
+    angle, velocity = _played(arm, found.x, told)
+    far = float(np.abs(angle - told.angle).max())
+    off = float(np.sqrt(np.mean((velocity - told.velocity) ** 2, axis=0)).max())
+    return far <= SAME_RAD and off <= SAME_RAD_S
+
+
+def _limits(links: int, range_of_masses: float) -> Array:
+    """Largest absolute value of each parameter, in the order of `_altered`: seven per link, and the base's tilt."""
+    each = [range_of_masses, _CENTRE, range_of_masses, range_of_masses, _FRICTION, _FRICTION, _TORQUE]
+    return np.array([*each * links, _TILT_RAD])
+
+
+def _altered(arm: Arm, parameters: Array) -> Arm:
+    """The arm with other masses, centres, inertias, rotors, friction and torque constants, and its base tilted."""
+    links, drives = [], []
+    factors = np.exp(parameters[:-1]).reshape(len(arm.links), 7)
+    for link, drive, (mass, centre, inertia, rotor, viscous, coulomb, torque) in zip(
+        arm.links, arm.drives, factors.tolist(), strict=True
+    ):
+        links.append(
+            Link(length=link.length, mass=mass * link.mass, centre=centre * link.centre, inertia=inertia * link.inertia)
+        )
+        changed = {
+            "rotor_inertia": rotor * drive.rotor_inertia,
+            "viscous": viscous * drive.viscous,
+            "coulomb": coulomb * drive.coulomb,
+            "torque_constant": torque * drive.torque_constant,
+        }
+        drives.append(Drive(**{**drive.model_dump(), **changed}))
+    start = (arm.start[0] + float(parameters[-1]), *arm.start[1:])
+    return arm.model_copy(update={"links": tuple(links), "drives": tuple(drives), "start": start})
+
+
+def _played(arm: Arm, parameters: Array, told: Heard) -> tuple[Array, Array]:
+    """Angles and velocities (n, joints) of the altered arm under the same commands, at the times of `told`."""
+    plant = make_plant(_altered(arm, parameters))
+    begun = float(told.commanded_at[0])
+    angle, velocity = np.empty_like(told.angle), np.empty_like(told.velocity)
+    current: Sequence[float] = (0.0,) * told.angle.shape[1]
+    upcoming = 0
+    for index, time in enumerate(told.time.tolist()):
+        while upcoming < told.commanded_at.size and told.commanded_at[upcoming] <= time:
+            plant.advance(float(told.commanded_at[upcoming]) - begun, current)
+            current = told.commands[upcoming].tolist()
+            upcoming += 1
+        plant.advance(time - begun, current)
+        angle[index], velocity[index] = plant.position, plant.velocity
+    angle[:, 0] -= parameters[-1]
+    return angle, velocity

@@ -1,0 +1,291 @@
+"""Random faults in runs of spatial arms with four and six joints: which stops lower the arm, and which may drop it.
+
+    python benchmarks/spatial/chain_faults.py [--injections 100] [--first 0] [--only NAME] [--rate 400] [--show]
+
+The faults are those of benchmarks/faults.py, injected into the whole command on the fake arms
+`fake_open_manipulator_x` and `fake_viperx_300`, with paths of a few seconds. A spatial arm falls when torque is cut, so
+"current must end within 100 ms" holds only where the servos cannot be commanded any more. The emulated servos' own
+record, which the program never sees, decides:
+
+can command     the faults are of kinds that leave commands and readings true (`COMMANDABLE`), the record shows no
+                servo that was silent, disobeyed or told something false, and nothing held the arm by force
+unsafe          current that lasted longer than the bound: 100 ms, or the servos' watchdog, after a servo was silent or
+                the cable unplugged; otherwise the time in which the arm is lowered, which is watched all the way.
+                Links that came closer to each other while motors drove them than in the undisturbed run, and touched.
+                A joint that went further beyond its limits meanwhile than a lowering may
+lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
+                current was only switched off there
+"""
+
+import argparse
+import json
+import sys
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.fault_campaign import arms
+from benchmarks.fault_campaign.arms import Setting
+from benchmarks.fault_campaign.attack import Kind
+from benchmarks.fault_campaign.campaign import DoesNotRun, Ready, play, prepare
+from benchmarks.fault_campaign.draw import UNHEARD, Drawn, draw
+from benchmarks.fault_campaign.judge import BOUND_MS, TRIP_MS, Reason, Story, judge_words, reasons_of
+from hil.clearance.space import Space
+from hil.config.schema import Config
+from hil.plan.way_home import WayHome
+
+NAMES = ("fake_open_manipulator_x", "fake_viperx_300")
+RATES = (200, 400)
+PERIOD_S = 2.0
+RAMP_S = 1.5
+SWING = 0.4
+SAME_M = 2e-3
+"""Difference of two runs' least clearance that does not count [m]: an arm that lies touches what it lies on."""
+
+INJECTIONS = 100
+
+CANNOT = (
+    *("is not where the program was told", "is not as fast as told", "was not heard", "does not do as told"),
+    "the cable was unplugged",
+)
+"""Reasons after which the arm cannot be commanded reliably."""
+
+UNREACHED = ("was not heard", "the cable was unplugged")
+"""Reasons after which a servo cannot be commanded at all."""
+
+MOST_BEYOND_RAD = 0.2
+
+_BY_FORCE = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.OBSTACLE, Kind.SNAG, Kind.LOAD_CHANGED})
+COMMANDABLE = _BY_FORCE | {
+    *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP),
+    *(Kind.RAISED_LIMIT, Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG),
+}
+"""Kinds after which every servo still hears, obeys and tells the truth."""
+
+WEAKER = 0.3
+"""Force relative to the largest motor torque of the run that a motor overcomes on the way home in any pose."""
+
+SETTLES_S = 1.0
+"""Time beyond the foreseen lowering that a stop may take [s]."""
+
+LIES_RAD = 0.1
+LOOKED_AT_MS = 5
+
+
+@dataclass(frozen=True)
+class ChainOutcome:
+    """The outcome of one injection.
+
+    owed: why the run had to end, "" if there was no reason. can_command: see above; None if nothing stopped the run.
+    lies: whether it ended lying in its rest pose. late_ms: how long current flowed after the reason. clearance: least
+    distance while motors drove the arm, beyond that of the undisturbed run if that is negative [m]. beyond: largest
+    overshoot beyond a position limit meanwhile [rad].
+    """
+
+    setting: Setting
+    drawn: Drawn
+    owed: str
+    late_ms: float
+    bound_ms: float
+    lower_ms: float
+    clearance: float
+    beyond: float
+    stopped: bool
+    can_command: bool
+    lies: bool
+    named: bool
+    misleading: bool
+    unreadable: bool
+    not_restored: tuple[str, ...]
+    text: str
+
+    @property
+    def unsafe(self) -> bool:
+        is_late = self.late_ms > (self.lower_ms if self.lies else self.bound_ms)
+        return is_late or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
+
+    @property
+    def dropped(self) -> bool:
+        return self.stopped and self.can_command and not self.lies
+
+    def __str__(self) -> str:
+        flags = [word for word in ("unsafe", "dropped", "misleading", "unreadable") if getattr(self, word)]
+        flags += [f"not restored {', '.join(self.not_restored)}"] * bool(self.not_restored)
+        flags += ["unnamed"] * (self.stopped and not self.named)
+        return (
+            f"{self.setting.name} {self.setting.rate} Hz: {self.drawn}: {self.owed or 'nothing owed'}, current for "
+            f"{self.late_ms:.0f} ms of {self.bound_ms:.0f}, clearance {1e3 * self.clearance:.0f} mm, "
+            f"{', '.join(flags) or 'good'}\n    {self.text.strip()[-600:]}"
+        )
+
+
+def make_document(setting: Setting, period: float) -> dict[str, Any]:
+    """The bundled configuration with a short path at this rate, behind the campaign's port."""
+    document: dict[str, Any] = tomllib.loads((arms.CONFIGS / f"{setting.name}.toml").read_text(encoding="utf-8"))
+    urdf = str(arms.CONFIGS / document["arm"]["urdf"])
+    document["arm"]["urdf"] = document["fake"]["chain"]["urdf"] = urdf
+    document["experiment"] |= {
+        "rate": float(setting.rate),
+        "period": period,
+        "ramp": RAMP_S,
+        "periods": 1,
+        "settle_within": 0.9,
+        "held_out": False,
+    }
+    document["port"] |= {"url": f"{arms.SCHEME}arm"}
+    # Few harmonics in a short period: the path has another shape than the bundled one, for which the swing was chosen.
+    document["joint_path"]["swing"] = [SWING * each for each in document["joint_path"]["swing"]]
+    return document
+
+
+def inject(setting: Setting, seed: int) -> ChainOutcome:
+    """Draw faults and inject them into one run. Every second seed draws only from `COMMANDABLE`. Raises DoesNotRun."""
+    ready = prepare(setting, PERIOD_S, make_document)
+    ids = [joint.id for joint in ready.config.joints]
+    for attempt in count():
+        drawn = draw(f"chain {setting.name} {setting.rate} {seed} {attempt}", ready.undisturbed.ended, ids)
+        if seed % 2 or set(drawn.kinds) <= COMMANDABLE:
+            break
+    story, readable, changed = play(ready, drawn, seed)
+    return _judged(ready, drawn, story, readable, changed)
+
+
+def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: tuple[str, ...]) -> ChainOutcome:
+    config, record = ready.config, story.record
+    reasons = reasons_of(config, drawn, story, ready.undisturbed)
+    time, driven = record["time"][:, 0], np.asarray(record["driven"].any(axis=1))
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    moved = record["position"][driven] if driven.any() else record["position"][:1]
+    unheard = bool(set(drawn.kinds) & UNHEARD)
+    cut_ms = max(BOUND_MS, 1e3 * config.safety.watchdog + TRIP_MS) if unheard else BOUND_MS
+    lower_ms = 1e3 * (longest_lowering(ready.path) + SETTLES_S)
+    cannot = [reason for reason in reasons if any(word in reason[0] for word in CANNOT)]
+    unreached = [reason for reason in cannot if any(word in reason[0] for word in UNREACHED)]
+    (owed, since), bound = _owed(reasons, unreached, cut_ms, lower_ms)
+    flowed = time[driven & (time >= since)]
+    stopped = bool(story.code)
+    named, misleading = judge_words(drawn, story.text) if stopped else (True, False)
+    last = np.flatnonzero(driven)
+    return ChainOutcome(
+        ready.setting,
+        drawn,
+        owed,
+        1e3 * float(flowed[-1] - since) if flowed.size else 0.0,
+        bound,
+        lower_ms,
+        _clearance(config, record) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
+        float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
+        stopped,
+        not cannot and _leaves_command(drawn, story.ended),
+        _lies(config, record["position"][last[-1] if last.size else -1]),
+        bool(named),
+        misleading,
+        not readable or (stopped and story.code != -9 and not story.text.strip()),
+        changed,
+        story.text,
+    )
+
+
+def _owed(reasons: list[Reason], unreached: list[Reason], cut_ms: float, lower_ms: float) -> tuple[Reason, float]:
+    """The reason whose bound ends first, and the bound [ms]."""
+    ends = [(each, cut_ms if each in unreached else lower_ms) for each in reasons]
+    return min(ends, key=lambda pair: pair[0][1] + 1e-3 * pair[1], default=(("", np.inf), cut_ms))
+
+
+@cache
+def longest_lowering(path: Path) -> float:
+    """Longest way home [s] from any point of the planned path."""
+    from hil.config.schema import parse_config
+    from hil.plan.chain_plan import make_chain_plan
+
+    config = parse_config(path.read_text(encoding="utf-8"), path)
+    plan = make_chain_plan(config)
+    way = WayHome(config, plan)
+    segment: Any = plan.segments[0]
+    played = segment.paths[1]
+    every = range(0, played.position.shape[1], max(1, played.position.shape[1] // 20))
+    ways = [way.path(played.position[:, k], played.velocity[:, k]).position.shape[1] for k in every]
+    return float(max(ways)) / plan.rate
+
+
+def _leaves_command(drawn: Drawn, ended: float) -> bool:
+    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end."""
+    forced = any(
+        each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks
+    )
+    return set(drawn.kinds) <= COMMANDABLE and not forced
+
+
+def _clearance(config: Config, record: NDArray[Any]) -> float:
+    """Least distance [m] while motors drove the arm and it was away from its rest pose."""
+    driven = np.asarray(record["driven"].any(axis=1))
+    position = record["position"][driven][::LOOKED_AT_MS].T
+    space = Space.of(config)
+    position = position[:, ~space.lies(position)]
+    if not position.shape[1]:
+        return 1.0
+    return float(min(space.nearest(position, on_the_way=True).distance, 1.0))
+
+
+def _lies(config: Config, position: NDArray[np.float64]) -> bool:
+    return bool(np.abs(position - np.array(config.arm.rest_pose)).max() < LIES_RAD)
+
+
+def figures(outcomes: Iterable[ChainOutcome]) -> dict[str, Any]:
+    """Summary figures."""
+    every = list(outcomes)
+    stopped = [each for each in every if each.stopped]
+    commanding = [each for each in stopped if each.can_command]
+    return {
+        "injections": len(every),
+        "unsafe": sum(each.unsafe for each in every),
+        "stopped": len(stopped),
+        "could_command": len(commanding),
+        "lying": sum(each.lies for each in commanding),
+        "unnamed": sum(not each.named for each in stopped),
+        "misleading": sum(each.misleading for each in stopped),
+        "unreadable": sum(each.unreadable for each in every),
+        "not_restored": sum(bool(each.not_restored) for each in every),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--injections", type=int, default=INJECTIONS, help="number, over all settings")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--only", choices=NAMES)
+    parser.add_argument("--rate", type=int, choices=RATES)
+    parser.add_argument("--show", action="store_true", help="print every outcome that is not good")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    settings = [
+        Setting(name, rate)
+        for name in NAMES
+        for rate in RATES
+        if options.only in (None, name) and options.rate in (None, rate)
+    ]
+    outcomes, left_out = [], set()
+    for number in range(options.injections):
+        try:
+            outcomes.append(inject(settings[number // 2 % len(settings)], options.first + number))
+        except DoesNotRun as error:
+            left_out.add(str(error))
+            continue
+        bad = outcomes[-1]
+        if options.show and (bad.unsafe or bad.dropped or bad.misleading or bad.unreadable or bad.not_restored):
+            print(bad, flush=True)
+    told = {**figures(outcomes), "left_out": sorted(left_out)}
+    print(json.dumps(told) if options.json else "\n".join(f"{name}: {value}" for name, value in told.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,22 @@
+"""Whether a stop of a spatial arm would lay it down decides about "safe" as well."""
+
+import numpy as np
+
+from hil.clearance.space import Nearest
+from hil.dry_run.chain_stop import ChainStops, Fall, LoweringForeseen
+
+FALL = Fall(0.0, None, 1.0, 0.1, 1.0, np.zeros(3))
+FREE = Nearest(0.05, 0.01, ("hand", "floor"), 0)
+
+
+def test_a_lowering_with_room_that_lays_the_arm_down_is_safe() -> None:
+    assert ChainStops(FALL, LoweringForeseen(5.0, FREE, 1.0)).unsafe == ""
+
+
+def test_too_little_room_on_the_way_down_is_not() -> None:
+    near = Nearest(-0.005, 0.01, ("hand", "floor"), 0)
+    assert "hand and floor: -5 mm, at least 10 mm" in ChainStops(FALL, LoweringForeseen(5.0, near, 1.0)).unsafe
+
+
+def test_arms_that_do_not_reach_the_rest_pose_are_not() -> None:
+    assert "83 %" in ChainStops(FALL, LoweringForeseen(5.0, FREE, 0.83)).unsafe
