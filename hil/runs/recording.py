@@ -4,6 +4,7 @@ The samples survive if the process is killed, but not if the machine loses power
 pages. A row whose phase is 0 has not been recorded.
 """
 
+import contextlib
 import ctypes
 import mmap
 import os
@@ -87,6 +88,8 @@ class Recorder:
             self._samples: NDArray[np.void] = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=(capacity,))
             _reserve(path)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                path.unlink()  # a part of it could not be read
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
         self._bytes = memoryview(self._samples.view(np.uint8).data)
         self._rows_a_chunk = max(1, _CHUNK_BYTES // self._row.size)
