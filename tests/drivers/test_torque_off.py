@@ -99,6 +99,7 @@ def test_an_interrupted_write_is_repeated_five_times_at_most(count: int, confirm
     bench = Bench(first=[KeyboardInterrupt() for _ in range(count)])
     assert (JOINTS[0] in bench.cut()[0]) is True, "it is tried again after the watchdog's time"
     assert len(bench.interrupts) == count
+    assert (bench.sent[-1][1] < WATCHDOG_S) is confirmed, "five count as a failure"
     assert [who for who, _ in bench.sent].count(FIRST) == (5 if confirmed else 6)
 
 
