@@ -156,7 +156,14 @@ class Selection:
                 best = self._better(self._with_ripple(near), best) or best
         best = self._steadied(best) or best
         again = self._with_bristles(self._restarted(best))
-        return self._converged(best if again is best else self._steadied(again) or again)
+        again = self._converged(best if again is best else self._steadied(again) or again)
+        return self._without_bristles(again)
+
+    def _without_bristles(self, best: Trial) -> Trial:
+        """Drop presliding if the motion is explained as well without it: it may have passed for ripple before that."""
+        if "presliding" not in best.model.options or "ripple" not in best.model.options:
+            return best
+        return self._better(best, self._try_or_none(best.model.without("presliding"), best)) or best
 
     def _with_bristles(self, best: Trial) -> Trial:
         """Add presliding to a model that explains nearly everything, from where it is: a search would find no more."""
