@@ -43,7 +43,7 @@ _MOVED = 2.0
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
 """Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
 
-_LYING_RAD = 0.15
+_LYING_RAD = 0.25
 """Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given."""
 
 

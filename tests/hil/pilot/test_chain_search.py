@@ -8,7 +8,7 @@ from hil.config.schema import load_config, parse_config
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import unsafe
-from hil.errors import NoSafeTorque
+from hil.errors import ConfigError
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
@@ -97,7 +97,7 @@ def hil_foot(config: object, motion: Motion) -> list[float]:
 def test_no_room_is_said() -> None:
     text = LEG.read_text(encoding="utf-8").replace("floor = -0.4 ", "floor = 0.02 ")
     config = chain_config(parse_config(text, LEG))
-    with pytest.raises(NoSafeTorque, match="clearance"):
+    with pytest.raises(ConfigError, match=r"arm\.rest_pose puts shank .* into floor"):
         Paths.of(config, ChainBelief.prior(config).torque)
 
 
