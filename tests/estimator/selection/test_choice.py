@@ -36,11 +36,12 @@ def test_the_plain_model_is_kept_where_nothing_more_is_true(
     choice = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay")
     assert choice.estimate.model == Model(2, "coulomb", "delay")
     assert choice.gained == 1.0 and choice.cost == pytest.approx(1.0)
-    # An initial guess that fails is counted, which shows that it was used, and does not affect the result.
-    astray = {name: 0.1 * value for name, value in base_parameters(ideal_arm).items()}
-    again = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay", starts=[astray])
+    # A further initial guess is used, which the number of iterations shows, and does not affect the result.
+    near = {name: 1.1 * value for name, value in base_parameters(ideal_arm).items()}
+    again = choose([ideal_period], recorded(ideal_arm, wave(2, (0.8, 0.42))), "delay", starts=[near])
     first, second = again.trials[0].estimate, choice.trials[0].estimate
     assert first is not None and second is not None and first.iterations != second.iterations
+    assert np.nanstd(first.residual) == pytest.approx(np.nanstd(second.residual), rel=1e-4)
     assert again.estimate.value == pytest.approx(choice.estimate.value, rel=1e-3)
 
 
