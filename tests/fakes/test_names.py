@@ -56,7 +56,7 @@ def test_a_file_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_unknown_names_come_with_the_known_ones() -> None:
-    with pytest.raises(DescriptionError, match="known by name: .*koch, .*open_manipulator_x, .*viperx_300"):
+    with pytest.raises(DescriptionError, match=r"known by name: .*koch, .*open_manipulator_x, .*viperx_300"):
         load_fake("nosuch")
 
 
