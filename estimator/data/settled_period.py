@@ -12,6 +12,7 @@ from hil.estimator.simulation.closed_loop import Stabilised
 
 FEWEST_SAMPLES = 32
 SPIKE = 8.0  # deviation from the local median, in typical deviations, above which a reading is a spike
+MOST_SPIKES = 0.05  # fraction of spikes above which they are the motion itself
 LEAST_VALID = 0.5  # minimum fraction of a joint's samples that must be valid
 LEAST_MOTION = 4.0  # minimum range of motion in encoder steps
 MOST_GAP = 4.0  # allowed gap from the last sample to the first, relative to the largest change between neighbours
@@ -97,12 +98,14 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     """Return the period with single outliers (such as a bit error on the bus) marked as missing.
 
     A reading is an outlier if its distance from the median of itself and two neighbours on either side exceeds SPIKE
-    encoder steps and SPIKE times the typical distance.
+    encoder steps and SPIKE times the typical distance. Where more than MOST_SPIKES are that far, they are no outliers:
+    the joint moves that fast, compared with the sample rate.
     """
     position = period.filled()
     away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))
     usual = np.maximum(1.5 * np.median(away, axis=1), np.maximum(period.position_step, period.noise))
     wild = (away > SPIKE * usual[:, None]) & period.valid
+    wild &= wild.mean(axis=1, keepdims=True) <= MOST_SPIKES
     if not wild.any():
         return period
     return replace(period, position=np.where(wild, np.nan, period.position))

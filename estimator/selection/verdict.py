@@ -141,7 +141,8 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
     if not evidence.tried_all and estimate.model.friction != "stribeck_load":
         return 'No single term explains it; [model] friction = "auto" tries them together.'
     return (
-        "No available term explains it. Possible causes: backlash, a loose screw, a sagging supply or a dragging cable."
+        "No available term explains it. Possible causes: cogging or torque ripple, backlash, a loose screw, a sagging "
+        "supply or a dragging cable."
     )
 
 

@@ -30,8 +30,8 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         lost = 1.0 - float(np.mean(period.valid[index]))
         if lost > LOST:
             found.append(
-                f"{joint.name}: {100 * lost:.1f} % of the samples are missing; check cable, baud rate and sampling "
-                "rate."
+                f"{joint.name}: {100 * lost:.1f} % of the samples are missing or far from their neighbours; check "
+                "cable, baud rate and sampling rate."
             )
     return found
 

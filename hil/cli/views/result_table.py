@@ -19,6 +19,12 @@ from hil.results.result import Result, SettledResult, ShootingResult
 _NOTHING = 1e-9
 """Fraction of a value below which a truth is rounding error, so that a relative error means nothing."""
 
+_MOST_NAMED = 3
+"""Number of models tried up to which all are named."""
+
+_ALIKE = 0.05
+"""Relative difference up to which two errors are about the same."""
+
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
     """Print the parameter table, the quality of the fit, the verdict and the next commands."""
@@ -130,14 +136,23 @@ def _choice(result: SettledResult) -> list[str]:
     choice = result.model_choice
     if not choice:
         return []
-    if len(choice.tried) == 1:
+    tried = list(dict.fromkeys(trial.model for trial in choice.tried))
+    if len(tried) == 1:
         return [f"Model chosen: {choice.chosen}. The motion gives no reason to add a term."]
-    tried = ", ".join(trial.model for trial in choice.tried)
-    gained, cost = choice.error_divided_by, choice.standard_errors_times
+    among = ", ".join(tried) if len(tried) <= _MOST_NAMED else f"{len(tried)} candidates"
+    cost = choice.standard_errors_times
     return [
-        f"Model chosen from {tried}: {choice.chosen}. Compared with the first, its prediction error is {gained:.3g} "
-        f"times smaller and its standard errors are {cost:.3g} times larger."
+        f"Model chosen from {among}: {choice.chosen}. Compared with {tried[0]}, its prediction error is "
+        f"{_times(1.0 / choice.error_divided_by)} and its standard errors are {_times(cost)}."
     ]
+
+
+def _times(ratio: float | None) -> str:
+    if ratio is None:
+        return "not comparable"
+    if abs(ratio - 1.0) < _ALIKE:
+        return "about the same"
+    return f"{ratio:.3g} times larger" if ratio > 1.0 else f"{1.0 / ratio:.3g} times smaller"
 
 
 def _verdict(result: SettledResult) -> list[str]:

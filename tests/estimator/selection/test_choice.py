@@ -92,6 +92,12 @@ def test_a_wild_reading_costs_nothing(ideal_arm: Arm, ideal_period: SettledPerio
     assert estimate.outliers >= 8
 
 
+def test_motion_that_is_fast_for_the_sample_rate_is_no_outlier(ideal_period: SettledPeriod) -> None:
+    slow = replace(ideal_period, position=ideal_period.position[:, ::40], torque=ideal_period.torque[:, ::40])
+    slow = replace(slow, rate=ideal_period.rate / 40)
+    assert without_spikes(slow).valid.all()
+
+
 def test_two_runs_together_tell_more_than_one(
     ideal_arm: Arm, ideal_period: SettledPeriod, recorded: Recorder, wave: Wave
 ) -> None:
