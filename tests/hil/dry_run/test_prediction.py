@@ -83,7 +83,7 @@ def test_seen_peaks_stay_within_the_predicted_ones() -> None:
 
 
 def test_without_link_lengths_there_is_no_prior(arm: Arm) -> None:
-    with pytest.raises(ConfigError, match=r"needs arm\.link_lengths"):
+    with pytest.raises(ConfigError, match=r"set arm\.link_lengths"):
         prior_ensemble(arm(), 4)
 
 
