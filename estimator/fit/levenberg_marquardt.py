@@ -136,11 +136,14 @@ class _Trials:
             gained = self.at.cost - self._cost_at(moved)
             if gained > 0.0:
                 trusted = 0.1 if gained > 0.5 * foreseen else 1.0
+                taken = damping
                 if self.cost is not None and trusted < 1.0:
-                    moved, damping = self._bolder(moved, gained, damping, options)
+                    moved, taken = self._bolder(moved, gained, damping, options)
                 there = self._evaluated(moved)
                 if there.cost < self.at.cost:
-                    return (moved, there), max(options.min_damping, damping * trusted)
+                    return (moved, there), max(options.min_damping, taken * trusted)
+            # Also where `cost` promised a decrease that the normal equations' simulation does not confirm: damping
+            # rises from the step tried first, not from a bolder one, or the search would never end.
             damping = max(10.0 * damping, options.initial_damping)
         return None, damping
 

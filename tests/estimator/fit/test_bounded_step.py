@@ -50,3 +50,14 @@ def test_a_narrow_valley_is_followed_to_its_end_with_short_steps() -> None:
         return Quadratic(float(r @ r) + 1e-3, J.T @ J, J.T @ r)
 
     assert np.allclose(minimise(evaluate, np.zeros(3), 1e-9, 1e-9).x, goal, atol=0.05)
+
+
+def test_a_search_ends_where_the_sum_alone_promises_what_the_normal_equations_do_not_confirm() -> None:
+    evaluated = []
+
+    def evaluate(x: np.ndarray) -> Quadratic:
+        evaluated.append(x)
+        return Quadratic(1.0 + 1e-3 * len(evaluated), np.eye(2), np.array([0.3, -0.2]))
+
+    found = minimise(evaluate, np.zeros(2), 1e-6, cost=lambda x: 0.9 - 0.1 * float(x @ x))
+    assert found.x.tolist() == [0.0, 0.0] and len(evaluated) < 50
