@@ -10,7 +10,7 @@ from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_lines
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.summary import DryRun, dry_run_lines
 from hil.report.page import render, write_page
-from hil.report.scene import MOST_FRAMES, spatial_motion
+from hil.report.scene import planar_motion, spatial_motion
 from hil.report.section import Motion, Section, SpatialMotion, Table
 
 
@@ -47,16 +47,7 @@ def _in_space(found: ChainDryRun) -> SpatialMotion | None:
 def _in_plane(config: Config, shown: Prediction) -> Motion | None:
     if not len(shown.shown):
         return None
-    angles = shown.shown[0]
-    step = max(1, -(-angles.shape[1] // MOST_FRAMES))
-    lengths = config.arm.link_lengths or (1.0,) * len(angles)
-    return Motion(
-        step / shown.rate,
-        tuple(tuple(round(float(angle), 4) for angle in row) for row in angles[:, ::step]),
-        tuple(float(length) for length in lengths),
-        bool(config.arm.gravity),
-        "One of the simulated arms",
-    )
+    return planar_motion(config, shown.shown[0], shown.rate, "One of the simulated arms")
 
 
 def _peaks(config: Config, shown: Prediction) -> Table:

@@ -1,6 +1,6 @@
-"""A spatial arm's motion as data for the page: geometry once, then angles and clearance frame by frame.
+"""An arm's motion as data for the page: geometry once, then angles, and in space the clearance, frame by frame.
 
-The page's script (spatial.js) places the links itself, so that a motion of minutes takes a few hundred kilobytes.
+The page's scripts place the links themselves, so that a motion of minutes takes a few hundred kilobytes.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.description.urdf import rotation_of
-from hil.report.section import SpatialMotion
+from hil.report.section import Motion, SpatialMotion
 
 Array = NDArray[np.float64]
 
@@ -20,6 +20,19 @@ FEW_POSES = 60
 """Number of poses from which the size of the picture is found."""
 MOST_SHOWN_M = 1.0
 """Clearances above this are shown as this [m]."""
+
+
+def planar_motion(config: Config, position: Array, rate: float, caption: str = "") -> Motion:
+    """The motion (joints, samples) [rad] of a configured planar arm; links without a length are drawn 1 m long."""
+    step = _frame_step(position)
+    lengths = config.arm.link_lengths or (1.0,) * len(position)
+    return Motion(
+        step / rate,
+        tuple(tuple(round(float(angle), 4) for angle in row) for row in position[:, ::step]),
+        tuple(float(length) for length in lengths),
+        bool(config.arm.gravity),
+        caption,
+    )
 
 
 def spatial_motion(
@@ -31,7 +44,7 @@ def spatial_motion(
     closer than the margin. Raises ConfigError, ArmFileError.
     """
     space = Space.of(config)
-    step = max(1, -(-position.shape[1] // MOST_FRAMES))
+    step = _frame_step(position)
     kept = np.arange(0, position.shape[1], step)
     angles = position[:, kept]
     on_the_way = (kept < ways[0]) | (kept >= position.shape[1] - ways[1])
@@ -52,6 +65,11 @@ def spatial_motion(
         **_clearances(space, angles, on_the_way),
     }
     return SpatialMotion(caption, scene)
+
+
+def _frame_step(position: Array) -> int:
+    """Number of samples from one frame to the next."""
+    return max(1, -(-int(position.shape[1]) // MOST_FRAMES))
 
 
 def _clearances(space: Space, angles: Array, on_the_way: NDArray[np.bool_]) -> dict[str, Any]:

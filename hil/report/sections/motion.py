@@ -5,9 +5,11 @@ from numpy.typing import NDArray
 
 from hil.report.chart import GREEN, Chart, Series
 from hil.report.run_data import RunData
-from hil.report.scene import MOST_FRAMES, spatial_motion
-from hil.report.section import Motion, Picture, Section, SpatialMotion, Table
+from hil.report.scene import planar_motion, spatial_motion
+from hil.report.section import Picture, Section, Table
 from hil.runs.period_file import PlayedPeriod
+
+_IN_SPACE = "The arm in the fitted period, as measured, with its parts enclosed in capsules."
 
 
 def motion(data: RunData) -> Section | None:
@@ -29,7 +31,8 @@ def motion(data: RunData) -> Section | None:
         )
         for joint, name in enumerate(data.names)
     )
-    moving = _moving_in_space(data, period) if data.config.is_chain else _moving(data, period)
+    shown = data.config, _filled(period), period.rate
+    moving = spatial_motion(*shown, _IN_SPACE) if data.config.is_chain else planar_motion(*shown)
     return Section("motion", "The experiment", pictures=pictures, motion=moving)
 
 
@@ -53,23 +56,6 @@ def next_commands(data: RunData) -> Section:
     return Section("next", "What next", tables=(Table(("", ""), rows, 2),))
 
 
-def _moving_in_space(data: RunData, period: PlayedPeriod) -> SpatialMotion:
-    said = "The arm in the fitted period, as measured, with its parts enclosed in capsules."
-    return spatial_motion(data.config, _filled(period), period.rate, said)
-
-
 def _filled(period: PlayedPeriod) -> NDArray[np.float64]:
     """Measured positions; predicted ones where a measurement is missing."""
     return np.where(np.isfinite(period.position), period.position, period.predicted)
-
-
-def _moving(data: RunData, period: PlayedPeriod) -> Motion:
-    filled = _filled(period)
-    step = max(1, -(-filled.shape[1] // MOST_FRAMES))
-    lengths = data.config.arm.link_lengths or (1.0,) * len(filled)
-    return Motion(
-        step / period.rate,
-        tuple(tuple(round(float(angle), 4) for angle in row) for row in filled[:, ::step]),
-        tuple(float(length) for length in lengths),
-        bool(data.config.arm.gravity),
-    )
