@@ -38,6 +38,8 @@ from hil.next_step import command
 from hil.toml_errors import describe
 
 FAKE_URL = "fake://"
+LYING_RAD = 0.25
+"""Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given [rad]."""
 
 SLOW_INTERVAL_S = 0.25
 """Interval between slow reads [s], which alternate between the servos' clocks and voltage and temperature."""
@@ -239,6 +241,16 @@ class Config(Table):
     def is_chain(self) -> bool:
         """Whether the arm is one in space: described by a file, unless that describes a planar arm without a path."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
+
+    @property
+    def rest_tolerance(self) -> float:
+        """Largest deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
+
+        If that is not given, it is LYING_RAD for a spatial arm: it lies on something, where friction holds it less far
+        away than an arm that hangs.
+        """
+        is_given = "rest_tolerance" in self.arm.model_fields_set
+        return LYING_RAD if self.is_chain and not is_given else self.arm.rest_tolerance
 
     @property
     def url(self) -> str:

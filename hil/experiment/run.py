@@ -43,9 +43,6 @@ _MOVED = 2.0
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
 """Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
 
-_LYING_RAD = 0.25
-"""Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given."""
-
 
 def run_experiment(
     config: Config,
@@ -216,7 +213,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
     """
     if has_moved():
         _check_inside(config, bus)
-    tolerance = _rest_tolerance(config) * (_MOVED if has_moved() else 1.0)
+    tolerance = config.rest_tolerance * (_MOVED if has_moved() else 1.0)
     or_there = " If the arm lies there without torque, set arm.rest_pose." if config.is_chain else ""
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
@@ -226,12 +223,6 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
                 f"{tolerance:g}. Move it there by hand: friction may hold it away from rest. Only "
                 f"if it is in its rest pose now, set zero_ticks = {ticks}.{or_there}"
             )
-
-
-def _rest_tolerance(config: Config) -> float:
-    """A spatial arm lies on something, where friction holds it less far away than an arm that hangs."""
-    given = config.arm.rest_tolerance
-    return min(given, _LYING_RAD) if config.is_chain and "rest_tolerance" not in config.arm.model_fields_set else given
 
 
 def _check_inside(config: Config, bus: ServoBus) -> None:

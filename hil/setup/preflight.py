@@ -312,10 +312,10 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
     fix = (
-        f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.arm.rest_tolerance:g}. If the arm hangs "
+        f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. If the arm hangs "
         f"at rest now, set zero_ticks = {zero}."
     )
-    return _graded(abs(angle - rest) <= config.arm.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)
+    return _graded(abs(angle - rest) <= config.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)
 
 
 _LOOKS: tuple[_Look, ...] = (
