@@ -225,15 +225,15 @@ class Exchange:
                 break
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
-        self._look_for_strangers(received)
+        self._look_for_strangers(_packets_within(received))
         complete = sum(answer is not None for answer in answers) / len(answers)
         if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
             self.damaged_at = self._now()
         return answers
 
-    def _look_for_strangers(self, received: bytes) -> None:
+    def _look_for_strangers(self, packets: Sequence[Packet]) -> None:
         if not self._echoes:
-            self.strangers += sum(self._is_strange(packet) for packet in _packets_within(received))
+            self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
         """Whether this is an instruction, or the answer to one, of another master. A refusal has no data."""
@@ -243,8 +243,9 @@ class Exchange:
 
     def _overhear(self, received: bytes) -> None:
         """Look at bytes that were pending before the request: another master's, or a late or second reply."""
-        self._look_for_strangers(received)
-        if any(packet.is_status for packet in Framer().feed(received)):
+        packets = _packets_within(received)
+        self._look_for_strangers(packets)
+        if any(packet.is_status for packet in packets):
             self.late_at = self._now()
 
     def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:

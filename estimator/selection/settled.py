@@ -9,6 +9,7 @@ Statistics 6 (1978) 461), with the number of samples reduced according to the re
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
+from itertools import islice
 from types import MappingProxyType
 
 import numpy as np
@@ -247,18 +248,15 @@ class Selection:
 
     def _restarted(self, best: Trial) -> Trial:
         """Refit the model from other initial guesses while it does not explain the motion of every joint."""
-        left = self._options.max_restarts
-        while best.estimate is not None:
-            for values in restarts(self.period, best.estimate, self._options):
+        left, improved = self._options.max_restarts, True
+        while improved and best.estimate is not None:
+            improved = False
+            for values in islice(restarts(self.period, best.estimate, self._options), left):
                 left -= 1
                 again = self._better(self._try_or_none(best.model, best, values, coarse=True), best)
-                if left <= 0 or (again is not None and again is not best):
+                if again is not None and again is not best:
+                    best, improved = again, True
                     break
-            else:
-                return best
-            best = again or best
-            if left <= 0:
-                break
         return best
 
     def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:
