@@ -22,7 +22,7 @@ MOST_SHOWN_M = 1.0
 """Clearances above this are shown as this [m]."""
 
 
-def planar_motion(config: Config, position: Array, rate: float, caption: str = "") -> Motion:
+def planar_motion(config: Config, position: Array, rate: float, caption: str) -> Motion:
     """The motion (joints, samples) [rad] of a configured planar arm; links without a length are drawn 1 m long."""
     step = _frame_step(position)
     lengths = config.arm.link_lengths or (1.0,) * len(position)

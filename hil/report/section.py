@@ -48,7 +48,7 @@ class Motion:
     angles: tuple[tuple[float, ...], ...]
     lengths: tuple[float, ...]
     hangs: bool
-    caption: str = "The arm in the fitted period, as measured"
+    caption: str
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from hil.report.scene import planar_motion, spatial_motion
 from hil.report.section import Picture, Section, Table
 from hil.runs.period_file import PlayedPeriod
 
-_IN_SPACE = "The arm in the fitted period, as measured, with its parts enclosed in capsules."
+_SHOWN = "The arm in the fitted period, as measured"
 
 
 def motion(data: RunData) -> Section | None:
@@ -32,7 +32,11 @@ def motion(data: RunData) -> Section | None:
         for joint, name in enumerate(data.names)
     )
     shown = data.config, _filled(period), period.rate
-    moving = spatial_motion(*shown, _IN_SPACE) if data.config.is_chain else planar_motion(*shown)
+    moving = (
+        spatial_motion(*shown, f"{_SHOWN}, with its parts enclosed in capsules.")
+        if data.config.is_chain
+        else planar_motion(*shown, _SHOWN)
+    )
     return Section("motion", "The experiment", pictures=pictures, motion=moving)
 
 

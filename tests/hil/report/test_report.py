@@ -59,6 +59,11 @@ def test_words_come_first_then_every_section_and_figure(identified: Path) -> Non
         assert said in page
 
 
+def test_the_moving_arm_says_what_it_shows(identified: Path) -> None:
+    page = make_page(RunData.load(identified))
+    assert "<figcaption>The arm in the fitted period, as measured; gravity points down. Play it" in page
+
+
 def test_a_run_in_steps_shows_prediction_beside_what_was_seen(identified: Path) -> None:
     path = identified / "result.json"
     result = json.loads(path.read_text(encoding="utf-8"))
