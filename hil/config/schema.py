@@ -37,6 +37,18 @@ from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
 from hil.toml_errors import describe
 
+__all__ = [
+    "ArmConfig",
+    "Config",
+    "PortConfig",
+    "PriorConfig",
+    "SafetyConfig",
+    "StabiliserConfig",
+    "load_config",
+    "parse_config",
+    "port_url",
+]
+
 FAKE_URL = "fake://"
 LYING_RAD = 0.25
 """Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given [rad]."""
