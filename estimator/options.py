@@ -111,6 +111,10 @@ class LikelihoodOptions:
     coarse_integration: IntegrationOptions = IntegrationOptions(max_step=2.6e-3, max_substeps=16)
     """Accurate to a few hundredths of an encoder step, in a third of the time."""
     covariance: CovarianceOptions = CovarianceOptions()
+    least_inflation: float = 2.0
+    """Factor by which the data's variance must exceed that of independent errors for priors to count more."""
+    least_tempering: float = 1e-4
+    """Least increase of the sum of squares, as a fraction of it, for which the fit is repeated with such priors."""
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried.

@@ -133,6 +133,10 @@ class CoordinatePrior:
                 centre[index], precision[index] = np.log(term.initial), 1.0 / term.log_spread**2
         return cls(centre, precision)
 
+    def weighted(self, factor: Array) -> "CoordinatePrior":
+        """Return this prior with its precisions multiplied by `factor` (parameters,)."""
+        return CoordinatePrior(self.centre, self.precision * factor)
+
     def cost(self, x: Array) -> float:
         """Return the prior's contribution to the sum of squares at the coordinates `x` (parameters,)."""
         return float(np.sum(self.precision * (x - self.centre) ** 2))

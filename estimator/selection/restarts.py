@@ -11,10 +11,14 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
+from hil.estimator.models.terms import term_of
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import ripple_cycles
 
 ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
+LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
+WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be told apart
+NARROW = 1e-3  # rad/s: initial width of an undisguised step
 ALIKE_CYCLES = 0.3  # difference of two numbers of cycles per turn between which no minimum is expected
 
 
@@ -34,6 +38,20 @@ def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOption
         if left[joint - 1] > options.presliding_residual**2:
             yield from _ripple(period, estimate, int(joint), options)
             yield from _standstill(estimate, int(joint), options)
+
+
+def undisguised(estimate: Estimate) -> dict[str, float]:
+    """Return changed parameters, by name, for joints whose Stribeck rise may be a narrow Coulomb step in disguise.
+
+    A rise that fades within a wide step resembles a narrow step without a rise, and explains the motion nearly as well;
+    no path leads from one to the other.
+    """
+    values, changed = estimate.parameters, {}
+    for joint in range(1, estimate.model.joints + 1):
+        rise, velocity, width = (f"{name}_{joint}" for name in ("stribeck_rise", "stribeck_velocity", "coulomb_width"))
+        if {rise, width} <= values.keys() and values[rise] > LEAST_RISE and values[width] > WIDE * values[velocity]:
+            changed |= {rise: LEAST_RISE, velocity: term_of(velocity).initial, width: NARROW}
+    return changed
 
 
 def _ripple(

@@ -24,7 +24,7 @@ from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_o
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
 from hil.estimator.selection.drift import Drift, friction_change
-from hil.estimator.selection.restarts import bristles, restarts
+from hil.estimator.selection.restarts import bristles, restarts, undisguised
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
 
@@ -142,7 +142,7 @@ class Selection:
         plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
-            return self._steadied(plain) or plain
+            return self._undisguised(self._steadied(plain) or plain)
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
             best = self._steadied(self._better(self._try_or_none(smooth, plain, coarse=True), plain))
@@ -158,7 +158,12 @@ class Selection:
         best = self._steadied(best) or best
         again = self._with_bristles(self._restarted(best))
         again = self._converged(best if again is best else self._steadied(again) or again)
-        return self._without_bristles(again)
+        return self._undisguised(self._without_bristles(again))
+
+    def _undisguised(self, best: Trial) -> Trial:
+        """Refit with narrow Coulomb steps where the Stribeck rise may only imitate them, if that explains more."""
+        values = {} if best.estimate is None else undisguised(best.estimate)
+        return self._better(self._try_or_none(best.model, best, values), best) or best if values else best
 
     def _without_bristles(self, best: Trial) -> Trial:
         """Drop presliding if the motion is explained as well without it: it may have passed for ripple before that."""
@@ -244,7 +249,7 @@ class Selection:
         """Return a fit with full precision: while models are compared, those that leave much do not get it."""
         if not trial.coarse or self._is_explained(trial):
             return trial
-        return self._better(self._try_or_none(trial.model, trial), trial) or trial
+        return self._try_or_none(trial.model, trial) or trial
 
     def _restarted(self, best: Trial) -> Trial:
         """Refit the model from other initial guesses while it does not explain the motion of every joint."""
