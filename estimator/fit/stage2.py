@@ -24,7 +24,7 @@ from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
 from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever, Sizes, scales_of
-from hil.estimator.fit.ripple import find_ripple
+from hil.estimator.fit.ripple import WAVES, find_waves
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
@@ -170,8 +170,10 @@ def _initial_guesses(
     options: LikelihoodOptions,
 ) -> list[Array]:
     """Return initial guesses in coordinates: the caller's, then stage 1's with narrow and with wide friction."""
-    ripple = find_ripple(periods, linear) if "ripple" in model.options else {}
-    own = [_guess(model, linear, ripple, standstill, options) for standstill in _standstill_guesses(linear, options)]
+    waves: dict[str, float] = {}
+    for wave in WAVES:
+        waves |= find_waves(periods, linear, wave) if wave in model.options else {}
+    own = [_guess(model, linear, waves, standstill, options) for standstill in _standstill_guesses(linear, options)]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
     return [objective.coordinates.coordinates(value) for value in (*given, *own)]
@@ -192,12 +194,12 @@ def _standstill_guesses(linear: LinearEstimate, options: LikelihoodOptions) -> l
 def _guess(
     model: Model,
     linear: LinearEstimate,
-    ripple: Mapping[str, float],
+    waves: Mapping[str, float],
     standstill: Mapping[str, float],
     options: LikelihoodOptions,
 ) -> Array:
     """Return an initial guess (parameters,) [SI]: stage 1's values, and defaults for other parameters."""
-    known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | dict(ripple)
+    known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | dict(waves)
     known |= {f"{name}_{joint + 1}": value for name, value in standstill.items() for joint in range(model.joints)}
     if model.drive == "delay":
         known["delay"] = linear.delay

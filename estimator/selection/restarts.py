@@ -1,7 +1,7 @@
 """Other initial guesses for an estimate that may be a local minimum.
 
 The likelihood has several minima where a term acts in a narrow range: the width of the Coulomb step, the stiffness of
-bristles (once they are too stiff to bend, nothing tells how stiff), and the period of torque ripple.
+bristles (once they are too stiff to bend, nothing tells how stiff), and the periods of torque ripple and cogging.
 """
 
 from collections.abc import Iterator, Mapping
@@ -10,10 +10,11 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.ripple import WAVES, Wave
 from hil.estimator.identify import Estimate
 from hil.estimator.models.terms import term_of
 from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import ripple_cycles
+from hil.estimator.selection.waves import wave_cycles
 
 ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
 LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
@@ -36,7 +37,8 @@ def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOption
     left = left_per_joint(period, estimate)
     for joint in np.argsort(-left) + 1:
         if left[joint - 1] > options.presliding_residual**2:
-            yield from _ripple(period, estimate, int(joint), options)
+            for wave in WAVES:
+                yield from _other_wave(period, estimate, int(joint), options, wave)
             yield from _standstill(estimate, int(joint), options)
 
 
@@ -46,7 +48,8 @@ def undisguised(estimate: Estimate) -> dict[str, float]:
     A rise that fades within a wide step resembles a narrow step without a rise, and explains the motion nearly as well;
     no path leads from one to the other.
     """
-    values, changed = estimate.parameters, {}
+    values: dict[str, float] = estimate.parameters
+    changed: dict[str, float] = {}
     for joint in range(1, estimate.model.joints + 1):
         rise, velocity, width = (f"{name}_{joint}" for name in ("stribeck_rise", "stribeck_velocity", "coulomb_width"))
         if {rise, width} <= values.keys() and values[rise] > LEAST_RISE and values[width] > WIDE * values[velocity]:
@@ -54,15 +57,15 @@ def undisguised(estimate: Estimate) -> dict[str, float]:
     return changed
 
 
-def _ripple(
-    period: SettledPeriod, estimate: Estimate, joint: int, options: SelectionOptions
+def _other_wave(
+    period: SettledPeriod, estimate: Estimate, joint: int, options: SelectionOptions, wave: Wave
 ) -> Iterator[Mapping[str, float]]:
-    name = f"ripple_cycles_{joint}"
+    name = f"{wave}_cycles_{joint}"
     if name not in estimate.names:
         return
-    found = ripple_cycles(period, estimate, options.ripple_cycles, (joint,))
+    found = wave_cycles(period, estimate, options.wave_cycles, (wave,), (joint,))
     if abs(found[name] - estimate.parameters[name]) > ALIKE_CYCLES:
-        yield found | {f"ripple_sin_{joint}": 0.0, f"ripple_cos_{joint}": 0.0}
+        yield found | {f"{wave}_sin_{joint}": 0.0, f"{wave}_cos_{joint}": 0.0}
 
 
 def bristles(estimate: Estimate, bend: float) -> list[dict[str, float]]:
