@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MOST_JOINTS = 7
 _PLANAR = 2
-_OPTIONS = ("presliding", "asymmetry", "ripple", "saturation", "cable", "encoder")
+_OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
 def described_arm(config: "Config") -> ArmDescription:

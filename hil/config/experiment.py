@@ -95,6 +95,7 @@ class ModelConfig(Table):
     presliding: bool = Field(False, description=OPTIONS["presliding"])
     asymmetry: bool = Field(False, description=OPTIONS["asymmetry"])
     ripple: bool = Field(False, description=OPTIONS["ripple"])
+    cogging: bool = Field(False, description=OPTIONS["cogging"])
     zeros: bool = Field(False, description=OPTIONS["zeros"])
     torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
     saturation: bool = Field(False, description=OPTIONS["saturation"])
