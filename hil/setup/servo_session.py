@@ -15,7 +15,7 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import DriverError, TorqueNotOff
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
@@ -50,8 +50,6 @@ class ServoSession:
     bus: ServoBus
     _say: Say
     _kept: dict[Joint, Kept] = field(default_factory=dict)
-    _cut_since: set[Joint] = field(default_factory=set)
-    """Servos whose torque could not be confirmed as off at first, and has been since."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
 
@@ -116,24 +114,13 @@ class ServoSession:
         failed: dict[Joint, DriverError] = {}
         for joint in joints:
             try:
-                self._cut_again(joint)
+                self.bus.confirm_later(joint)
                 put_back(self.bus.drives[joint], self._kept[joint].settings)
             except DriverError as error:
                 failed[joint] = error
             else:
                 settings_file.forget(self._kept[joint])
         return failed
-
-    def _cut_again(self, joint: Joint) -> None:
-        """Cut the torque of a servo that could not be confirmed as off before, and say that it is off now."""
-        report = self.bus.torque_off_report
-        if report is None or joint in report.confirmed or joint in self._cut_since:
-            return
-        servo = self.bus.drives[joint]
-        if servo.read("Torque Enable"):
-            servo.write("Torque Enable", 0)
-        self._cut_since.add(joint)
-        self._say(f"{joint.title} answers again: its torque is off, read back.")
 
 
 _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=None)
@@ -142,6 +129,8 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 @contextmanager
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
     """Open the bus with every servo in its mode and torque off, prepared for exchanges; restore settings at the end.
+
+    A TorqueNotOff that leaves the block says how things stand at the very end: servos that answer again are read back.
 
     folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises as
     `ServoBus.open`, and RunFolderError.
@@ -157,14 +146,20 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     with ServoBus.connect(config.bus) as bus:
         session = ServoSession(bus, say)
         token = _outermost.set(session)
+        not_off: TorqueNotOff | None = None
         try:
             session.begin(config, folder)
             bus.prepare()
             yield bus
+        except TorqueNotOff as error:
+            not_off = error
+            raise
         finally:
             _outermost.reset(token)
             with signals_held_back():
                 session.end()
+            if not_off is not None:  # a servo may have answered again since
+                not_off.args = (str(bus.torque_off_report),)
 
 
 def has_moved() -> bool:

@@ -152,10 +152,27 @@ def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
         play(arm(SHORT), tmp_path / "run")
     assert [servo.value("Torque Enable") for servo in bench.port.bus.servos.values()] == [0, 0]
     assert bench.changed() == []
-    if isinstance(stop.value, TorqueNotOff):
-        assert "Joint 'elbow' (ID 2, XM430-W350) answers again: its torque is off" in capsys.readouterr().err
     stopped = (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8")
+    if isinstance(stop.value, TorqueNotOff):
+        assert str(stop.value).startswith("Torque is off on all 2 servos, read back. Joint 'elbow'"), "the last word"
+        assert "answers again" in str(stop.value) and "rebooted" not in str(stop.value)
+        assert "NOT CONFIRMED" not in capsys.readouterr().err
+        assert "Joint 'elbow' (ID 2, XM430-W350) answers again" in stopped.splitlines()[-1]
     assert "missed" in stopped and "replies in a row" in stopped, "the cause, not only that torque was left on"
+
+
+@pytest.mark.parametrize("servo", [1, 2])
+def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
+    arm: Arm, tmp_path: Path, bench: Bench, servo: int
+) -> None:
+    bench.prepare = lambda port: port.bus.faults.add(Fault(kind="reboot", servo=servo, at=2.0, amount=0.4))
+    with pytest.raises(TorqueNotOff, match=r"answers again\. Joint .* was rebooted: its Bus Watchdog") as stop:
+        play(arm(SHORT), tmp_path / "run")
+    cause = str(stop.value.__context__)
+    if servo == 1:  # it hides the second one
+        assert "No servo was heard" in cause
+        assert "'elbow' (ID 2, XM430-W350) answered and joint 'shoulder' (ID 1, XM430-W350) did not" in cause
+    assert bench.changed() == []
 
 
 def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(
