@@ -37,6 +37,10 @@ REBOOT_S = 0.6
 """Time before a servo that does not answer at the end, and may be booting, is tried again [s]."""
 
 
+COUNT_DOWN_S = 5.0
+"""Time between the announcement that an arm whose last run was stopped moves again by itself, and torque [s]."""
+
+
 def to_stderr(text: str) -> None:
     """Print a message on standard error; standard output may be reserved for results."""
     with suppress(OSError, ValueError):
@@ -52,6 +56,8 @@ class ServoSession:
     _kept: dict[Joint, Kept] = field(default_factory=dict)
     shared: int = 0
     """Number of inner blocks that have used the bus."""
+    was_stopped: bool = False
+    """Whether the last inner block ended with an exception: the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
         """Check that the servos answer and that nobody holds the arm, then save their settings. Raises as
@@ -96,6 +102,21 @@ class ServoSession:
             )
             self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
+    def warn(self) -> None:
+        """If the last run was stopped, announce that the arm is about to move again, and give people time to step back.
+
+        Whoever saw it go limp may believe that the program has ended, and reach into the arm.
+        """
+        if not self.was_stopped:
+            return
+        self.was_stopped = False
+        self._say(
+            f"THE ARM MOVES AGAIN IN {COUNT_DOWN_S:.0f} s: the run before was stopped, but this command goes on. Keep "
+            "clear of the arm; Ctrl-C ends it here."
+        )
+        clock = self.bus.port.clock
+        clock.wait_until(clock.now() + COUNT_DOWN_S)
+
     def end(self) -> None:
         """Restore every servo's settings and report those that cannot be restored. Never raises DriverError."""
         failed = self._put_back(self._kept)
@@ -139,8 +160,13 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
         outer.bus.config = config.bus
         outer.shared += 1
+        outer.warn()
         outer.bus.prepare()
-        yield outer.bus
+        try:
+            yield outer.bus
+        except BaseException:
+            outer.was_stopped = True
+            raise
         return
     fakes.register_for(config.url)
     with ServoBus.connect(config.bus) as bus:

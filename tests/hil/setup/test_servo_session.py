@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,13 @@ import serial
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
-from hil.errors import HilError
+from hil.errors import Cause, HilError, SafetyStop
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.servo_session import SETTINGS_NAME, servo_session
+from hil.setup.servo_session import COUNT_DOWN_S, SETTINGS_NAME, servo_session
 from hil.setup.settings_file import settings_path
 from tests.support.command_line import hil
 
@@ -137,6 +138,21 @@ def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_star
         found = list(check_arm(config))
         assert any(each.what == "settings from an earlier run" and each.level is Level.OK for each in found)
     assert bench.changed() == []
+
+
+def test_an_arm_that_was_stopped_moves_again_only_after_an_announcement(arm: Arm, bench: Bench) -> None:
+    config = arm(SHORT)
+    said: list[str] = []
+    began: list[float] = []
+    with servo_session(config, say=said.append):
+        for number in range(4):
+            before = bench.port.clock.now()
+            with suppress(HilError), servo_session(config):
+                began.append(bench.port.clock.now() - before)
+                if number in (1, 2):
+                    raise SafetyStop("It is late.", Cause.LATE)
+    assert [seconds >= COUNT_DOWN_S for seconds in began] == [False, False, True, True]
+    assert len(said) == 2 and said[0].startswith("THE ARM MOVES AGAIN IN 5 s")
 
 
 class _Gone(BaseException):
