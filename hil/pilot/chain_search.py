@@ -26,6 +26,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.punctual import punctual
 from hil.pilot.steps import Say, Step, tells_of_the_arm
+from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
@@ -92,7 +93,11 @@ class ChainSearch:
         """Find the first of the shares that is safe for all simulated arms. Raises NoSafeTorque."""
         said = ""
         for share in shares:
-            plan = self.paths.plan(config, self.belief.torque, share)
+            try:
+                plan = self.paths.plan(config, self.belief.torque, share)
+            except NoHeadroom as error:  # the arm is heavier than the paths were designed for
+                said = said or str(error)
+                continue
             foreseen = predict_chain(config, plan, self.belief.arms.first(SEARCH_ARMS))
             said = said or unsafe(config, foreseen)
             if unsafe(config, foreseen):
