@@ -17,6 +17,7 @@ PLANAR_ONLY = (
     *("backlash", "presliding_stiffness", "cogging", "saturation"),
     *("cold_viscous", "cold_coulomb", "cable_stiffness"),
 )
+_Place = Annotated[float, Field(ge=-3, le=3)]
 
 
 class ChainArm(Described):
@@ -40,8 +41,8 @@ class ChainArm(Described):
     centre_shift: tuple[Annotated[float, Field(ge=-1, le=1)], ...] | None = Field(
         None, strict=False, description="shift of each link's true centre of mass along its frame's x axis [m]"
     )
-    payload: NotNegative = Field(0.0, description="point mass bolted to the last link [kg]")
-    payload_at: Annotated[tuple[Finite, Finite, Finite], Field(strict=False)] = Field(
+    payload: NotNegative = Field(0.0, le=50, description="point mass bolted to the last link [kg]")
+    payload_at: Annotated[tuple[_Place, _Place, _Place], Field(strict=False)] = Field(
         (0.0, 0.0, 0.0), description="its place in that link's frame [m]"
     )
     drives: tuple[Drive, ...] = Field(strict=False, description="drives, one per joint; their mass is not used")
