@@ -159,8 +159,8 @@ def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
     if NONE_HEARD not in str(stop) or not silent or not heard:
         return ""
     return (
-        f"No servo was heard then, but {' and '.join(heard)} answered afterwards and {' and '.join(map(str, silent))} did "
-        "not: a silent servo hides those after it. Check its cable and its supply."
+        f"No servo was heard then, but {' and '.join(heard)} answered afterwards and {' and '.join(map(str, silent))} "
+        "did not: a silent servo hides those after it. Check its cable and its supply."
     )
 
 
