@@ -172,9 +172,12 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
 
 def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo has lost the watchdog that it was armed with; False if it does not answer."""
+    """Whether a servo has lost the watchdog that it was armed with; False if it does not answer.
+
+    A late reply to an earlier question would be taken for the answer, so another register is read before and after.
+    """
     with suppress(DriverError):
-        return servo.read("Bus Watchdog") == 0
+        return servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id
     return False
 
 

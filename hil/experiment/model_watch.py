@@ -31,8 +31,13 @@ _FRICTIONS = 8.0
 _TILT_SHARE = 0.2  # standard deviation of gravity out of the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
 """Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
+_UNDESCRIBED = {"gravity": 10.0, "viscous": 6.0, "offset": 0.3}
+"""Standard deviations for an arm without a description, as multiples of the planned torque in SI units; others 1.
+
+A small first torque moves an arm by a tenth of a radian: its gravity is ten times as large.
+"""
 _STILL_RAD_S = 0.06
-_STEP_S = 0.06
+_STEP_S = 0.02
 """Time for which a joint must seem to stand under a torque that is held over several exchanges [s]."""
 
 _LAG_S = 0.012
@@ -173,7 +178,6 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
 
     Friction decides whether a joint that stands still is held: without a bound on it, any torque might be too small.
     """
-    each = {"gravity": 3.0, "tilt": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
     guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
     mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
     spread = np.zeros(len(NAMES))
@@ -185,5 +189,5 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
         if term == "coulomb":
             spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
         else:
-            spread[index] = each.get(term, 3.0) * largest[joint]
+            spread[index] = _UNDESCRIBED.get(term, 1.0) * largest[joint]
     return mean, np.diag(spread**2)

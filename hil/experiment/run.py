@@ -137,7 +137,7 @@ def _play(
             _try_again(bus, note)
             error.args = (str(bus.torque_off_report),)
         if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):
-            cause.args = (f"{cause} {who}",)
+            cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
             note(who)
         raise
 
@@ -161,8 +161,8 @@ def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
     if NONE_HEARD not in str(stop) or not silent or not heard:
         return ""
     return (
-        f"When torque was cut, {' and '.join(heard)} answered and {' and '.join(map(str, silent))} did not: a servo "
-        "that is silent hides those after it. Look at that servo, its cable and its supply first."
+        f"No servo was heard then, but {' and '.join(heard)} answered afterwards and {' and '.join(map(str, silent))} "
+        "did not: a silent servo hides those after it. Check its cable and its supply."
     )
 
 
