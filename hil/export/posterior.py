@@ -103,8 +103,8 @@ def _nothing_older(formats: Sequence[str], out: Path, samples: int) -> None:
             remaining = sum(int(path.stem[4:]) >= samples for path in older)
             if remaining:
                 raise ExportError(
-                    f"{out} holds {len(older)} arms of an earlier draw, of which {remaining} would remain: give another "
-                    "--out, or remove them."
+                    f"{out} holds {len(older)} arms of an earlier draw, of which {remaining} would remain: give "
+                    "another --out, or remove them."
                 )
 
 
