@@ -224,7 +224,7 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
     if share <= 1.0:
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
         return False
-    single[_HELD + j] += dt * min(max(share - 1.0, 1.0), _MOST_WEIGHT)
+    single[_HELD + j] += dt * min(max(share - 0.5, 1.0), _MOST_WEIGHT)
     single[_SAMPLES + j] += 1.0
     # Where samples are far apart, a sudden fault may show in a single one.
     enough = single[_SAMPLES + j] >= 2.0 or (dt >= HOLD_S and share >= _OBVIOUS)
