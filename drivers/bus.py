@@ -19,6 +19,8 @@ from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_
 from hil.drivers.sync_read import Answer, one_each
 from hil.drivers.torque_off import TorqueOff, cut_again, cut_torque, disarm_watchdogs, signals_held_back, was_rebooted
 
+__all__ = ["CHECK_S", "BusConfig", "ServoBus"]
+
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
 

@@ -20,6 +20,18 @@ from pydantic import Field, ValidationError
 
 from hil.toml_errors import Described, describe
 
+__all__ = [
+    "FAULTS",
+    "INSTRUCTION_FAULTS",
+    "REPLY_FAULTS",
+    "Fault",
+    "FaultFacts",
+    "FaultKind",
+    "Faults",
+    "Happened",
+    "parse_fault",
+]
+
 
 class FaultKind(StrEnum):
     """Every kind of fault that can be injected."""

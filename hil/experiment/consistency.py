@@ -56,7 +56,10 @@ samples per period, the fastest that is played, needs 0.27.
 
 
 class Consistency:
-    """Compares one joint's position [rad] with its velocity [rad/s]."""
+    """Compares one joint's position [rad] with its velocity [rad/s].
+
+    It runs for each joint in each exchange, so it is written for speed: comparisons instead of abs and max.
+    """
 
     def __init__(self) -> None:
         self._position: float | None = None
@@ -76,48 +79,42 @@ class Consistency:
 
         unsure: excess duration of its exchange [s], in which the time of the measurement is not known.
         """
-        former, self._position = self._position, position
-        before, self._velocity = self._velocity, velocity
-        short = self._short
+        former, before = self._position, self._velocity
+        self._position, self._velocity = position, velocity
         if former is None:
-            short.restart(velocity)
+            self._short.restart(velocity)
             self._long.restart(velocity)
             self._forget_sums()
             return False
         moved = position - former
+        turned = velocity - before if velocity > before else before - velocity
         difference = moved - 0.5 * (before + velocity) * seconds
-        curved = CURVED * seconds * abs(velocity - before)
-        unknown = unsure * abs(velocity)
-        short.add(moved, difference, velocity, seconds, curved, unknown)
-        known = LAG_S * abs(velocity - before) + SCALE * abs(moved) + curved + unknown
-        if self._steps.look(abs(difference) - known, seconds):
+        curved = CURVED * seconds * turned
+        unknown = unsure * velocity if velocity > 0.0 else -unsure * velocity
+        known = LAG_S * turned + SCALE * (moved if moved > 0.0 else -moved) + curved + unknown
+        if self._steps.look((difference if difference > 0.0 else -difference) - known, seconds):
             return True
-        if short.is_wrong(velocity, self._lag, self._scale) or self._looks_long(
-            moved, difference, velocity, seconds, curved, unknown
-        ):
+        if self._short.add(moved, difference, velocity, seconds, curved, unknown, self._lag, self._scale):
             return True
-        if self._learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
-            self._learn(velocity, seconds)
-        return False
-
-    def _looks_long(
-        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
-    ) -> bool:
-        """Add an interval to the long memory, which takes several at once: it is slow anyway, and time is scarce."""
-        self._sum_seconds += seconds
+        # The long memory takes several intervals at once: it is slow anyway, and time is scarce.
         self._sum_moved += moved
         self._sum_difference += difference
         self._sum_unknown += unknown
         if curved > self._most_curved:
             self._most_curved = curved
-        if self._sum_seconds < LONG_EVERY_S:
-            return False
-        long = self._long
-        long.add(
-            self._sum_moved, self._sum_difference, velocity, self._sum_seconds, self._most_curved, self._sum_unknown
-        )
+        self._sum_seconds += seconds
+        if self._sum_seconds >= LONG_EVERY_S and self._looks_long(velocity):
+            return True
+        if self._learnt_for < LEARNT_S and self._short.span > _FAST_RAD_S and not unsure > seconds:
+            self._learn(velocity, seconds)
+        return False
+
+    def _looks_long(self, velocity: float) -> bool:
+        """Add the intervals since the last time to the long memory; return whether it shows a disagreement."""
+        moved, difference, seconds = self._sum_moved, self._sum_difference, self._sum_seconds
+        curved, unknown = self._most_curved, self._sum_unknown
         self._forget_sums()
-        return long.is_wrong(velocity, self._lag, self._scale)
+        return self._long.add(moved, difference, velocity, seconds, curved, unknown, self._lag, self._scale)
 
     def _forget_sums(self) -> None:
         self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
@@ -159,7 +156,10 @@ class _Steps:
             return False
         self._since += seconds
         self._age += seconds
-        square = step * step if step > 0.0 else 0.0
+        if step <= 0.0:  # nearly always
+            self._square -= seconds / (self._age if self._age < LONG_S else LONG_S) * self._square
+            return self._count >= STEPS
+        square = step * step
         most = max(STEP_RAD * STEP_RAD, STEP_TIMES * STEP_TIMES * self._square)
         if square > most and self._age > SHORT_S:  # before that, the usual differences are being learnt
             self._count = self._count + 1 if self._since < STEPS_S else 1
@@ -187,31 +187,39 @@ class _Memory:
         self.mean = self._highest = self._lowest = velocity
 
     def add(
-        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
-    ) -> None:
+        self,
+        moved: float,
+        difference: float,
+        velocity: float,
+        seconds: float,
+        curved: float,
+        unknown: float,
+        lag: float,
+        scale: float,
+    ) -> bool:
         """Add one interval of `seconds`, at the end of which the joint has `velocity`.
+
+        Returns whether position and velocity disagree now, given the largest accepted lag [s] and scale error.
 
         moved, difference: change of position, and the same less the integral of velocity [rad]. curved, unknown: their
         uncertainty [rad], the second of which accumulates.
         """
         kept = 1.0 - seconds / self._seconds if seconds < self._seconds else 0.0
         new = 1.0 - kept
-        self.apart = kept * self.apart + difference
-        self.far = kept * self.far + moved
-        self._unknown = kept * self._unknown + unknown
+        self.apart = apart = kept * self.apart + difference
+        self.far = far = kept * self.far + moved
+        self._unknown = unknown = kept * self._unknown + unknown
         faded = kept * self._curved
-        self._curved = curved if curved > faded else faded
-        self.mean += new * (velocity - self.mean)
+        self._curved = curved = curved if curved > faded else faded
+        mean = self.mean
+        self.mean = mean = mean + new * (velocity - mean)
         highest, lowest = kept * self._highest + new * velocity, kept * self._lowest + new * velocity
         self._highest = highest = velocity if velocity > highest else highest
         self._lowest = lowest = velocity if velocity < lowest else lowest
-        self.span = highest - lowest
-
-    def is_wrong(self, velocity: float, lag: float, scale: float) -> bool:
-        """Whether position and velocity disagree, given the largest accepted lag [s] and scale error."""
-        of_lag = lag * (velocity - self.mean)
-        allowed = self._unsure + scale * abs(self.far) + self._curved + self._unknown + _LAG_SHARE * lag * self.span
-        apart = self.apart
+        self.span = span = highest - lowest
+        of_lag = lag * (velocity - mean)
+        far = far if far > 0.0 else -far
+        allowed = self._unsure + scale * far + curved + unknown + _LAG_SHARE * lag * span
         if of_lag > 0.0:
             return apart > allowed + of_lag or apart < -allowed
         return apart > allowed or apart < of_lag - allowed

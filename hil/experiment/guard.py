@@ -26,6 +26,8 @@ from hil.experiment.status_check import StatusCheck
 from hil.experiment.work import Work
 from hil.plan.find_torque import how_to_find_torque
 
+__all__ = ["MOST_OUTSIDE_RAD", "Guard"]
+
 JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
 

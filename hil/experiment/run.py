@@ -28,6 +28,8 @@ from hil.runs.timing import lateness_histogram
 from hil.setup.realtime import on_time
 from hil.setup.servo_session import REBOOT_S, has_moved, servo_session
 
+__all__ = ["run_experiment"]
+
 _LAST_SAMPLES = 100
 """Number of samples attached to an exception."""
 

@@ -27,6 +27,8 @@ from hil.setup.current_limit import current_limit_ticks
 from hil.setup.others import others_on_the_bus
 from hil.setup.settings_file import Kept
 
+__all__ = ["SETTINGS_NAME", "Say", "ServoSession", "has_moved", "left_behind", "recover", "servo_session", "to_stderr"]
+
 Say = Callable[[str], None]
 
 SETTINGS_NAME = "servo_settings.json"

@@ -246,6 +246,8 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate arm.toml", 2, "give the folder of a run"),
     ("export run --format stl", 2, "'stl' is not a format"),
     ("export no_result --format mjcf", 2, "hil estimate no_result"),
+    ("export .. --format mjcf", 2, ".. is not a run folder, but holds some: did you mean ../here?"),
+    ("export nothing --format mjcf", 2, "nothing is not a run folder: it has neither a result nor a recording."),
     ("calibrate run run --mass -1", 2, "--mass"),
     ("pose arm.toml", 2, "arm.urdf is missing"),
 ]
@@ -276,6 +278,7 @@ def folder(tmp_path: Path, identified_once: Path, monkeypatch: pytest.MonkeyPatc
         for file, content in changed.items():
             if content is not None:
                 (here / name / file).write_bytes(content)
+    (here / "nothing").mkdir()
     monkeypatch.chdir(here)
     monkeypatch.setattr(sys, "argv", sys.argv)
     return here
