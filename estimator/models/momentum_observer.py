@@ -53,7 +53,7 @@ _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned t
 _NOISE_S = 1.0  # time constant of the noise estimate
 _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
-_LESSONS = 3.0  # number of lessons in a row that share an error of the model
+_LESSONS = 2.0  # number of lessons in a row that share an error of the model
 _STANDING_LESSONS = 28.0  # the same, for the rounding of velocities that stay below a tick while a joint hardly moves
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
 _MOST_WEIGHT = 6.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
@@ -224,7 +224,7 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
     if share <= 1.0:
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
         return False
-    single[_HELD + j] += dt * min(max(share - 1.0, 1.0), _MOST_WEIGHT)
+    single[_HELD + j] += dt * min(max(share - 0.5, 1.0), _MOST_WEIGHT)
     single[_SAMPLES + j] += 1.0
     # Where samples are far apart, a sudden fault may show in a single one.
     enough = single[_SAMPLES + j] >= 2.0 or (dt >= HOLD_S and share >= _OBVIOUS)
