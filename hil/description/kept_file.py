@@ -34,9 +34,8 @@ def _self_contained(path: Path) -> str:
         return ""
     for body in spec.bodies[1:]:
         body.explicitinertial = True
-        body.mass, body.ipos, body.iquat = (
-            each[body.id] for each in (model.body_mass, model.body_ipos, model.body_iquat)
-        )
+        number = body.id
+        body.mass, body.ipos, body.iquat = model.body_mass[number], model.body_ipos[number], model.body_iquat[number]
         body.inertia, body.fullinertia = model.body_inertia[number], np.full(6, np.nan)
     of_files = (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF)
     for geom in list(spec.geoms):
