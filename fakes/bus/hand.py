@@ -22,6 +22,8 @@ from hil.fakes.bus.joints import Joints
 from hil.fakes.plants.plant import CanBeHeld, Plant, PlantError
 from hil.toml_errors import Described, describe
 
+__all__ = ["Hand", "Move", "parse_move"]
+
 _PULL_S = 0.01
 """Time constant with which the hand corrects the joint's deviation from the planned path [s]."""
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MOST_JOINTS = 7
 _PLANAR = 2
-_OPTIONS = ("presliding", "asymmetry", "ripple", "saturation", "cable", "encoder")
+_OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
 def described_arm(config: "Config") -> ArmDescription:
@@ -56,13 +56,7 @@ def only_planar(config: "Config", what: str) -> None:
 def chain_slips(config: "Config") -> Iterator[str]:
     """Yield one sentence per mistake in the configuration of a spatial arm; nothing for a valid planar arm."""
     if config.arm.urdf is None:
-        if len(config.joints) > _PLANAR:
-            yield (
-                f"joints: {len(config.joints)} joints need arm.urdf, which gives the geometry; without it, an "
-                "arm has one or two joints"
-            )
-        if config.joint_path is not None:
-            yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
+        yield from _planar_slips(config)
         return
     try:
         described_arm(config)
@@ -70,6 +64,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
         yield f"arm.urdf: {error}"
         return
     if not config.is_chain:
+        yield from _planar_slips(config)
         return
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
@@ -91,6 +86,18 @@ def chain_slips(config: "Config") -> Iterator[str]:
     if told:
         yield f"model.{told[0]} = true: only planar arms support this term so far; remove it"
     yield from _path_slips(config)
+
+
+def _planar_slips(config: "Config") -> Iterator[str]:
+    if config.arm.urdf is None and len(config.joints) > _PLANAR:
+        yield (
+            f"joints: {len(config.joints)} joints need arm.urdf, which gives the geometry; without it, an "
+            "arm has one or two joints"
+        )
+    if config.arm.urdf is None and config.joint_path is not None:
+        yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
+    if config.model.base_tilt:
+        yield "model.base_tilt: the tilt of a planar arm is the zero error of its first joint: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:

@@ -104,12 +104,14 @@ class ModelConfig(Table):
     presliding: bool = Field(False, description=OPTIONS["presliding"])
     asymmetry: bool = Field(False, description=OPTIONS["asymmetry"])
     ripple: bool = Field(False, description=OPTIONS["ripple"])
+    cogging: bool = Field(False, description=OPTIONS["cogging"])
     zeros: bool = Field(False, description=OPTIONS["zeros"])
     torque_scale: bool = Field(False, description=OPTIONS["torque_scale"])
     saturation: bool = Field(False, description=OPTIONS["saturation"])
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
     lags: bool = Field(False, description=OPTIONS["lags"])
+    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity shows it")
 
     @property
     def fixed_friction(self) -> Friction:

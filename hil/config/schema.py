@@ -38,6 +38,18 @@ from hil.next_step import command
 from hil.toml_errors import describe, not_toml
 from hil.unit_hints import in_other_units
 
+__all__ = [
+    "ArmConfig",
+    "Config",
+    "PortConfig",
+    "PriorConfig",
+    "SafetyConfig",
+    "StabiliserConfig",
+    "load_config",
+    "parse_config",
+    "port_url",
+]
+
 FAKE_URL = "fake://"
 LYING_RAD = 0.25
 """Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given [rad]."""

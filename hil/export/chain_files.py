@@ -81,11 +81,11 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
     solids = [] if is_mjcf(found.path) else solids_of(found.arm)
-    kept = ("offset_", "lag")
+    kept = ("offset_", "lag", "base_tilt")
     left = [*_not_in_mjcf(found, solids), *(each for each in found.left_out if not each.startswith(kept))]
     _describe(root, model, found, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    ET.SubElement(root, "option", gravity=numbers(*model.geometry.gravity), timestep="0.001", integrator="implicitfast")
+    ET.SubElement(root, "option", gravity=numbers(*model.base_gravity), timestep="0.001", integrator="implicitfast")
     parent = ET.SubElement(root, "worldbody")
     for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
         number = index + 1

@@ -38,6 +38,8 @@ from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
 
+__all__ = ["SCHEMA", "Excitation", "RunFacts", "RunFolder", "RunRecord", "taken", "write_json"]
+
 log = logging.getLogger(__name__)
 
 SCHEMA = 1

@@ -170,6 +170,7 @@ SAMPLES = {
     "load": 0.05, "ripple": 0.02, "cogging": 0.01, "backlash": 0.01, "presliding_stiffness": 300.0,
     "presliding_damping": 0.5, "cable_stiffness": 0.2, "current_lag": 0.001, "saturation": 0.05, "rest": 0.5,
     "damp_time": 0.06, "torque_constant_std": 0.15, "adapter_latency_us": 60.0, "centre_shift": [0.01] * 5,
+    "payload": 0.3, "payload_at": [0.05, 0.01, 0.02],
 }  # fmt: skip
 """Sane values where the file gives none and the default is missing or 0."""
 
