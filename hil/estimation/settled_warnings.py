@@ -48,16 +48,19 @@ def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
 
 def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]) -> list[str]:
     """Detect a motor that receives less current than commanded, from a sagging supply or its own current limit."""
-    # Large goals change slowly near their peak, so a lagging current loop does not count as clipping.
-    large = (np.abs(goal) > LARGE * np.abs(goal).max()) & np.isfinite(measured)
+    # A sample's current answers the goal of the sample before it, and a lagging current loop is not clipping either:
+    # the smaller of two successive goals is what the motor has had time to follow.
+    least = np.minimum(np.abs(goal[1:]), np.abs(goal[:-1])) * (goal[1:] * goal[:-1] > 0.0)
+    measured = measured[1:]
+    large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured)
     if not large.any():
         return []
-    short = np.abs(measured[large]) < SHORT * np.abs(goal[large])
+    short = np.abs(measured[large]) < SHORT * least[large]
     part = float(np.mean(short))
     if part <= OFTEN:
         return []
     return [
         f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
         "high-torque samples: the servo's own current limit or, at speed, the supply voltage clips it; lower "
-        "peak_torque or raise the supply voltage."
+        "peak_torque (with pilot = true: current_limit) or raise the supply voltage."
     ]
