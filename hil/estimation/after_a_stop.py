@@ -10,10 +10,10 @@ from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
 
-def after_a_stop(run: RunFolder, shown: Path) -> list[str]:
+def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
     """Sentences about what is kept; the last one is the next command.
 
-    shown: the configuration's path as the user wrote it.
+    command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """
     if run.result_path.is_file():
         return ["The result is kept; the report is missing.", next_step("report", run.path)]
@@ -26,7 +26,7 @@ def after_a_stop(run: RunFolder, shown: Path) -> list[str]:
             "rougher than that of a finished run.",
             next_step("estimate", steps[-1]),
         ]
-    return [f"What was recorded until then is kept in {run.path}; no period had settled.", next_step("identify", shown)]
+    return [f"What was recorded until then is kept in {run.path}; no period had settled.", next_step(command, shown)]
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
