@@ -9,13 +9,13 @@ record, which the program never sees, decides:
 
 can command     the faults are of kinds that leave commands and readings true (`COMMANDABLE`), the record shows no
                 servo that was silent, disobeyed or told something false, and nothing held the arm by force
-unsafe          judged by what the program can do: servos that obey may be driven until the arm is lowered, since nothing
-                else lays it down; a motor whose current the program does not decide is to be off within 100 ms; one that
-                hears nothing can only be stopped by its watchdog. So: a motor that carried for more than 100 ms a current
-                that was not commanded, also while the arm was lowered; current for longer than 100 ms, or the
-                watchdog's time, after a servo was silent or the cable unplugged; after any other reason, current for
-                longer than the lowering takes. Links that came closer to each other while motors drove them than in the undisturbed run, and touched.
-                A joint that went further beyond its limits meanwhile than a lowering may
+unsafe          by what the program can do: servos that obey may be driven until the arm is lowered, since nothing else
+                lays it down; a motor whose current the program does not decide is to be off within 100 ms; one that
+                hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was not
+                commanded for longer than that, also while the arm was lowered; current for longer than that after a
+                servo was silent or the cable unplugged; current for longer than the lowering takes after any other
+                reason. Links that came closer to each other while motors drove them than in the undisturbed run, and
+                touched. A joint that went further beyond its limits meanwhile than a lowering may
 lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
                 current was only switched off there
 """
@@ -91,8 +91,8 @@ class ChainOutcome:
     owed: why the run had to end, "" if there was no reason. can_command: see above; None if nothing stopped the run.
     lies: whether it ended lying in its rest pose. late_ms: how long current flowed after the reason. clearance: least
     distance while motors drove the arm, beyond that of the undisturbed run if that is negative [m]. beyond: largest
-    overshoot beyond a position limit meanwhile [rad]. overruled_ms: longest time for which a motor carried a current that
-    was not commanded.
+    overshoot beyond a position limit meanwhile [rad]. overruled_ms: longest time for which a motor carried a current
+    that was not commanded, of `cut_ms` allowed.
     """
 
     setting: Setting
@@ -101,6 +101,7 @@ class ChainOutcome:
     late_ms: float
     bound_ms: float
     lower_ms: float
+    cut_ms: float
     clearance: float
     beyond: float
     overruled_ms: float
@@ -116,7 +117,7 @@ class ChainOutcome:
     @property
     def unsafe(self) -> bool:
         is_late = self.late_ms > (self.lower_ms if self.lies else self.bound_ms)
-        return is_late or self.overruled_ms > BOUND_MS or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
+        return is_late or self.overruled_ms > self.cut_ms or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
 
     @property
     def dropped(self) -> bool:
@@ -128,8 +129,8 @@ class ChainOutcome:
         flags += ["unnamed"] * (self.stopped and not self.named)
         return (
             f"{self.setting.name} {self.setting.rate} Hz: {self.drawn}: {self.owed or 'nothing owed'}, current for "
-            f"{self.late_ms:.0f} ms of {self.bound_ms:.0f}, overruled for {self.overruled_ms:.0f} ms, clearance {1e3 * self.clearance:.0f} mm, "
-            f"{', '.join(flags) or 'good'}\n    {self.text.strip()[-600:]}"
+            f"{self.late_ms:.0f} ms of {self.bound_ms:.0f}, overruled {self.overruled_ms:.0f} of {self.cut_ms:.0f}, "
+            f"clearance {1e3 * self.clearance:.0f} mm, {', '.join(flags) or 'good'}\n    {self.text.strip()[-600:]}"
         )
 
 
@@ -187,6 +188,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
         1e3 * float(flowed[-1] - since) if flowed.size else 0.0,
         bound,
         lower_ms,
+        cut_ms,
         _clearance(config, record) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
         float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
         overruled_ms(config, drawn, story),
