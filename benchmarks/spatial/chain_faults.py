@@ -68,6 +68,7 @@ UNREACHED = ("was not heard", "the cable was unplugged")
 MOST_BEYOND_RAD = 0.2
 
 _BY_FORCE = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.OBSTACLE, Kind.SNAG, Kind.LOAD_CHANGED})
+_SIGNALS = frozenset({Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP})
 COMMANDABLE = _BY_FORCE | {
     *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP),
     *(Kind.RAISED_LIMIT, Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG),
@@ -226,11 +227,15 @@ def longest_lowering(path: Path) -> float:
 
 
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
-    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end."""
+    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end.
+
+    A second request to stop asks for torque to be cut at once, so it does not.
+    """
     forced = any(
         each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks
     )
-    return set(drawn.kinds) <= COMMANDABLE and not forced
+    asked = sum(each.kind in _SIGNALS and each.start < ended for each in drawn.attacks)
+    return set(drawn.kinds) <= COMMANDABLE and not forced and asked <= 1
 
 
 def _clearance(config: Config, record: NDArray[Any]) -> float:
