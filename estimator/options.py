@@ -111,6 +111,10 @@ class LikelihoodOptions:
     coarse_integration: IntegrationOptions = IntegrationOptions(max_step=2.6e-3, max_substeps=16)
     """Accurate to a few hundredths of an encoder step, in a third of the time."""
     covariance: CovarianceOptions = CovarianceOptions()
+    least_inflation: float = 2.0
+    """Factor by which the data's variance must exceed that of independent errors for priors to count more."""
+    least_tempering: float = 1e-4
+    """Least increase of the sum of squares, as a fraction of it, for which the fit is repeated with such priors."""
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried.
@@ -243,12 +247,12 @@ class SelectionOptions:
     """Maximum number of fits from other initial guesses."""
     overrule_ratio: float = 0.8
     """Prediction error relative to the chosen model's that another model must reach to replace it."""
-    ripple_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
-    """Numbers of ripple cycles per turn that are searched."""
-    ripple_evidence: float = 0.05
-    """Significance level of the score test at which ripple is tried.
+    wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
+    """Numbers of ripple and cogging cycles per turn that are searched."""
+    wave_evidence: float = 0.05
+    """Evidence in the score test at which ripple or cogging is tried.
 
-    It is lenient because the test only finds the ripple's period roughly; a fit that includes the ripple explains more.
+    It is lenient because the test only finds the wave's period roughly; a fit that includes the wave explains more.
     """
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
     """Significance levels for removing terms, tried in turn until the reduced model explains the motion as well."""

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hil.estimator.models.friction import direction, dry_level, viscous
 
+__all__ = ["ArmModel", "JointFacts"]
+
 Array = NDArray[np.float64]
 
 _CHUNK = 16384  # samples per block, chosen so that temporaries stay in the processor's cache
@@ -54,7 +56,7 @@ class ArmModel:
     joints: tuple[JointFacts, ...]
 
     def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Motor torques (..., joints) [N m] for a motion: inertia, Coriolis, gravity, friction and offset.
+        """Motor torques (..., joints) [N m] for a motion: inertia, Coriolis, gravity, friction, offset, cable, cogging.
 
         Args:
             q: angles (..., joints) [rad].
@@ -115,7 +117,8 @@ class ArmModel:
         q, dq, torque = self._motion(q=q, dq=dq, torque=torque)
         torque = torque * np.stack([self._ripple(j, q[..., j - 1]) for j in range(1, len(self.joints) + 1)], axis=-1)
         loaded = self.friction_torque(dq) + self._load_friction(dq, torque) + self._offsets()
-        free = torque - self.rigid_body_torque(q, dq, np.zeros_like(q)) - loaded
+        held = np.stack([self._by_angle(j, q[..., j - 1]) for j in range(1, len(self.joints) + 1)], axis=-1)
+        free = torque - self.rigid_body_torque(q, dq, np.zeros_like(q)) - loaded - held
         return np.asarray(np.linalg.solve(self.mass_matrix(q), free[..., None])[..., 0])
 
     def goal(self, torque: ArrayLike) -> Array:
@@ -151,7 +154,7 @@ class ArmModel:
         for joint, v in enumerate(dq, start=1):
             step = self._step(joint, v)
             moving = self._viscous(joint, v) + step * self._level(joint, v)
-            total = torque[joint - 1] + moving + self.values[f"offset_{joint}"]
+            total = torque[joint - 1] + moving + self.values[f"offset_{joint}"] + self._by_angle(joint, q[joint - 1])
             load = self.values.get(f"load_{joint}", 0.0)
             # Solves total + step * load * |torque| = torque; its sign is that of total as long as load < 1.
             applied = total / (1 - load * step * np.sign(total)) if load else total
@@ -187,6 +190,13 @@ class ArmModel:
         cycles = self.values.get(f"ripple_cycles_{joint}", 0.0) * q
         sine, cosine = (self.values.get(f"ripple_{part}_{joint}", 0.0) for part in ("sin", "cos"))
         return np.asarray(1.0 + sine * np.sin(cycles) + cosine * np.cos(cycles))
+
+    def _by_angle(self, joint: int, q: Array) -> Array:
+        """Load torque of the cable and of cogging at the angles q [rad]."""
+        cycles = self.values.get(f"cogging_cycles_{joint}", 0.0) * q
+        sine, cosine = (self.values.get(f"cogging_{part}_{joint}", 0.0) for part in ("sin", "cos"))
+        cable = self.values.get(f"cable_stiffness_{joint}", 0.0) * q
+        return np.asarray(cable - sine * np.sin(cycles) - cosine * np.cos(cycles))
 
     def _step(self, joint: int, v: Array) -> Array:
         return direction(v, self.values.get(f"coulomb_width_{joint}", 0.0))

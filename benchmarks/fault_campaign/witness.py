@@ -19,6 +19,9 @@ GRIP_RAD_S = 0.1
 SLIPS_S = 0.05
 """Time in which a joint slips on its shaft [s]."""
 
+HALF = 0.5
+"""Share of its torque constant that a motor loses when its magnet overheats."""
+
 SOFT_RAD = 0.02
 """Way on which an obstacle, or a cable that snags, comes to its full force [rad]."""
 
@@ -104,14 +107,20 @@ class Witness:
                 case Kind.PUSHED:
                     felt[joint] = before + most * min(1.0, (now - each.start) / PUSH_RISES_S)
                     self._missing[joint] += before - felt[joint]
-                case Kind.SLIP:
+                case Kind.SLIP | Kind.CREEPING_HORN:
                     self._slip(joint, each, now)
+                case Kind.FADING:
+                    felt[joint] = before * (1.0 - HALF * min(1.0, (now - each.start) / each.amount))
+                    self._missing[joint] += before - felt[joint]
                 case _:
                     felt[joint] = before + most * self._resists(joint, each)
                     self._missing[joint] += before - felt[joint]
         return felt
 
     def _slip(self, joint: int, attack: Attack, now: float) -> None:
+        if attack.kind == Kind.CREEPING_HORN:
+            self._slips[joint], self._slipped[joint] = attack.amount, attack.amount * (now - attack.start)
+            return
         done = min(1.0, (now - attack.start) / SLIPS_S)
         self._slips[joint] = attack.amount / SLIPS_S if done < 1.0 else 0.0
         self._slipped[joint] = attack.amount * done

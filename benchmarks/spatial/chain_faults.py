@@ -8,14 +8,14 @@ The faults are those of benchmarks/faults.py, injected into the whole command on
 record, which the program never sees, decides:
 
 can command     the faults are of kinds that leave commands and readings true (`COMMANDABLE`), the record shows no
-                servo that was silent, disobeyed or told something false, and nothing held the arm by force
-unsafe          by what the program can do: servos that obey may be driven until the arm is lowered, since nothing else
-                lays it down; a motor whose current the program does not decide is to be off within 100 ms; one that
-                hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was not
-                commanded for longer than that, also while the arm was lowered; current for longer than that after a
-                servo was silent or the cable unplugged; current for longer than the lowering takes after any other
-                reason. Links that came closer to each other while motors drove them than in the undisturbed run, and
-                touched. A joint that went further beyond its limits meanwhile than a lowering may
+                servo that was silent, disobeyed or reported something false, and nothing held the arm by force
+unsafe          judged by what the program can do: servos that obey may be driven until the arm is lowered, since
+                nothing else lays it down; a motor whose current the program does not decide must be off within 100 ms;
+                one that hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was
+                not commanded for more than 100 ms (the watchdog's time where a servo hears nothing), also while the
+                arm was lowered; current for longer than that after a servo was silent or the cable unplugged; after
+                any other reason, current for longer than the lowering takes. Links that, while motors drove them, came closer to each other
+                than in the undisturbed run, and touched. A joint that overshot its limits further than a lowering may
 lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
                 current was only switched off there
 """

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.fit.levenberg_marquardt import Quadratic
 from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.options import CovarianceOptions
@@ -114,19 +114,8 @@ def robust_covariance(
             measurement errors are larger than independent ones.
     """
     prior = np.zeros_like(at.normal) if expected is None else (1.0 - FAINT_PRIOR) * expected
-    norm = np.sqrt(np.diag(at.normal))
-    seen = norm > 1e-12 * norm.max()
-    lengths = np.outer(norm[seen], norm[seen])
-    measured = (at.normal - prior)[np.ix_(seen, seen)] / lengths
-    inverse = np.asarray(np.linalg.pinv(measured, hermitian=True), dtype=np.float64)
-    freedom = max(1, samples - int(seen.sum()))
+    seen, lengths, _, found = _measured(at, scatter, samples, structured, prior)
     covariance = np.zeros_like(at.normal)
-    found = inverse
-    if scatter is not None:
-        scores = (scatter - prior)[np.ix_(seen, seen)] / lengths
-        robust = inverse @ scores @ inverse * (samples / freedom)
-        found = larger_covariance(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
-        found = found + 0.5 * structured * inverse
     if prior.any():
         size, directions = np.linalg.eigh(prior[np.ix_(seen, seen)] / lengths)
         root = directions * np.sqrt(np.maximum(size, 0.0))
@@ -137,6 +126,39 @@ def robust_covariance(
     hidden = np.flatnonzero(~seen)
     covariance[hidden, hidden] = np.inf
     return covariance[:count, :count]
+
+
+def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: float, expected: Array) -> Array:
+    """Return by what factor (coordinates,) the data know each coordinate worse than independent errors would let them.
+
+    That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
+    correlated errors and model errors; the arguments are the same.
+    """
+    seen, _, inverse, found = _measured(at, scatter, samples, structured, (1.0 - FAINT_PRIOR) * expected)
+    factor = np.ones(len(at.normal))
+    factor[seen] = np.maximum(np.diag(found) / np.maximum(np.diag(inverse), 1e-300), 1.0)
+    return factor
+
+
+def _measured(
+    at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
+) -> tuple[Mask, Array, Array, Array]:
+    """Return what the data alone know: the covariance for independent errors, and the robust one.
+
+    Both are of the coordinates that influence the residual, which are the first result, and relative to the second.
+    """
+    norm = np.sqrt(np.diag(at.normal))
+    seen: Mask = norm > 1e-12 * norm.max()
+    lengths = np.outer(norm[seen], norm[seen])
+    measured = (at.normal - prior)[np.ix_(seen, seen)] / lengths
+    inverse = np.asarray(np.linalg.pinv(measured, hermitian=True), dtype=np.float64)
+    if scatter is None:
+        return seen, lengths, inverse, inverse
+    freedom = max(1, samples - int(seen.sum()))
+    scores = (scatter - prior)[np.ix_(seen, seen)] / lengths
+    robust = inverse @ scores @ inverse * (samples / freedom)
+    found = larger_covariance(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
+    return seen, lengths, inverse, found + 0.5 * structured * inverse
 
 
 def larger_covariance(robust: Array, white: Array) -> Array:

@@ -105,6 +105,13 @@ class Objective:
         """Return the prior's contribution to the normal equations (parameters, parameters)."""
         return self._expected(x).normal[: self.count, : self.count]
 
+    def with_prior_weighted(self, factor: Array) -> "Objective":
+        """Return this objective with the precision of each parameter's prior multiplied by `factor` (parameters,)."""
+        lever = self.lever
+        if lever is not None:
+            lever = replace(lever, std=lever.std / float(np.sqrt(factor[[lever.coupling, lever.gravity]].min())))
+        return replace(self, prior=self.prior.weighted(factor), lever=lever)
+
     def minimise(self, x: Array, ftol: float, damping: float | None = None, at: Quadratic | None = None) -> Minimum:
         """Minimise the sum of squares from `x`; see `hil.estimator.fit.levenberg_marquardt.minimise`."""
         return minimise(

@@ -19,6 +19,7 @@ from hil.estimator.options import CoordinateOptions
 TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a scale
 LEAST_WEIGHT = 0.02  # least gravity_2 that gives a scale, as a fraction of the RMS torque
 TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS torque per radian
+TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
@@ -133,6 +134,10 @@ class CoordinatePrior:
                 centre[index], precision[index] = np.log(term.initial), 1.0 / term.log_spread**2
         return cls(centre, precision)
 
+    def weighted(self, factor: Array) -> "CoordinatePrior":
+        """Return this prior with its precisions multiplied by `factor` (parameters,)."""
+        return CoordinatePrior(self.centre, self.precision * factor)
+
     def cost(self, x: Array) -> float:
         """Return the prior's contribution to the sum of squares at the coordinates `x` (parameters,)."""
         return float(np.sum(self.precision * (x - self.centre) ** 2))
@@ -187,6 +192,7 @@ class Sizes:
             "damping": self.torque / self.velocity,
             "stiffness": self.torque / TYPICAL_BEND,
             "cable": TYPICAL_CABLE * self.torque,
+            "cogging": TYPICAL_COGGING * self.torque,
             "saturation": TYPICAL_SATURATION / self.torque**2,
         }[scale]
 

@@ -1,11 +1,12 @@
-"""Period of the torque ripple over the joint angle: a scan that needs no initial guess.
+"""Period of torque ripple and cogging over the joint angle: a scan that needs no initial guess.
 
 For each number of cycles per turn, torque times the sine and cosine of the angle are two additional columns of the
-regression on Fourier lines. The number that explains most of the residual of dynamics and friction is the likelihood's
-initial guess.
+regression on Fourier lines; for cogging, the sine and cosine themselves. The number that explains most of the residual
+of dynamics and friction is the likelihood's initial guess.
 """
 
 from collections.abc import Sequence
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -16,13 +17,16 @@ from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.regressor import regressor
 from hil.estimator.options import LinearOptions
 
+Wave = Literal["ripple", "cogging"]
+WAVES: tuple[Wave, ...] = get_args(Wave)
+"""Options that are waves over the joint's angle: of the torque per torque, and of the torque itself."""
 CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint; slower variations come from gravity, cables, encoders
 COULOMB_WIDTH = LinearOptions().coulomb_width
 STRIBECK_VELOCITY = 0.15  # rad/s: a rough value suffices to separate the Stribeck rise from the ripple
 
 
-def find_ripple(periods: Sequence[SettledPeriod], linear: LinearEstimate) -> dict[str, float]:
-    """Return cycles per turn, sine and cosine part of each joint's torque ripple, by parameter name."""
+def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: Wave) -> dict[str, float]:
+    """Return cycles per turn, sine and cosine part of each joint's ripple or cogging, by parameter name."""
     found: dict[str, float] = {}
     for joint in range(periods[0].joints):
         each = [
@@ -33,14 +37,17 @@ def find_ripple(periods: Sequence[SettledPeriod], linear: LinearEstimate) -> dic
         goal = _without(Q, np.concatenate([torque for _, torque, _, _ in each]))
         best: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(2))
         for cycles in CYCLES.tolist():
-            waves = [_waves(torque, angle, cycles, size) for _, size, torque, angle in _parts(each)]
+            waves = [
+                _waves(torque if wave == "ripple" else np.ones_like(torque), angle, cycles, size)
+                for _, size, torque, angle in _parts(each)
+            ]
             extra = _without(Q, np.concatenate(waves))
             share = np.asarray(np.linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
             explained = float(goal @ goal - np.sum((goal - extra @ share) ** 2))
             best = max(best, (explained, cycles, share), key=lambda trial: trial[0])
-        # Torque appears as measured = applied (1 + ripple), so the columns explain the negative ripple.
-        found |= {f"ripple_cycles_{joint + 1}": best[1]}
-        found |= {f"ripple_sin_{joint + 1}": -float(best[2][0]), f"ripple_cos_{joint + 1}": -float(best[2][1])}
+        # Torque appears as measured = applied (1 + ripple) + cogging, so the columns explain their negative.
+        found |= {f"{wave}_cycles_{joint + 1}": best[1]}
+        found |= {f"{wave}_sin_{joint + 1}": -float(best[2][0]), f"{wave}_cos_{joint + 1}": -float(best[2][1])}
     return found
 
 
@@ -69,8 +76,8 @@ def _prepared(
     return rows, _real(lines[None, : harmonics + 1])[0], torque, motion.position[joint]
 
 
-def _waves(torque: Array, angle: Array, cycles: float, lines: int) -> Array:
-    waves = np.stack((torque * np.sin(cycles * angle), torque * np.cos(cycles * angle)))
+def _waves(size: Array, angle: Array, cycles: float, lines: int) -> Array:
+    waves = np.stack((size * np.sin(cycles * angle), size * np.cos(cycles * angle)))
     return _real(lines_of(waves)[:, :lines]).T
 
 

@@ -12,12 +12,19 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
-from hil.estimator.fit.covariance import by_parameters, correlation_time, robust_covariance, structured_share
+from hil.estimator.errors import ConvergenceError
+from hil.estimator.fit.covariance import (
+    by_parameters,
+    correlation_time,
+    inflation,
+    robust_covariance,
+    structured_share,
+)
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
 from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever, Sizes, scales_of
-from hil.estimator.fit.ripple import find_ripple
+from hil.estimator.fit.ripple import WAVES, find_waves
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
@@ -96,13 +103,12 @@ def fit_runs(
     if near is not None:
         x = fine.coordinates.coordinates(_near_values(model, linear, near.parameters, options))
         states[: fine.state_scale.size] = near.state.reshape(-1) / fine.state_scale
-        return _fit(
-            periods, *Search(periods, fine, rough, options, coarse).nearest(np.concatenate((x, states))), options
-        )
+        refined, minimum = Search(periods, fine, rough, options, coarse).nearest(np.concatenate((x, states)))
+        return _fit(periods, refined, minimum, options, options.ftol_coarse if coarse else options.ftol_refine)
     guesses = [np.concatenate((x, states)) for x in _initial_guesses(fine, periods, model, linear, starts, options)]
     search = Search(periods, fine, rough, options, coarse)
     refined, minimum = search.minimum(guesses, _springs(linear, options))
-    return _fit(periods, refined, minimum, options)
+    return _fit(periods, refined, minimum, options, options.ftol_coarse if coarse else options.ftol_refine)
 
 
 def _near_values(
@@ -164,8 +170,10 @@ def _initial_guesses(
     options: LikelihoodOptions,
 ) -> list[Array]:
     """Return initial guesses in coordinates: the caller's, then stage 1's with narrow and with wide friction."""
-    ripple = find_ripple(periods, linear) if "ripple" in model.options else {}
-    own = [_guess(model, linear, ripple, standstill, options) for standstill in _standstill_guesses(linear, options)]
+    waves: dict[str, float] = {}
+    for wave in WAVES:
+        waves |= find_waves(periods, linear, wave) if wave in model.options else {}
+    own = [_guess(model, linear, waves, standstill, options) for standstill in _standstill_guesses(linear, options)]
     unnamed = dict(zip(model.names, own[0].tolist(), strict=True))
     given = [np.array([{**unnamed, **start}[name] for name in model.names]) for start in starts]
     return [objective.coordinates.coordinates(value) for value in (*given, *own)]
@@ -186,12 +194,12 @@ def _standstill_guesses(linear: LinearEstimate, options: LikelihoodOptions) -> l
 def _guess(
     model: Model,
     linear: LinearEstimate,
-    ripple: Mapping[str, float],
+    waves: Mapping[str, float],
     standstill: Mapping[str, float],
     options: LikelihoodOptions,
 ) -> Array:
     """Return an initial guess (parameters,) [SI]: stage 1's values, and defaults for other parameters."""
-    known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | dict(ripple)
+    known = dict(zip(linear.names, linear.value.tolist(), strict=True)) | dict(waves)
     known |= {f"{name}_{joint + 1}": value for name, value in standstill.items() for joint in range(model.joints)}
     if model.drive == "delay":
         known["delay"] = linear.delay
@@ -199,9 +207,26 @@ def _guess(
     return np.array([known.get(name, term_of(name).initial) for name in model.names])
 
 
-def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, options: LikelihoodOptions) -> Fit:
-    objective, x, count = refined.weighted, minimum.x, refined.weighted.count
-    positions = objective.positions(x)
+@dataclass(frozen=True)
+class _Errors:
+    """What is left at a minimum, as `hil.estimator.fit.covariance` judges it."""
+
+    lags: int
+    samples: int
+    scatter: Array
+    structured: float
+    """Part of the sum of squares that is due to model errors."""
+    expected: Array
+    """What the priors add to the normal equations (coordinates, coordinates)."""
+
+
+def _errors(
+    periods: Sequence[SettledPeriod],
+    objective: Objective,
+    x: Array,
+    positions: Sequence[Array],
+    options: LikelihoodOptions,
+) -> _Errors:
     residuals = [
         weight * np.where(period.valid, period.position - position, 0.0)
         for period, position, weight in zip(periods, positions, objective.weights, strict=True)
@@ -210,15 +235,34 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
     lags = correlation_time(residuals, correlation)
     longest = max(period.samples for period in periods)
     window = max(lags, min(correlation.max_lag, int(correlation.min_window_share * longest)))
-    samples = int(sum(period.valid.sum() for period in periods))
     structured = sum(
         float(np.sum(_model_error(each, weight, period)))
         for each, weight, period in zip(residuals, objective.weights, periods, strict=True)
     )
     expected = np.zeros((x.size, x.size))
-    expected[:count, :count] = objective.expected_normal(x)
-    scatter = objective.scatter(x, window)
-    covariance = robust_covariance(minimum.at, scatter, samples, count, structured, expected)
+    expected[: objective.count, : objective.count] = objective.expected_normal(x)
+    samples = int(sum(period.valid.sum() for period in periods))
+    return _Errors(lags, samples, objective.scatter(x, window), structured, expected)
+
+
+def _fit(
+    periods: Sequence[SettledPeriod],
+    refined: Refined,
+    minimum: Minimum,
+    options: LikelihoodOptions,
+    ftol: float | None = None,
+) -> Fit:
+    """Return the fit at `minimum`, or with priors of due weight, to the tolerance `ftol` if given, where it differs."""
+    objective, x, count = refined.weighted, minimum.x, refined.weighted.count
+    positions = objective.positions(x)
+    errors = _errors(periods, objective, x, positions, options)
+    if ftol is not None:
+        fitted = _tempered(objective, minimum, errors, options, ftol)
+        if fitted is not minimum:
+            return _fit(periods, refined, fitted, options)
+    covariance = robust_covariance(
+        minimum.at, errors.scatter, errors.samples, count, errors.structured, errors.expected
+    )
     value = objective.coordinates.values(x[:count])
     return Fit(
         value,
@@ -226,9 +270,36 @@ def _fit(periods: Sequence[SettledPeriod], refined: Refined, minimum: Minimum, o
         tuple(objective.start(x, run) for run in range(len(periods))),
         positions,
         refined.outliers,
-        float(lags),
+        float(errors.lags),
         minimum.iterations,
     )
+
+
+def _tempered(
+    objective: Objective, minimum: Minimum, errors: _Errors, options: LikelihoodOptions, ftol: float
+) -> Minimum:
+    """Return the minimum with priors that count as much as the data really know, or `minimum` if that is the same.
+
+    The sum of squares takes the errors of all samples as independent. Under a model error, which repeats at every
+    reversal, the data know a parameter much worse than that, as its standard error says, and would overrule any prior
+    by means of the error: a torque constant half of what it can be, encoders bent by degrees. Therefore each prior's
+    precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    """
+    count, prior = objective.count, objective.prior
+    if objective.lever is None and not prior.precision.any():
+        return minimum
+    factor = inflation(minimum.at, errors.scatter, errors.samples, errors.structured, errors.expected)[:count]
+    if float(factor.max()) < options.least_inflation:
+        return minimum
+    heavier = objective.with_prior_weighted(factor)
+    x = minimum.x
+    if heavier.cost_at(x) - objective.cost_at(x) < options.least_tempering * minimum.at.cost:
+        return minimum
+    try:
+        found = heavier.minimise(x, ftol)
+    except ConvergenceError:
+        return minimum
+    return Minimum(found.x, objective.evaluate(found.x), minimum.iterations + found.iterations)
 
 
 def _model_error(residual: Array, weight: Array, period: SettledPeriod) -> Array:

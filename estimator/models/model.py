@@ -37,6 +37,7 @@ class Model:
             does this).
         ripple: multiplies the motor torque by 1 + ripple_sin sin(ripple_cycles q) + ripple_cos cos(ripple_cycles q),
             with ripple_cycles per turn of the joint.
+        cogging: adds cogging_sin sin(cogging_cycles q) + cogging_cos cos(cogging_cycles q) to the torque.
         zeros: adds zero errors of the encoders, true angle = measured angle + zero; the first joint's is observable
             only under gravity.
         torque_scale: multiplies the second joint's torque by the ratio of true to assumed torque constant relative to

@@ -13,12 +13,33 @@ from typing import Literal, get_args
 
 from hil.estimator.errors import ModelError
 
+__all__ = [
+    "DRIVES",
+    "FRICTIONS",
+    "OPTIONS",
+    "RIGID_BODY",
+    "TERMS",
+    "Drive",
+    "Friction",
+    "Option",
+    "Scale",
+    "Term",
+    "base_names",
+    "constants",
+    "extra_names",
+    "joint_of",
+    "kind_of",
+    "term_of",
+    "units_of",
+]
+
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]
 Drive = Literal["delay", "lag", "delay_lag"]
 Option = Literal[
     "presliding",
     "asymmetry",
     "ripple",
+    "cogging",
     "zeros",
     "torque_scale",
     "saturation",
@@ -28,7 +49,7 @@ Option = Literal[
 ]
 Scope = Literal["arm", "joint"]
 Range = Literal["any", "positive", "floor", "share"]
-Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation", "cable"]
+Scale = Literal["inertia", "torque", "velocity", "damping", "stiffness", "saturation", "cable", "cogging"]
 
 FRICTIONS: tuple[Friction, ...] = get_args(Friction)
 """Laws of dry friction; each includes the terms of the previous ones."""
@@ -38,6 +59,7 @@ OPTIONS: dict[Option, str] = {
     "presliding": "presliding friction: elastic displacement before sliding",
     "asymmetry": "direction-dependent viscous friction",
     "ripple": "torque ripple over the joint angle",
+    "cogging": "cogging: torque that varies over the joint angle, whether or not the motor is driven",
     "zeros": "joint zero offsets; the first joint's is observable only under gravity",
     "torque_scale": "ratio of the joints' torque constants; one of them must be trusted",
     "saturation": "torque saturation: torque falls short of large commands",
@@ -187,6 +209,9 @@ _DECLARED = (
     Term("ripple_sin", "1", "torque ripple over the angle, sine part", part="ripple", range="any", scale=0.02),
     Term("ripple_cos", "1", "torque ripple over the angle, cosine part", part="ripple", range="any", scale=0.02),
     Term("ripple_cycles", "1", "ripple cycles per turn", part="ripple", range="any", scale=0.02),
+    Term("cogging_sin", "N m", "cogging torque, sine part", part="cogging", range="any", scale="cogging"),
+    Term("cogging_cos", "N m", "cogging torque, cosine part", part="cogging", range="any", scale="cogging"),
+    Term("cogging_cycles", "1", "cogging cycles per turn", part="cogging", range="any", scale=0.02),
     Term("zero", "rad", "true minus measured angle", part="zeros", range="any", scale=0.02, spread=0.04),
     Term(
         "torque_scale",

@@ -19,6 +19,7 @@ from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.covariance import autocorrelation
 from hil.estimator.fit.objective import Run
 from hil.estimator.fit.reparametrisation import Lever, Sizes
+from hil.estimator.fit.ripple import WAVES
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.identify import Estimate
@@ -29,7 +30,6 @@ from hil.estimator.options import IntegrationOptions
 
 MAX_LAG_SHARE = 0.05  # fraction of the samples over which a residual's autocorrelation is summed
 INTEGRATION = IntegrationOptions()
-COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 
 
 @dataclass(frozen=True)
@@ -147,12 +147,14 @@ def linearised(
 def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
     """Return the terms that could be added to the estimate's model, most significant first.
 
-    `known`: the period of ripple (`ripple_cycles`), by parameter name; without it, ripple is not considered.
+    `known`: the periods of ripple and cogging (`hil.estimator.selection.waves`), by parameter name; without them, these
+    are not considered.
     """
     model = estimate.model
     richer = richer_models(model)
-    if not known:
-        richer.pop("ripple", None)
+    for wave in WAVES:
+        if f"{wave}_cycles_1" not in known:
+            richer.pop(wave, None)
     new = {part: tuple(n for n in more.names if n not in model.names) for part, more in richer.items()}
     about = linearised(period, estimate, [n for names in new.values() for n in names], known)
     return ranked(about, estimate.names, richer, known)
@@ -167,7 +169,7 @@ def ranked(
     found = []
     for part, more in richer.items():
         fall, step = about.fall((*fitted, *new[part]))
-        free = sum(term_of(name).part != "ripple" or "cycles" not in name for name in new[part])
+        free = sum("cycles" not in name for name in new[part])
         chance = about.colour * free * np.log(max(about.samples / about.colour, 3.0))
         moved = dict(zip(new[part], step[len(fitted) :].tolist(), strict=True))
         found.append(
@@ -280,40 +282,6 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
     )
 
 
-def ripple_cycles(
-    period: SettledPeriod, estimate: Estimate, cycles: Sequence[float], only: Sequence[int] = ()
-) -> dict[str, float]:
-    """Return the numbers of `cycles` per turn for which ripple of each joint would explain most of the residual.
-
-    This is the score test of ripple for one number of cycles after the other, after removing what the fitted parameters
-    explain. The result is by parameter name. Ripple that the estimate's model has is left out where it is searched for.
-
-    only: joints, from 1, that are searched; by default all.
-    """
-    used = without_spikes(period)
-    run = simulated_run(used).integrated(COARSE)
-    weight = np.where(np.isfinite(estimate.residual), 1.0 / period.noise[:, None], 0.0)
-    joints = tuple(only) or tuple(range(1, period.joints + 1))
-    searched = {f"ripple_{what}_{joint}": 0.0 for joint in joints for what in ("sin", "cos", "cycles")}
-    known = estimate.parameters | searched
-    fitted = tuple(name for name in estimate.names if name not in searched)
-    columns, position = _columns(run, Physics.of(known), estimate.start, fitted, weight)
-    Q = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
-    residual = (weight * (run.measured - position)).reshape(-1)
-    rest = residual - Q @ (Q.T @ residual)
-    best: dict[int, tuple[float, float]] = {}
-    names = tuple(f"ripple_{wave}_{joint}" for joint in joints for wave in ("sin", "cos"))
-    for each in cycles:
-        given = {f"ripple_cycles_{joint}": each for joint in joints}
-        waves, _ = _columns(run, Physics.of({**known, **given}), estimate.start, names, weight)
-        waves = waves[:, : len(names)] - Q @ (Q.T @ waves[:, : len(names)])
-        for place, joint in enumerate(joints):
-            own = waves[:, 2 * place : 2 * place + 2]
-            fall = float(np.sum((np.linalg.qr(own)[0].T @ rest) ** 2))
-            best[joint] = max(best.get(joint, (-1.0, 0.0)), (fall, each))
-    return {f"ripple_cycles_{joint}": best[joint][1] for joint in joints}
-
-
 def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
     """Return derivatives of the positions of `period` by all causes (joints, samples, causes), over the residual's RMS.
 
@@ -322,13 +290,13 @@ def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
     used = without_spikes(period)
     rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
     weight = np.where(np.isfinite(estimate.residual), 1.0 / np.maximum(rms, 1e-300), 0.0)
-    columns, _ = _columns(
+    columns, _ = columns_of(
         simulated_run(used), Physics.of(estimate.parameters), estimate.start, tuple(estimate.names), weight
     )
     return columns.reshape(period.joints, -1, columns.shape[1])
 
 
-def _columns(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
+def columns_of(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
     """Return weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
     pieces = list(run.pieces(physics, start, names))
     derivative = np.concatenate([each for _, _, each in pieces], axis=1) * weight[:, :, None]

@@ -1,7 +1,7 @@
 """Other initial guesses for an estimate that may be a local minimum.
 
 The likelihood has several minima where a term acts in a narrow range: the width of the Coulomb step, the stiffness of
-bristles (once they are too stiff to bend, nothing tells how stiff), and the period of torque ripple.
+bristles (once they are too stiff to bend, nothing tells how stiff), and the periods of torque ripple and cogging.
 """
 
 from collections.abc import Iterator, Mapping
@@ -10,11 +10,16 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.ripple import WAVES, Wave
 from hil.estimator.identify import Estimate
+from hil.estimator.models.terms import term_of
 from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import ripple_cycles
+from hil.estimator.selection.waves import wave_cycles
 
 ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
+LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
+WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be told apart
+NARROW = 1e-3  # rad/s: initial width of an undisguised step
 ALIKE_CYCLES = 0.3  # difference of two numbers of cycles per turn between which no minimum is expected
 
 
@@ -32,19 +37,35 @@ def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOption
     left = left_per_joint(period, estimate)
     for joint in np.argsort(-left) + 1:
         if left[joint - 1] > options.presliding_residual**2:
-            yield from _ripple(period, estimate, int(joint), options)
+            for wave in WAVES:
+                yield from _other_wave(period, estimate, int(joint), options, wave)
             yield from _standstill(estimate, int(joint), options)
 
 
-def _ripple(
-    period: SettledPeriod, estimate: Estimate, joint: int, options: SelectionOptions
+def undisguised(estimate: Estimate) -> dict[str, float]:
+    """Return changed parameters, by name, for joints whose Stribeck rise may be a narrow Coulomb step in disguise.
+
+    A rise that fades within a wide step resembles a narrow step without a rise, and explains the motion nearly as well;
+    no path leads from one to the other.
+    """
+    values: dict[str, float] = estimate.parameters
+    changed: dict[str, float] = {}
+    for joint in range(1, estimate.model.joints + 1):
+        rise, velocity, width = (f"{name}_{joint}" for name in ("stribeck_rise", "stribeck_velocity", "coulomb_width"))
+        if {rise, width} <= values.keys() and values[rise] > LEAST_RISE and values[width] > WIDE * values[velocity]:
+            changed |= {rise: LEAST_RISE, velocity: term_of(velocity).initial, width: NARROW}
+    return changed
+
+
+def _other_wave(
+    period: SettledPeriod, estimate: Estimate, joint: int, options: SelectionOptions, wave: Wave
 ) -> Iterator[Mapping[str, float]]:
-    name = f"ripple_cycles_{joint}"
+    name = f"{wave}_cycles_{joint}"
     if name not in estimate.names:
         return
-    found = ripple_cycles(period, estimate, options.ripple_cycles, (joint,))
+    found = wave_cycles(period, estimate, options.wave_cycles, (wave,), (joint,))
     if abs(found[name] - estimate.parameters[name]) > ALIKE_CYCLES:
-        yield found | {f"ripple_sin_{joint}": 0.0, f"ripple_cos_{joint}": 0.0}
+        yield found | {f"{wave}_sin_{joint}": 0.0, f"{wave}_cos_{joint}": 0.0}
 
 
 def bristles(estimate: Estimate, bend: float) -> list[dict[str, float]]:

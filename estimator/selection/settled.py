@@ -18,15 +18,17 @@ from scipy.stats import chi2
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError
+from hil.estimator.fit.ripple import WAVES
 from hil.estimator.identify import Estimate
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
 from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import Candidate, candidates, colour, ripple_cycles
+from hil.estimator.selection.candidates import Candidate, candidates, colour
 from hil.estimator.selection.drift import Drift, friction_change
-from hil.estimator.selection.restarts import bristles, restarts
+from hil.estimator.selection.restarts import bristles, restarts, undisguised
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
+from hil.estimator.selection.waves import wave_cycles
 
 DEFAULTS = SelectionOptions()
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
@@ -142,7 +144,7 @@ class Selection:
         plain = self._try_or_none(model.having(*unknown), coarse=True)
         explained = plain is not None and self._is_explained(plain)
         if plain is not None and explained and not self._seen(plain):
-            return self._steadied(plain) or plain
+            return self._undisguised(self._steadied(plain) or plain)
         best = plain
         if plain is not None and self._left(plain) < self._options.near_residual**2:
             best = self._steadied(self._better(self._try_or_none(smooth, plain, coarse=True), plain))
@@ -154,15 +156,22 @@ class Selection:
             best = self._better(self._try_or_none(smooth.having("presliding"), coarse=True), best) or best
         for near in self._closest():
             if not self._is_explained(best):
-                best = self._better(self._with_ripple(near), best) or best
+                best = self._better(self._with_wave(near), best) or best
+        if set(WAVES) & set(best.model.options) and not self._is_explained(best):
+            best = self._with_wave(best)
         best = self._steadied(best) or best
         again = self._with_bristles(self._restarted(best))
         again = self._converged(best if again is best else self._steadied(again) or again)
-        return self._without_bristles(again)
+        return self._undisguised(self._without_bristles(again))
+
+    def _undisguised(self, best: Trial) -> Trial:
+        """Refit with narrow Coulomb steps where the Stribeck rise may only imitate them, if that explains more."""
+        values = {} if best.estimate is None else undisguised(best.estimate)
+        return self._better(self._try_or_none(best.model, best, values), best) or best if values else best
 
     def _without_bristles(self, best: Trial) -> Trial:
         """Drop presliding if the motion is explained as well without it: it may have passed for ripple before that."""
-        if "presliding" not in best.model.options or "ripple" not in best.model.options:
+        if "presliding" not in best.model.options or not set(WAVES) & set(best.model.options):
             return best
         return self._better(best, self._try_or_none(best.model.without("presliding"), best)) or best
 
@@ -230,13 +239,15 @@ class Selection:
         assert trial.estimate is not None
         return [each for each in candidates(self._periods[0], trial.estimate, {}) if each.evidence > 1.0]
 
-    def _with_ripple(self, best: Trial) -> Trial:
+    def _with_wave(self, best: Trial) -> Trial:
+        """Add ripple or cogging, whichever explains more, if the score test finds it."""
         assert best.estimate is not None
-        if "ripple" in best.model.options:
+        absent = [wave for wave in WAVES if wave not in best.model.options]
+        if not absent:
             return best
-        known = ripple_cycles(self._periods[0], best.estimate, self._options.ripple_cycles)
+        known = wave_cycles(self._periods[0], best.estimate, self._options.wave_cycles, absent)
         for each in candidates(self._periods[0], best.estimate, known):
-            if each.part == "ripple" and each.evidence > self._options.ripple_evidence:
+            if each.part in absent and each.evidence > self._options.wave_evidence:
                 return self._better(self._try_or_none(each.model, best, each.values, coarse=True), best) or best
         return best
 
@@ -244,7 +255,7 @@ class Selection:
         """Return a fit with full precision: while models are compared, those that leave much do not get it."""
         if not trial.coarse or self._is_explained(trial):
             return trial
-        return self._better(self._try_or_none(trial.model, trial), trial) or trial
+        return self._try_or_none(trial.model, trial) or trial
 
     def _restarted(self, best: Trial) -> Trial:
         """Refit the model from other initial guesses while it does not explain the motion of every joint."""
@@ -395,7 +406,7 @@ def _parts(model: Model) -> list[tuple[str, Model]]:
 def _tested(model: Model, plainer: Model) -> list[str]:
     """Return the tested parameters of the part that `plainer` lacks.
 
-    Parameters that only have an effect together with others, such as a ripple's period, are not tested.
+    Parameters that only have an effect together with others, such as a wave's period, are not tested.
     """
     lacking = [name for name in model.names if name not in plainer.names]
-    return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "stribeck_velocity")]
+    return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "cogging_cycles", "stribeck_velocity")]

@@ -9,7 +9,8 @@ The equations are those of `hil.estimator.models.regressor` with a smooth fricti
     level(v) = coulomb (1 + stribeck_rise exp(-(v / stribeck_velocity)^2)) + load |motor torque|
 
 Here generated v is the back-EMF of a joint driven by voltage (`hil.estimator.simulation.back_emf`), 0 otherwise. In
-addition to friction there is the torque cable_stiffness q. |v| is smoothed as well, to v tanh(v / width). An
+addition to friction there is the torque cable_stiffness q - cogging_sin sin(cogging_cycles q) - cogging_cos
+cos(cogging_cycles q). |v| is smoothed as well, to v tanh(v / width). An
 asymmetry of the Coulomb level itself is the offset. With presliding, the term level(v) tanh(v / width) is replaced by
 the bristles of `hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these
 equations and this integration scheme.
@@ -41,6 +42,7 @@ LOAD, ASYMMETRY, SINE, COSINE, CYCLES, ZERO, SCALE = map(
     place_of, ("load", "viscous_asymmetry", "ripple_sin", "ripple_cos", "ripple_cycles", "zero", "torque_scale")
 )
 SATURATION, CABLE, GENERATED = map(place_of, ("saturation", "cable_stiffness", "back_emf"))
+COG_SINE, COG_COSINE, COG_CYCLES = map(place_of, ("cogging_sin", "cogging_cos", "cogging_cycles"))
 
 INTEGRATION = IntegrationOptions()
 MAX_SUBSTEPS = INTEGRATION.max_substeps
@@ -142,6 +144,9 @@ def _drive(p: Any, joint: int, q: float, v: float, t: float) -> tuple[float, flo
         - viscous * v
         - (p[ASYMMETRY + joint] * v + level) * bend
     )
+    cogs = p[COG_CYCLES + joint]
+    if cogs != 0.0:
+        left += p[COG_SINE + joint] * math.sin(cogs * q) + p[COG_COSINE + joint] * math.cos(cogs * q)
     slope = viscous + level * bent
     return left, slope
 

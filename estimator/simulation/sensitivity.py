@@ -29,6 +29,9 @@ from hil.estimator.models.parameters import CONSTANTS, ENCODER, Physics
 from hil.estimator.simulation.arm import (
     ASYMMETRY,
     CABLE,
+    COG_COSINE,
+    COG_CYCLES,
+    COG_SINE,
     COSINE,
     COULOMB,
     CYCLES,
@@ -213,6 +216,13 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
         rows[f + at[GENERATED + joint]], rows[s + at[GENERATED + joint]] = v - v * driven, -v * driven_slope
     if at[CABLE + joint] != NOWHERE:
         rows[f + at[CABLE + joint]] = -q
+    cogging, cogging_q, cogs = 0.0, 0.0, p[COG_CYCLES + joint]
+    if cogs != 0.0:
+        sine, cosine = math.sin(cogs * q), math.cos(cogs * q)
+        cogging = p[COG_SINE + joint] * sine + p[COG_COSINE + joint] * cosine
+        cogging_q = p[COG_SINE + joint] * cosine - p[COG_COSINE + joint] * sine
+        rows[f + at[COG_SINE + joint]], rows[f + at[COG_COSINE + joint]] = sine, cosine
+        rows[f + at[COG_CYCLES + joint]] = q * cogging_q
     for cause in range(2):
         given = scale * eased * shape * dt[cause, joint]
         rows[f + at[DELAY + cause]], rows[s + at[DELAY + cause]] = given * passed, given * loaded * bent
@@ -220,11 +230,11 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
         # `given` still holds the derivative by the joint's own lag.
         rows[f + at[LAG_DIFFERENCE]], rows[s + at[LAG_DIFFERENCE]] = given * passed, given * loaded * bent
     cable = p[CABLE + joint]
-    left[stage, joint] = motor - offset - cable * q - (viscous - per_speed) * v - dry * bend
+    left[stage, joint] = motor + cogging - offset - cable * q - (viscous - per_speed) * v - dry * bend
     slope[stage, joint] = viscous + level * bent
     left_by = now * NUMBERS + stage * BY_STATE + 5 * joint
     slope_by = left_by + 8 - 3 * joint
-    numbers[left_by] = cycles * turn * passed - cable
+    numbers[left_by] = cycles * turn * passed + cogs * cogging_q - cable
     numbers[left_by + 2] = per_speed * (1.0 - driven) - viscous - dry * bent - (asymmetry + level_v) * bend
     numbers[slope_by] = cycles * turn * loaded * bent
     numbers[slope_by + 1] = level_v * bent + level * bent_v - per_speed * driven_slope

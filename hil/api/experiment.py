@@ -10,8 +10,9 @@ from pathlib import Path
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.config.schema import Config, load_config
-from hil.errors import ConfigError, StopRequested
-from hil.estimation.after_a_stop import after_a_stop
+from hil.drivers.errors import DriverError
+from hil.errors import ConfigError, ExperimentError, StopRequested
+from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress as StreamProgress
@@ -127,16 +128,22 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
     return read_result(path)
 
 
+def _how_to_go_on(stopped: BaseException, run: RunFolder, shown: Path) -> list[str]:
+    if isinstance(stopped, KeyboardInterrupt | StopRequested):
+        return after_a_stop(run, shown)
+    return after_a_failure(run, shown) if isinstance(stopped, ExperimentError | DriverError) else []
+
+
 @contextmanager
 def _discarding(run: RunFolder, shown: Path) -> Iterator[None]:
     """Remove the run folder if the experiment fails before the first sample, so that it does not block the next
-    attempt. After a stop by the user, add to the exception what is kept and how to go on.
+    attempt. After a stop, add to the exception what is kept and how to go on.
     """
     try:
         yield
     except BaseException as stopped:
-        if not run.discard_if_unused() and isinstance(stopped, KeyboardInterrupt | StopRequested):
-            for line in after_a_stop(run, shown):
+        if not run.discard_if_unused():
+            for line in _how_to_go_on(stopped, run, shown):
                 stopped.add_note(line)
         raise
 

@@ -13,13 +13,14 @@ from hil.description.files import read_arm
 from hil.description.planar import is_planar
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
+from hil.unit_hints import in_other_units
 
 if TYPE_CHECKING:
     from hil.config.schema import Config
 
 MOST_JOINTS = 7
 _PLANAR = 2
-_OPTIONS = ("presliding", "asymmetry", "ripple", "saturation", "cable", "encoder")
+_OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
 def described_arm(config: "Config") -> ArmDescription:
@@ -107,6 +108,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
         )
     if config.joint_path is None:
         return
+    least = min(joint.velocity_limit for joint in config.joints)
     parts = zip(config.joints, *config.joint_path.model_dump().values(), strict=False)
     for joint, centre, swing, speed in parts:
         low, high = joint.position_limit
@@ -116,7 +118,11 @@ def _path_slips(config: "Config") -> Iterator[str]:
                 f"position_limit [{low:g}, {high:g}]"
             )
         if speed > joint.velocity_limit:
-            yield f"joint_path.speed: {speed:g} rad/s of {joint.name!r}: its velocity_limit is {joint.velocity_limit:g}"
+            hint = in_other_units(speed, "rad/s", lambda limited: limited <= least)
+            yield (
+                f"joint_path.speed: {speed:g} rad/s of {joint.name!r}: its velocity_limit is {joint.velocity_limit:g}"
+                + (f". {hint}" if hint else "")
+            )
 
 
 def _changed(path: str) -> float:

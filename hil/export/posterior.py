@@ -93,6 +93,7 @@ def export_samples(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunFolderError(f"{out} cannot be created: {error.strerror}.") from error
+    _nothing_older(formats, out, samples)
     for name in formats:
         if name == "parquet":
             _write_table(source, drawn, out / TABLE)
@@ -101,6 +102,20 @@ def export_samples(
         for number, model in enumerate(drawn.models):
             write(replace(source, model=model), out / f"arm_{number:04d}.{ending}")
     return drawn
+
+
+def _nothing_older(formats: Sequence[str], out: Path, samples: int) -> None:
+    """Raise ExportError if arms of an earlier draw would remain in the folder beside those that are written now."""
+    for name in formats:
+        if name in FORMATS:
+            ending = FORMATS[name][1]
+            older = [path for path in out.glob(f"arm_*.{ending}") if path.stem[4:].isdigit()]
+            remaining = sum(int(path.stem[4:]) >= samples for path in older)
+            if remaining:
+                raise ExportError(
+                    f"{out} holds {len(older)} arms of an earlier draw, of which {remaining} would remain: give "
+                    "another --out, or remove them."
+                )
 
 
 def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:

@@ -34,9 +34,12 @@ from hil.config.experiment import ExperimentConfig
 from hil.config.schema import Config, StabiliserConfig, parse_config
 from hil.description.kept_file import kept_bytes
 from hil.errors import RunFolderError
+from hil.next_step import command
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
+
+__all__ = ["SCHEMA", "Excitation", "RunFacts", "RunFolder", "RunRecord", "taken", "write_json"]
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +160,9 @@ class RunFolder:
             )
         for needed in (run.config_path, run.run_path, run.samples_path):
             if not needed.is_file():
-                raise RunFolderError(f"{path} is not a run folder: it has no {needed.name}.")
+                raise RunFolderError(
+                    f"{path} is not a run folder: it has no {needed.name}. List those that you have: {command('runs')}"
+                )
         return run
 
     @property

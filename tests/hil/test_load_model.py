@@ -35,8 +35,9 @@ def test_it_has_the_estimators_equations(identified: Path) -> None:
 
 
 def full(model: ArmModel) -> ArmModel:
-    """The model with every friction term."""
-    more = {"coulomb_width": 0.01, "stribeck_rise": 0.4, "stribeck_velocity": 0.15, "load": 0.05}
+    """The model with every friction term, ripple, cogging and a cable."""
+    more = {"coulomb_width": 0.01, "stribeck_rise": 0.4, "stribeck_velocity": 0.15, "load": 0.05, "ripple_cos": 0.02}
+    more |= {"ripple_cycles": 7.0, "cogging_sin": 0.004, "cogging_cycles": 5.0, "cable_stiffness": 0.03}
     terms = {f"{term}_{joint}": value for term, value in more.items() for joint in (1, 2)}
     return dataclasses.replace(model, values={**model.values, **terms})
 
@@ -46,6 +47,12 @@ def test_forward_is_the_inverse_of_inverse(identified: Path) -> None:
     q, dq, ddq = motions((300, 2))
     torque = model.inverse_dynamics(q, dq, ddq)
     np.testing.assert_allclose(model.forward_dynamics(q, dq, torque), ddq, atol=1e-9)
+    # At rest, against the offset alone, cogging drives the joint and the cable holds it.
+    still = np.zeros(2)
+    moved = dataclasses.replace(model, values={**model.values, "cogging_sin_1": 0.005, "cable_stiffness_1": 0.04})
+    less = model.inverse_dynamics([0.1, 0.0], still, still) - moved.inverse_dynamics([0.1, 0.0], still, still)
+    ripple = 1.0 + 0.02 * np.cos(0.7)
+    np.testing.assert_allclose(less, [(0.001 * np.sin(0.5) - 0.01 * 0.1) / ripple, 0.0], atol=1e-12)
 
 
 def test_a_torque_constant_found_wrong_changes_goals_and_no_torque(identified: Path) -> None:

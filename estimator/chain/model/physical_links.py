@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
 
@@ -35,6 +36,7 @@ class PhysicalLinks:
     """Largest deviation of a base parameter from the identified one, in standard errors."""
 
 
+@one_blas_thread
 def nearest_links(base: BaseParameters, value: Array, std: Array, described: Array, armature: Array) -> PhysicalLinks:
     """Return the links and rotors nearest to the described ones that agree with the identified base parameters.
 

@@ -103,7 +103,8 @@ def diff_models(
     friction: Sequence[FrictionChange] = (),
 ) -> Difference:
     """Compare two models of one arm parameter by parameter, in the order of the first."""
-    common = [name for name in before.values if name in after.values and not name.startswith("ripple_cycles")]
+    periods = ("ripple_cycles", "cogging_cycles")
+    common = [name for name in before.values if name in after.values and not name.startswith(periods)]
     z = {name: _z(before, after, name) for name in common}
     p = {name: math.erfc(abs(value) / math.sqrt(2)) for name, value in z.items()} | {
         row.name: row.p for row in friction

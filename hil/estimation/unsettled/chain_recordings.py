@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 FITTED_SHARE = 0.75  # of each recording, for the check on the rest
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
-UNSUPPORTED = ("presliding", "asymmetry", "ripple", "saturation", "cable", "encoder", "lags")
+UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder", "lags")
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the likelihood: the first that can be used
 START_WIDTH = 0.05  # rad/s
-NOT_HERE = ("ripple", "encoder", "lags")
+NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
 
 @dataclass(frozen=True)

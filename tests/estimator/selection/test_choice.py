@@ -9,7 +9,7 @@ import pytest
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.fit.covariance import correlation_time, structured_share
-from hil.estimator.fit.ripple import find_ripple
+from hil.estimator.fit.ripple import find_waves
 from hil.estimator.fit.stage1 import fit_lines
 from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
@@ -150,7 +150,7 @@ def test_a_good_estimate_is_trusted(ideal_period: SettledPeriod) -> None:
 def test_ripple_is_found_without_a_starting_value(ideal_arm: Arm, recorded: Recorder, wave: Wave) -> None:
     drives = [drive.model_copy(update={"ripple": 0.03, "ripple_cycles": 9.0}) for drive in ideal_arm.drives]
     period = recorded(ideal_arm.model_copy(update={"drives": tuple(drives)}), wave(1, (0.8, 0.42)))
-    found = find_ripple([period], fit_lines(period))
+    found = find_waves([period], fit_lines(period), "ripple")
     assert found["ripple_cycles_1"] == pytest.approx(9.0, abs=0.26)
     assert found["ripple_sin_2"] == pytest.approx(0.03, rel=0.3)
 

@@ -15,6 +15,7 @@ EACH = {
     **{"viscous": 0.045, "coulomb": 0.055, "offset": 0.004, "coulomb_width": 0.02, "stribeck_rise": 0.4},
     **{"stribeck_velocity": 0.15, "load": 0.05, "viscous_asymmetry": 0.002, "ripple_sin": 0.02, "ripple_cos": 0.01},
     **{"ripple_cycles": 7.0, "zero": 0.01, "torque_scale": 1.1, "saturation": 0.05, "cable_stiffness": 0.02},
+    **{"cogging_sin": 0.004, "cogging_cos": -0.003, "cogging_cycles": 5.0},
 }
 ARM = {
     **{"inertia_1": 0.018, "coupling": 0.0033, "inertia_2": 0.0028, "armature_2": 0.01},
