@@ -14,8 +14,9 @@ unsafe          judged by what the program can do: servos that obey may be drive
                 one that hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was
                 not commanded for more than 100 ms (the watchdog's time where a servo hears nothing), also while the
                 arm was lowered; current for longer than that after a servo was silent or the cable unplugged; after
-                any other reason, current for longer than the lowering takes. Links that, while motors drove them, came closer to each other
-                than in the undisturbed run, and touched. A joint that overshot its limits further than a lowering may
+                any other reason, current for longer than the lowering takes. Links that, while motors drove them, came
+                closer to each other than in the undisturbed run, and touched. A joint that overshot its limits further
+                than a lowering may
 lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
                 current was only switched off there
 """
