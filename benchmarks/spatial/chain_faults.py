@@ -12,10 +12,11 @@ can command     the faults are of kinds that leave commands and readings true (`
 unsafe          judged by what the program can do: servos that obey may be driven until the arm is lowered, since
                 nothing else lays it down; a motor whose current the program does not decide must be off within 100 ms;
                 one that hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was
-                not commanded for more than 100 ms, also while the arm was lowered; current for longer than 100 ms, or
-                the watchdog's time, after a servo was silent or the cable unplugged; after any other reason, current
-                for longer than the lowering takes. Links that, while motors drove them, came closer to each other
-                than in the undisturbed run, and touched. A joint that overshot its limits further than a lowering may
+                not commanded for more than 100 ms (the watchdog's time where a servo hears nothing), also while the
+                arm was lowered; current for longer than that after a servo was silent or the cable unplugged; after
+                any other reason, current for longer than the lowering takes. Links that, while motors drove them, came
+                closer to each other than in the undisturbed run, and touched. A joint that overshot its limits further
+                than a lowering may
 lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
                 current was only switched off there
 """
@@ -68,6 +69,7 @@ UNREACHED = ("was not heard", "the cable was unplugged")
 MOST_BEYOND_RAD = 0.2
 
 _BY_FORCE = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.OBSTACLE, Kind.SNAG, Kind.LOAD_CHANGED})
+_SIGNALS = frozenset({Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP})
 COMMANDABLE = _BY_FORCE | {
     *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP),
     *(Kind.RAISED_LIMIT, Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG),
@@ -92,7 +94,7 @@ class ChainOutcome:
     lies: whether it ended lying in its rest pose. late_ms: how long current flowed after the reason. clearance: least
     distance while motors drove the arm, beyond that of the undisturbed run if that is negative [m]. beyond: largest
     overshoot beyond a position limit meanwhile [rad]. overruled_ms: longest time for which a motor carried a current
-    that was not commanded.
+    that was not commanded, of `cut_ms` allowed.
     """
 
     setting: Setting
@@ -101,6 +103,7 @@ class ChainOutcome:
     late_ms: float
     bound_ms: float
     lower_ms: float
+    cut_ms: float
     clearance: float
     beyond: float
     overruled_ms: float
@@ -116,7 +119,7 @@ class ChainOutcome:
     @property
     def unsafe(self) -> bool:
         is_late = self.late_ms > (self.lower_ms if self.lies else self.bound_ms)
-        return is_late or self.overruled_ms > BOUND_MS or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
+        return is_late or self.overruled_ms > self.cut_ms or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
 
     @property
     def dropped(self) -> bool:
@@ -128,9 +131,8 @@ class ChainOutcome:
         flags += ["unnamed"] * (self.stopped and not self.named)
         return (
             f"{self.setting.name} {self.setting.rate} Hz: {self.drawn}: {self.owed or 'nothing owed'}, current for "
-            f"{self.late_ms:.0f} ms of {self.bound_ms:.0f}, overruled for {self.overruled_ms:.0f} ms, "
-            f"clearance {1e3 * self.clearance:.0f} mm, "
-            f"{', '.join(flags) or 'good'}\n    {self.text.strip()[-600:]}"
+            f"{self.late_ms:.0f} ms of {self.bound_ms:.0f}, overruled {self.overruled_ms:.0f} of {self.cut_ms:.0f}, "
+            f"clearance {1e3 * self.clearance:.0f} mm, {', '.join(flags) or 'good'}\n    {self.text.strip()[-600:]}"
         )
 
 
@@ -188,6 +190,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
         1e3 * float(flowed[-1] - since) if flowed.size else 0.0,
         bound,
         lower_ms,
+        cut_ms,
         _clearance(config, record) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
         float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
         overruled_ms(config, drawn, story),
@@ -225,11 +228,15 @@ def longest_lowering(path: Path) -> float:
 
 
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
-    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end."""
+    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end.
+
+    A second request to stop asks for torque to be cut at once, so it does not.
+    """
     forced = any(
         each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks
     )
-    return set(drawn.kinds) <= COMMANDABLE and not forced
+    asked = sum(each.kind in _SIGNALS and each.start < ended for each in drawn.attacks)
+    return set(drawn.kinds) <= COMMANDABLE and not forced and asked <= 1
 
 
 def _clearance(config: Config, record: NDArray[Any]) -> float:
