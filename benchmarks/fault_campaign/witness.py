@@ -149,12 +149,14 @@ class Witness:
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         plant = self._plant
+        if self._next <= until:
+            told = [_told(servo) for servo in self._servos]  # no servo receives anything within this time
         while self._next <= until:
             plant.advance(self._next, self._driven_by(current, self._next) if self._disturbed else current)
             self._rows.append(
                 [
-                    (self._next, *_told(servo), *state)
-                    for servo, *state in zip(self._servos, plant.current, plant.position, plant.velocity, strict=True)
+                    (self._next, *each, *state)
+                    for each, *state in zip(told, plant.current, plant.position, plant.velocity, strict=True)
                 ]
             )
             self._next += STEP_S
