@@ -139,7 +139,7 @@ def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None
             near = difflib.get_close_matches(repr(value), known.split(", "), n=1)
             return f"did you mean {near[0]}? Known: {known}" if near else f"must be one of {known}"
         case "literal_error":
-            return f"must be one of {context['expected']}"
+            return f"must be one of {context['expected']}{_in_thousands(context['expected'], value)}"
         case "string_too_short":
             return "must not be empty"
         case "string_too_long":
@@ -149,6 +149,26 @@ def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None
         case "too_long":
             return f"may have at most {context['max_length']} entries"
     return None
+
+
+def _in_thousands(expected: str, value: object) -> str:
+    """Name the listed number that is meant if it was given in thousands or millions, such as a rate in Mbaud."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return ""
+    for name, factor in (("thousands", 1e3), ("millions", 1e6)):
+        meant = f"{value * factor:.0f}"
+        if meant in expected.replace(",", "").split():
+            return f". If it is in {name}, write {meant}"
+    return ""
+
+
+def not_toml(path: Path, error: Exception) -> str:
+    """What to say of a file that the TOML parser rejects."""
+    other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
+    kind = other.get(path.suffix.lower())
+    if kind is None:
+        return f"{path}: not valid TOML: {error}."
+    return f"{path}: it is {kind}, by its name; hil's files are TOML. `hil init` writes one."
 
 
 def _bound(value: float) -> str:

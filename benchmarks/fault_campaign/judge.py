@@ -178,6 +178,20 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
     return [reason for reason in found if reason is not None]
 
 
+def overruled_ms(config: Config, drawn: Drawn, story: Story) -> float:
+    """Longest time for which a motor carried a current that the program had not commanded [ms]."""
+    time = story.record["time"][:, 0]
+    told = _Told(config, story.traffic, drawn.start)
+    longest = 0
+    for joint in range(len(config.joints)):
+        own = story.record[:, joint]
+        at = np.flatnonzero(told.disobeys(joint, time, own, 1.0 / config.experiment.rate) & own["driven"])
+        breaks = np.flatnonzero(np.diff(at) > GAP_MS)
+        for start, end in zip(at[np.r_[0, breaks + 1]], at[np.r_[breaks, at.size - 1]], strict=True) if at.size else ():
+            longest = max(longest, int(end - start) + 1)
+    return float(longest)
+
+
 def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int, gap_ms: int) -> Reason | None:
     """When [s] a failure began that lasted at least `hold_ms`, including interruptions of up to `gap_ms`."""
     at = np.flatnonzero(wrong)

@@ -22,7 +22,7 @@ def compare(
     For a spatial arm: least squares on Fourier lines, and IDIM-LS.
     """
     from hil.cli.terminal import Terminal
-    from hil.estimation.compare import compare_run
+    from hil.estimation.comparison.compare import compare_run
     from hil.results.json_form import to_json
     from hil.runs.run_folder import RunFolder
 

@@ -35,7 +35,7 @@ from hil.errors import ConfigError
 from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
-from hil.toml_errors import describe
+from hil.toml_errors import describe, not_toml
 from hil.unit_hints import in_other_units
 
 __all__ = [
@@ -310,7 +310,7 @@ def parse_config(text: str, path: Path) -> Config:
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}.") from error
+        raise ConfigError(not_toml(path, error)) from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
     if "joints" not in values and "study" in values:

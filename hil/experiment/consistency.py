@@ -94,7 +94,9 @@ class Consistency:
         known = LAG_S * turned + SCALE * (moved if moved > 0.0 else -moved) + curved + unknown
         if self._steps.look((difference if difference > 0.0 else -difference) - known, seconds):
             return True
-        if self._short.add(moved, difference, velocity, seconds, curved, unknown, self._lag, self._scale):
+        short = self._short
+        short.add(moved, difference, velocity, seconds, curved, unknown)
+        if short.is_wrong(velocity, self._lag, self._scale):
             return True
         # The long memory takes several intervals at once: it is slow anyway, and time is scarce.
         self._sum_moved += moved
@@ -105,16 +107,18 @@ class Consistency:
         self._sum_seconds += seconds
         if self._sum_seconds >= LONG_EVERY_S and self._looks_long(velocity):
             return True
-        if self._learnt_for < LEARNT_S and self._short.span > _FAST_RAD_S and not unsure > seconds:
+        if self._learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
             self._learn(velocity, seconds)
         return False
 
     def _looks_long(self, velocity: float) -> bool:
         """Add the intervals since the last time to the long memory; return whether it shows a disagreement."""
-        moved, difference, seconds = self._sum_moved, self._sum_difference, self._sum_seconds
-        curved, unknown = self._most_curved, self._sum_unknown
+        long = self._long
+        long.add(
+            self._sum_moved, self._sum_difference, velocity, self._sum_seconds, self._most_curved, self._sum_unknown
+        )
         self._forget_sums()
-        return self._long.add(moved, difference, velocity, seconds, curved, unknown, self._lag, self._scale)
+        return long.is_wrong(velocity, self._lag, self._scale)
 
     def _forget_sums(self) -> None:
         self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
@@ -187,39 +191,31 @@ class _Memory:
         self.mean = self._highest = self._lowest = velocity
 
     def add(
-        self,
-        moved: float,
-        difference: float,
-        velocity: float,
-        seconds: float,
-        curved: float,
-        unknown: float,
-        lag: float,
-        scale: float,
-    ) -> bool:
+        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
+    ) -> None:
         """Add one interval of `seconds`, at the end of which the joint has `velocity`.
-
-        Returns whether position and velocity disagree now, given the largest accepted lag [s] and scale error.
 
         moved, difference: change of position, and the same less the integral of velocity [rad]. curved, unknown: their
         uncertainty [rad], the second of which accumulates.
         """
         kept = 1.0 - seconds / self._seconds if seconds < self._seconds else 0.0
         new = 1.0 - kept
-        self.apart = apart = kept * self.apart + difference
-        self.far = far = kept * self.far + moved
-        self._unknown = unknown = kept * self._unknown + unknown
+        self.apart = kept * self.apart + difference
+        self.far = kept * self.far + moved
+        self._unknown = kept * self._unknown + unknown
         faded = kept * self._curved
-        self._curved = curved = curved if curved > faded else faded
-        mean = self.mean
-        self.mean = mean = mean + new * (velocity - mean)
+        self._curved = curved if curved > faded else faded
+        self.mean += new * (velocity - self.mean)
         highest, lowest = kept * self._highest + new * velocity, kept * self._lowest + new * velocity
         self._highest = highest = velocity if velocity > highest else highest
         self._lowest = lowest = velocity if velocity < lowest else lowest
-        self.span = span = highest - lowest
-        of_lag = lag * (velocity - mean)
-        far = far if far > 0.0 else -far
-        allowed = self._unsure + scale * far + curved + unknown + _LAG_SHARE * lag * span
+        self.span = highest - lowest
+
+    def is_wrong(self, velocity: float, lag: float, scale: float) -> bool:
+        """Whether position and velocity disagree, given the largest accepted lag [s] and scale error."""
+        of_lag = lag * (velocity - self.mean)
+        allowed = self._unsure + scale * abs(self.far) + self._curved + self._unknown + _LAG_SHARE * lag * self.span
+        apart = self.apart
         if of_lag > 0.0:
             return apart > allowed + of_lag or apart < -allowed
         return apart > allowed or apart < of_lag - allowed

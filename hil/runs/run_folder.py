@@ -32,6 +32,7 @@ from hil.clearance.kept import keep_shapes
 from hil.config.chain import described_arm
 from hil.config.experiment import ExperimentConfig
 from hil.config.schema import Config, StabiliserConfig, parse_config
+from hil.description.kept_file import kept_bytes
 from hil.errors import RunFolderError
 from hil.next_step import command
 from hil.plan.plan import Plan
@@ -123,7 +124,7 @@ class RunFolder:
                 raise taken(path)
             run.config_path.write_bytes(config.path.read_bytes())
             for urdf in _urdfs(config):
-                (path / urdf.name).write_bytes(urdf.read_bytes())
+                (path / urdf.name).write_bytes(kept_bytes(urdf))
             if config.is_chain:
                 keep_shapes(described_arm(config), path)
         except OSError as error:

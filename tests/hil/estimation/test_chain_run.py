@@ -16,7 +16,7 @@ from hil.errors import ConfigError
 from hil.estimation.calibrate import AddedMass, calibrate_runs
 from hil.estimation.chain_estimate import unmoved
 from hil.estimation.changes.diff import diff_runs
-from hil.estimation.compare import compare_run
+from hil.estimation.comparison.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimation.unsettled.estimate import estimate_unsettled
 from hil.estimator.chain.model.dynamics import inverse_dynamics

@@ -8,7 +8,7 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimation.chain_compare import compare_chain, worst_chain_error
+from hil.estimation.comparison.chain_compare import compare_chain, worst_chain_error
 from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
 from hil.estimation.truth import true_parameters
@@ -97,7 +97,7 @@ def all_methods(
     length = link_length(config)
     yield from compare_peers(period, length, config.arm.gravity)
     if mujoco:
-        from hil.estimation.mujoco_peer import fit_with_mujoco
+        from hil.estimation.comparison.mujoco_peer import fit_with_mujoco
 
         if length is None and period.joints == 2:
             raise ConfigError("mujoco.sysid needs the length of link 1: add length_1 under [known].")
