@@ -311,7 +311,7 @@ def _astray(
     if set(drawn.kinds) & SHIFTED:
         return wrong
     if config.stabiliser is None:
-        count = _same_plan(own["goal"][:count], undisturbed["goal"][:count])
+        count = _same_plan(own[:count], undisturbed[:count])
     most = ASTRAY_RAD + ASTRAY_SHARE * float(np.ptp(undisturbed["position"]))
     wrong[:count] = np.abs(own["position"][:count] - undisturbed["position"][:count]) > most
     return wrong
@@ -322,7 +322,8 @@ def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
 
     Later another plan is played: a disturbed period is no repetition of the one before, so one more is needed.
     """
-    other = np.abs(own - undisturbed) > OBEYED * max(float(np.abs(undisturbed).max()), 1.0)
+    largest = np.abs(undisturbed["goal"][undisturbed["driven"]]).max(initial=1)
+    other = np.abs(own["goal"] - undisturbed["goal"]) > OBEYED * largest
     lasting = np.convolve(other, np.ones(LASTING_MS), "valid") > LASTING_MS - GAP_MS
     return int(np.argmax(lasting)) if lasting.any() else own.size
 
