@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
@@ -143,8 +143,9 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
         yield
     except BaseException as stopped:
         if not run.discard_if_unused():
-            for line in _how_to_go_on(stopped, run, command, shown):
-                stopped.add_note(line)
+            with suppress(Exception):  # a hint must never take the place of what stopped the arm, and of its torque
+                for line in _how_to_go_on(stopped, run, command, shown):
+                    stopped.add_note(line)
         raise
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from hil.errors import HilError
 from hil.estimation.settled_period import settled_period
+from hil.estimator.errors import EstimationError
 from hil.next_step import next_step
 from hil.plan.plan import IDENTIFY
 from hil.runs.recording import load_samples
@@ -44,7 +45,7 @@ def can_be_estimated(path: Path) -> bool:
         if IDENTIFY not in facts.segments:
             return False
         settled_period(config, facts, load_samples(run.samples_path, len(config.joints)), IDENTIFY)
-    except (HilError, ValueError):
+    except (HilError, EstimationError, ValueError):
         return False
     return True
 
