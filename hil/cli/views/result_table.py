@@ -19,9 +19,6 @@ from hil.results.result import Result, SettledResult, ShootingResult
 _NOTHING = 1e-9
 """Fraction of a value below which a truth is rounding error, so that a relative error means nothing."""
 
-_SHAPES = ("stribeck_rise", "stribeck_velocity")
-"""Parameters that are unknown where their standard error exceeds them. Others may be zero, and are then known to be."""
-
 _MOST_NAMED = 3
 """Number of models tried up to which all are named."""
 
@@ -98,18 +95,24 @@ def _parameters(result: SettledResult) -> Table:
 
 
 def _undetermined(result: SettledResult) -> list[str]:
-    """Name the values that the motion says nothing about, so that nobody takes them for measured ones."""
+    """Name the values that this motion hardly determines, so that nobody takes them for measured ones."""
+    known = {**result.parameters, **result.extra}
     names = [
         name
-        for name, entry in {**result.parameters, **result.extra}.items()
-        if not math.isfinite(entry.std) or (kind_of(name) in _SHAPES and entry.std > abs(entry.value))
+        for name, entry in known.items()
+        if not math.isfinite(entry.std) or (name in result.extra and _may_be_absent(name, entry))
     ]
     if not names:
         return []
-    return [
-        f"Not determined by this motion: {', '.join(names)}. Their values mean nothing by themselves; what the motion "
-        "shows of friction at low speed is in all of its terms together."
-    ]
+    return [f"Not determined by this motion (its effect is within a standard error of none): {', '.join(names)}."]
+
+
+def _may_be_absent(name: str, entry: Quantity) -> bool:
+    """Whether a term's distance from no effect is below its standard error."""
+    kind = kind_of(name)
+    if kind == "stribeck_velocity":  # no velocity stands for no effect
+        return entry.std > abs(entry.value)
+    return kind in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
 
 
 def _constant_std(result: SettledResult, name: str) -> float:
@@ -133,16 +136,6 @@ def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
         percent = "-" if is_nothing else f"{100 * error / abs(truth):+.3f}"
         cells += [f"{truth:.5g}", percent, f"{error / counted:+.1f}" if counted > 0 else "-"]
     return cells
-
-
-def _undetermined(result: SettledResult) -> list[str]:
-    """Further terms that this motion hardly determines: their distance from no effect is below their standard error."""
-    names = [
-        name
-        for name, entry in result.extra.items()
-        if kind_of(name) in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
-    ]
-    return [f"Not determined by this motion (within a standard error of none): {', '.join(names)}."] if names else []
 
 
 def _fit(result: SettledResult) -> list[str]:
