@@ -31,7 +31,7 @@ def print_result(result: SettledResult, config: Config, run: Path, console: Cons
     print_fitting(console, _parameters(result))
     physical = [] if result.physical is None else physical_lines(result.physical)
     told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
-    told = (*_undetermined(result), *told, *_torque_constants(result, config), *physical)
+    told = (*told, *_torque_constants(result, config), *physical)
     for line in (*told, *_next(result, run)):
         say(console, line)
 

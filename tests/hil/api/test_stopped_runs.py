@@ -28,7 +28,8 @@ def test_a_hint_that_fails_leaves_the_stop_as_it_is(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(experiment, "_how_to_go_on", fail)
     stop = SafetyStop("It has lost its torque.", Cause.TORQUE_OFF)
     stop.add_note("Torque is off on all 2 servos, read back.")
-    with pytest.raises(SafetyStop) as caught, experiment._discarding(_Run(), Path("arm.toml")):  # type: ignore[arg-type]
+    run, arm = _Run(), Path("arm.toml")
+    with pytest.raises(SafetyStop) as caught, experiment._discarding(run, "identify", arm):  # type: ignore[arg-type]
         raise stop
     assert caught.value is stop and caught.value.__notes__ == ["Torque is off on all 2 servos, read back."]
 
