@@ -276,3 +276,21 @@ def test_lag_and_scale_explain_part_of_a_jump(moved: float, velocities: tuple[fl
     change = abs(velocities[1] - velocities[0])
     known = LAG_S * change + SCALE * abs(moved) + CURVED * 0.01 * change + 0.001 * abs(velocities[1])
     assert steps == [(pytest.approx(abs(moved - 0.005 * sum(velocities)) - known), 0.01)]
+
+
+def test_the_long_memory_takes_every_sample_of_100_hz() -> None:
+    look = Consistency()
+    for index in range(3):
+        look.look(0.01 * index, 1.0, 0.01)
+        assert look._long.far == pytest.approx(0.01 * index, rel=0.02)
+
+
+def test_a_velocity_that_was_always_a_tenth_too_high_is_more_than_a_servo_s_error() -> None:
+    assert seen_after(400, lambda now: learnt_motion(now)[0], lambda now: 1.12 * learnt_motion(now)[1]) < math.inf
+
+
+def test_an_interval_longer_than_a_memory_leaves_nothing_of_what_was_before() -> None:
+    memory = _Memory(SHORT_S, 0.02)
+    memory.add(1.0, 0.5, 2.0, 0.1, 0.3, 0.2)
+    memory.add(0.25, 0.125, 3.0, 2 * SHORT_S, 0.0, 0.0)
+    assert (memory.far, memory.apart, memory.mean, memory._unknown) == (0.25, 0.125, 3.0, 0.0)

@@ -359,3 +359,17 @@ def test_the_status_of_one_joint_among_others_without_one(arm: Arm) -> None:
     with pytest.raises(SafetyStop, match=r"Joint 'elbow'.* has lost its torque") as stop:
         Guard(config).look(off)
     assert stop.value.cause is Cause.TORQUE_OFF
+
+
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize(("beyond", "stops"), [(0.1, False), (0.2, True)])
+def test_an_arm_that_a_run_left_beyond_either_limit_may_start_a_little_outside(
+    arm: Arm, side: int, beyond: float, stops: bool
+) -> None:
+    limits = arm().joints[0].position_limit
+    outside = STILL._replace(position=(limits[side] + (beyond if side else -beyond), 0.0))
+    guard = Guard(arm(), left_by_a_run=True)
+    if stops:
+        assert look(guard, outside) is Cause.POSITION
+    else:
+        guard.look(outside)
