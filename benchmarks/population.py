@@ -11,7 +11,7 @@ beyond_limit          arms that overshot a position limit by more than hil.dry_r
 yes, yes_current, yes_pwm   share with the verdict "yes": of all arms, those with current sensors, voltage-driven ones
 yes_but_wrong         share of the "yes" with an inertia, gravity or friction parameter off by more than 2 % and by more
                       than 3 standard errors. All torques are in units of the first joint's torque constant; warming
-                      friction is evaluated in the middle of the fitted multisine
+                      friction is evaluated in the middle of the fitted periods
 worst_percent_of_yes  largest such error of a "yes" [%]
 held_out_percent      largest held-out prediction error among the "yes", and its median [% of motion RMS]
 held_out_as_fitted_percent   the same with friction as it was in the fitted motion, where it has changed since: the
@@ -172,11 +172,13 @@ def _predicted(config: Config, at: np.void) -> float:
 
 
 def _truth(config: Config, folder: Path) -> dict[str, float]:
-    """True parameters in the middle of the fitted multisine: friction falls while grease warms."""
+    """True parameters in the middle of the fitted periods: friction falls while grease warms."""
     truth = true_parameters(config)
     assert truth is not None and config.fake is not None
     samples = load_samples(folder / "samples.npy", len(config.joints))
-    fitted = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == 0)
+    played = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == 0)
+    # Only the last periods of the multisine are fitted, once the motion has settled.
+    fitted = played & (samples["period"] > samples["period"][played].max() - config.experiment.periods)
     now = base_parameters(config.fake.arm, float(np.median(samples["time_before_write"][fitted])))
     warm = base_parameters(config.fake.arm)
     return {name: value + now[name] - warm[name] for name, value in truth.items()}

@@ -75,7 +75,6 @@ class Kind(StrEnum):
     OBSTACLE = "obstacle"
     SNAG = "snag"
     LOAD_CHANGED = "load_changed"
-    CREEPING_HORN = "creeping_horn"
     FADING = "fading"
     IDS_SWAPPED = "ids_swapped"
     SUSPENDED = "suspended"
@@ -95,7 +94,6 @@ ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED, Kind.GRIPPED, Kin
     Kind.OBSTACLE,
     Kind.SNAG,
     Kind.LOAD_CHANGED,
-    Kind.CREEPING_HORN,
     Kind.FADING,
 }
 ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD, Kind.GOAL_FIGHT})

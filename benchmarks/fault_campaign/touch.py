@@ -64,6 +64,8 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
         case Kind.IDS_SWAPPED if len(port.bus._servos) == 2:
             first, second = port.bus._servos
             ids = first.id, second.id
+            for servo in (first, second):  # with torque on, a servo refuses another ID
+                servo.write(64, b"\x00")
             return [_change(first, "ID", ids[1]), _change(second, "ID", ids[0])]
         case _:
             return [

@@ -107,7 +107,7 @@ class Witness:
                 case Kind.PUSHED:
                     felt[joint] = before + most * min(1.0, (now - each.start) / PUSH_RISES_S)
                     self._missing[joint] += before - felt[joint]
-                case Kind.SLIP | Kind.CREEPING_HORN:
+                case Kind.SLIP:
                     self._slip(joint, each, now)
                 case Kind.FADING:
                     felt[joint] = before * (1.0 - HALF * min(1.0, (now - each.start) / each.amount))
@@ -118,9 +118,6 @@ class Witness:
         return felt
 
     def _slip(self, joint: int, attack: Attack, now: float) -> None:
-        if attack.kind == Kind.CREEPING_HORN:
-            self._slips[joint], self._slipped[joint] = attack.amount, attack.amount * (now - attack.start)
-            return
         done = min(1.0, (now - attack.start) / SLIPS_S)
         self._slips[joint] = attack.amount / SLIPS_S if done < 1.0 else 0.0
         self._slipped[joint] = attack.amount * done
@@ -149,12 +146,14 @@ class Witness:
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         plant = self._plant
+        if self._next <= until:
+            told = [_told(servo) for servo in self._servos]  # no servo receives anything within this time
         while self._next <= until:
             plant.advance(self._next, self._driven_by(current, self._next) if self._disturbed else current)
             self._rows.append(
                 [
-                    (self._next, *_told(servo), *state)
-                    for servo, *state in zip(self._servos, plant.current, plant.position, plant.velocity, strict=True)
+                    (self._next, *each, *state)
+                    for each, *state in zip(told, plant.current, plant.position, plant.velocity, strict=True)
                 ]
             )
             self._next += STEP_S

@@ -22,6 +22,7 @@ from hil.estimator.options import CovarianceOptions
 
 DEFAULTS = CovarianceOptions()
 FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
+SENSITIVE = 1e7  # largest change of a sample, in units of the noise, per unit of a coordinate (RMS)
 VANISHED = 1e-3  # slope relative to its value below which a parameter has run into its floor
 
 
@@ -113,6 +114,8 @@ def robust_covariance(
         expected: what a prior has added to the normal equations (coordinates, coordinates); it is not inflated when the
             measurement errors are larger than independent ones.
     """
+    if is_unpredictable(at, samples):
+        return np.full((count, count), np.inf)
     prior = np.zeros_like(at.normal) if expected is None else (1.0 - FAINT_PRIOR) * expected
     seen, lengths, _, found = _measured(at, scatter, samples, structured, prior)
     covariance = np.zeros_like(at.normal)
@@ -128,12 +131,23 @@ def robust_covariance(
     return covariance[:count, :count]
 
 
+def is_unpredictable(at: Quadratic, samples: int) -> bool:
+    """Return whether the motion is so sensitive that its derivatives say nothing beyond the smallest changes.
+
+    Coordinates are of order 1. If a change of one in a million alters a sample by ten times the noise, the simulation
+    diverges; its standard errors would be tiny and mean nothing.
+    """
+    return bool(np.max(np.diag(at.normal), initial=0.0) > (samples * SENSITIVE**2))
+
+
 def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: float, expected: Array) -> Array:
     """Return by what factor (coordinates,) the data know each coordinate worse than independent errors would let them.
 
     That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
     correlated errors and model errors; the arguments are the same.
     """
+    if is_unpredictable(at, samples):
+        return np.ones(len(at.normal))
     seen, _, inverse, found = _measured(at, scatter, samples, structured, (1.0 - FAINT_PRIOR) * expected)
     factor = np.ones(len(at.normal))
     factor[seen] = np.maximum(np.diag(found) / np.maximum(np.diag(inverse), 1e-300), 1.0)

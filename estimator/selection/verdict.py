@@ -77,8 +77,9 @@ class Evidence:
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
     """Return the verdict on `estimate`."""
     explained = float(validation.residual_over_floor.max()) <= EXPLAINED
+    trust = _trust(validation, evidence)
     sentences = (
-        _noise(validation) if explained else _unexplained(estimate, validation, evidence),
+        _noise(validation) if explained else _unexplained(estimate, validation, evidence, trust),
         *(() if explained else _distorted(validation)),
         *_drifted(evidence.drift),
         *_predicted(evidence.held_out, evidence.held_out_as_fitted),
@@ -88,7 +89,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *_alike(validation),
         *_outliers(estimate, explained),
     )
-    return Verdict(_trust(validation, evidence), validation.weakest, sentences)
+    return Verdict(trust, validation.weakest, sentences)
 
 
 def _trust(validation: Validation, evidence: Evidence) -> Trust:
@@ -120,15 +121,17 @@ def _noise(validation: Validation) -> str:
     )
 
 
-def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence) -> str:
+def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence, trust: Trust) -> str:
     left = validation.residual_over_floor
     joint = int(np.argmax(left))
     error = float(validation.levels.model_error.max())
+    moves = "is not explained to the last step" if trust == "yes" else "moves in a way that the model cannot explain"
+    subject = f"The motion of joint {joint + 1}" if trust == "yes" else f"Joint {joint + 1}"
     said = (
-        f"Joint {joint + 1} moves in a way that the model cannot explain: its residual is {left[joint]:.1f} times the "
-        f"noise, a model error of {error:.2g} encoder steps RMS."
+        f"{subject} {moves}: its residual is {left[joint]:.1f} times the noise, a model error of {error:.2g} encoder "
+        "steps RMS."
     )
-    return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation)))
+    return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation, trust)))
 
 
 def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
@@ -151,14 +154,20 @@ def _in_words(part: str) -> str:
     return laws.get(part) or next(words for option, words in OPTIONS.items() if option == part)
 
 
-def _spoilt(validation: Validation) -> str:
+def _spoilt(validation: Validation, trust: Trust) -> str:
     """Return which parameters the model error may have biased, judged by their widened errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
+    if not worst and trust == "no":
+        return "It may bias all parameters, whatever their standard errors say."
     if not worst:
         return "It does not affect the parameters significantly: including it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
     listed = ", ".join(f"{name} ({100.0 * worst[name]:.2g} %)" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
+    if trust == "no":
+        return f"It may bias everything, most of all {listed}{more}."
+    if trust == "yes":
+        return f"The standard errors include it: {listed}{more}; the others are known to 2 % or better."
     return f"It may bias {listed}{more}; the others stay within 2 %."
 
 

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
@@ -76,7 +76,7 @@ def identify(
     def say(message: str) -> None:
         tell(Progress("experiment", message))
 
-    with _discarding(run, shown):
+    with _discarding(run, "identify", shown):
         if checked.experiment.pilot:
             from hil.pilot import identify_in_steps
 
@@ -112,7 +112,7 @@ def record(
         )
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
-    with _discarding(run, shown):
+    with _discarding(run, "record", shown):
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
     tell(Progress("experiment", torque))
     return load_run(run.path)
@@ -128,14 +128,14 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
     return read_result(path)
 
 
-def _how_to_go_on(stopped: BaseException, run: RunFolder, shown: Path) -> list[str]:
+def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:
     if isinstance(stopped, KeyboardInterrupt | StopRequested):
-        return after_a_stop(run, shown)
+        return after_a_stop(run, command, shown)
     return after_a_failure(run, shown) if isinstance(stopped, ExperimentError | DriverError) else []
 
 
 @contextmanager
-def _discarding(run: RunFolder, shown: Path) -> Iterator[None]:
+def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
     """Remove the run folder if the experiment fails before the first sample, so that it does not block the next
     attempt. After a stop, add to the exception what is kept and how to go on.
     """
@@ -143,8 +143,9 @@ def _discarding(run: RunFolder, shown: Path) -> Iterator[None]:
         yield
     except BaseException as stopped:
         if not run.discard_if_unused():
-            for line in _how_to_go_on(stopped, run, shown):
-                stopped.add_note(line)
+            with suppress(Exception):  # a hint must never take the place of what stopped the arm, and of its torque
+                for line in _how_to_go_on(stopped, run, command, shown):
+                    stopped.add_note(line)
         raise
 
 

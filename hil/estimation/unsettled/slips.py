@@ -24,12 +24,22 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
             '[columns] of --config ARM.toml: angles = "absolute"'
         )
     signs = suspect_signs(recordings)
-    if signs is not None and _is_clear(signs.residual, signs.residual_given):
+    if signs is None:
+        return
+    if _is_clear(signs.residual, signs.residual_given):
         columns = " and ".join(signs.signs.reversed_columns)
         raise CsvError(
             f"{source}: the sign of {columns} is reversed: with the sign changed, inverse dynamics leaves "
             f"{_percent(signs.residual)} of the torque unexplained instead of {_percent(signs.residual_given)}. Change "
             "the sign in the file, or exchange the columns."
+        )
+    # All torques reversed leave the same residual, but nothing has a negative inertia.
+    inertias = [name for name in signs.impossible if name.startswith("inertia")]
+    if inertias and signs.residual < WELL:
+        columns, names = " and ".join(signs.signs.reversed_columns), " and ".join(inertias)
+        raise CsvError(
+            f"{source}: the sign of {columns} is reversed: as given, {names} would be negative. Change the sign in the "
+            "file, or reverse the positions."
         )
 
 

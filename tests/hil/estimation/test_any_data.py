@@ -123,8 +123,9 @@ def test_data_that_is_doubtful_comes_with_a_warning(
 
 
 def test_torque_of_the_wrong_sign_is_an_error_that_says_where_to_look(capsys: pytest.CaptureFixture[str]) -> None:
-    assert estimate_pendulum(lambda columns: columns | {"tau1": -columns["tau1"]}) == 1
-    assert "check the units, signs and directions of torque and angle" in capsys.readouterr().err
+    assert estimate_pendulum(lambda columns: columns | {"tau1": -columns["tau1"]}) == 2
+    error = capsys.readouterr().err
+    assert "the sign of the torque of joint 1 is reversed: as given, inertia_1 would be negative" in error
 
 
 def estimate_pendulum(spoil: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> int:
