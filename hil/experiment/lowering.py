@@ -47,6 +47,7 @@ class Lowering:
         self._interval = interval
         self._way = WayHome(config, plan)
         self._thought = segment.thought
+        self._planned = [float(peak) for peak in np.max([each.peak_goal for each in plan.segments], axis=0)]
         self._stiffness, self._damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         self._fade = max(1, round(SETTLE_IN * plan.rate))
@@ -67,7 +68,7 @@ class Lowering:
         share = np.clip((count - np.arange(count)) / self._fade, 0.0, 1.0)
         self._feed = (share * torque).T
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
-        self._guard = _guard_of(self._config, self._path.position, velocity, self._interval)
+        self._guard = _guard_of(self._config, self._planned, self._path.position, velocity, self._interval)
         self._guard.holding(goal)
         return int(count)
 
@@ -90,8 +91,13 @@ class Lowering:
         self._guard.late(seconds)
 
 
-def _guard_of(config: Config, position: np.ndarray, velocity: np.ndarray, interval: float | None) -> Guard:
-    """A guard whose limits are widened just enough for the arm's position and velocity when it was stopped."""
+def _guard_of(
+    config: Config, planned: list[float], position: np.ndarray, velocity: np.ndarray, interval: float | None
+) -> Guard:
+    """A guard whose limits are widened just enough for the arm's position and velocity when it was stopped.
+
+    planned: largest goals of the experiment [A or V], so that currents have to follow as closely as they had to there.
+    """
     fastest = max(_FASTER * float(np.abs(velocity).max()), 2.0 * config.safety.lower_speed) + 0.5
     joints = [
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))
@@ -99,7 +105,7 @@ def _guard_of(config: Config, position: np.ndarray, velocity: np.ndarray, interv
     ]
     # A servo that has only lost its watchdog can still be lowered, which is better than to drop it.
     unwatched = config.safety.model_copy(update={"allow_no_watchdog": True})
-    return Guard(config.model_copy(update={"joints": joints, "safety": unwatched}), interval=interval)
+    return Guard(config.model_copy(update={"joints": joints, "safety": unwatched}), planned, interval=interval)
 
 
 def _allowing(joint: JointConfig, low: float, high: float, velocity: float) -> JointConfig:
