@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
-from benchmarks.bus.pty import responder_binary, served_pty
+from benchmarks.bus.served_pty import responder_binary, served_pty
 from benchmarks.machine import machine
 from hil.config.schema import load_config
 from hil.drivers.control_table import load_control_table

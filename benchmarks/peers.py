@@ -5,8 +5,8 @@
 `seconds`, `worst_relative_error` and `held_out_rms`, each by method, on the default demo recording (4,000 samples of
 two joints); under `textbook` the same on the arm of configs/fake_two_link_ideal.toml. The worst relative error is
 over inertias, gravity, viscous and Coulomb friction. The tuning of each peer is described in
-estimator/baselines/compare.py and hil/estimation/mujoco_peer.py; mujoco.sysid is included if it is installed (extra
-`peers`), with an initial guess within 50 % of the truth.
+estimator/baselines/compare.py and hil/estimation/comparison/mujoco_peer.py; mujoco.sysid is included if it is installed
+(extra `peers`), with an initial guess within 50 % of the truth.
 
 Times are medians of three runs of each method in one process, after one run for compilation, and exclude building the
 model and residual of mujoco.sysid. On the demo, `hil` fits the Stribeck friction and current lag of its configuration,
@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.machine import machine
 from hil.config.schema import load_config
-from hil.estimation.compare import OURS, OURS_PLAIN, MethodResult, compare_run
+from hil.estimation.comparison.compare import OURS, OURS_PLAIN, MethodResult, compare_run
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
 

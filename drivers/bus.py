@@ -6,13 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from hil.drivers.control_table import ControlTable, load_control_table, model_names
-from hil.drivers.errors import (
-    DriverError,
-    ServoFault,
-    ServoRefused,
-    TorqueNotOff,
-    WrongModel,
-)
+from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel
 from hil.drivers.exchange import HOST_S, Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.packet import ALERT, HardwareError
@@ -23,7 +17,9 @@ from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
 from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_span
 from hil.drivers.sync_read import Answer, one_each
-from hil.drivers.torque_off import TorqueOff, cut_torque, disarm_watchdogs, signals_held_back
+from hil.drivers.torque_off import TorqueOff, cut_again, cut_torque, disarm_watchdogs, signals_held_back, was_rebooted
+
+__all__ = ["CHECK_S", "BusConfig", "ServoBus"]
 
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
@@ -104,6 +100,8 @@ class ServoBus:
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
         self._watchdog = 0.0
+        self._armed: set[Joint] = set()
+        """Servos whose Bus Watchdog was armed and not switched off since."""
         self._last_answers: Sequence[Answer] = ()
         self.torque_off_report: TorqueOff | None = None
 
@@ -394,6 +392,7 @@ class ServoBus:
             servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
             if watched:
                 servo.write("Bus Watchdog", ticks)
+                self._armed.add(joint)
         for joint, servo in self._servos.items():
             try:
                 servo.write("Torque Enable", 1)
@@ -416,12 +415,30 @@ class ServoBus:
                 if answer is None or len(answer) == 1
             }
             confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
+            fell_silent = {joint: self._servos[joint] for joint in confirmed if joint in silent & self._armed}
+            rebooted = frozenset(joint for joint, servo in fell_silent.items() if was_rebooted(servo))
             watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
             disarm_watchdogs(watched, interrupts)
-            self.torque_off_report = TorqueOff(confirmed, unconfirmed, frozenset(self._without_watchdog))
+            self._armed.difference_update(watched)
+            unwatched = frozenset(self._without_watchdog)
+            self.torque_off_report = TorqueOff(confirmed, unconfirmed, unwatched, rebooted=rebooted)
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report
+
+    def confirm_later(self, drive: Joint) -> bool:
+        """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.
+
+        Returns whether there was anything to do; `torque_off_report` then counts it as confirmed. Raises DriverError if
+        it still does not answer.
+        """
+        report = self.torque_off_report
+        if report is None or drive not in [joint for joint, _ in report.unconfirmed]:
+            return False
+        rebooted = cut_again(self._servos[drive], armed=drive in self._armed)
+        self._armed.discard(drive)
+        self.torque_off_report = report.with_later(drive, rebooted=rebooted)
+        return True
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

@@ -16,6 +16,23 @@ DriverError
 └── TorqueNotOff        torque off could not be confirmed for a servo
 """
 
+__all__ = [
+    "BusShared",
+    "DriverError",
+    "NoReply",
+    "NotPermitted",
+    "PortLost",
+    "PortNotOpened",
+    "ServoFault",
+    "ServoRefused",
+    "TorqueHeld",
+    "TorqueNotOff",
+    "UnknownModel",
+    "WrongModel",
+    "WrongReply",
+    "WrongSetting",
+]
+
 
 class DriverError(Exception):
     """Base class of all errors between the computer and the servos.

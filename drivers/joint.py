@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from hil.drivers.servo_model import FULL_PWM_TICKS, VELOCITY_UNIT, Mode, ServoModel
 
+__all__ = ["Joint", "SecondServo"]
+
 
 class SecondServo(NamedTuple):
     """Another servo on the same joint.

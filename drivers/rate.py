@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 from hil.drivers.clock import Clock
 
+__all__ = ["FixedRate", "Tick"]
+
 
 class Tick(NamedTuple):
     """One deadline of a fixed rate.

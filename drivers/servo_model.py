@@ -13,6 +13,21 @@ from typing import NamedTuple
 
 from hil.drivers.errors import UnknownModel
 
+__all__ = [
+    "BAUD_RATES",
+    "FULL_PWM_TICKS",
+    "RETURN_DELAY_UNIT",
+    "SERVO_MODELS",
+    "VELOCITY_UNIT",
+    "VOLTAGE_UNIT",
+    "WATCHDOG_UNIT",
+    "Mode",
+    "Published",
+    "ServoModel",
+    "Stall",
+    "servo_model",
+]
+
 VELOCITY_UNIT = 0.229 * 2 * math.pi / 60
 """Velocity per tick of Present Velocity [rad/s]."""
 

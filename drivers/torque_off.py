@@ -16,7 +16,7 @@ import signal
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType
 
 from hil.drivers.errors import DriverError, PortLost
@@ -45,17 +45,47 @@ class TorqueOff:
     confirmed: joints whose servos were read back as off.
     unconfirmed: the other joints, each with the reason.
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
+    later: confirmed joints whose servos did not answer at first.
+    rebooted: confirmed joints whose servos had lost the watchdog that was armed before torque came on.
     """
 
     confirmed: tuple[Joint, ...]
     unconfirmed: tuple[tuple[Joint, str], ...]
     unwatched: frozenset[Joint] = frozenset()
+    later: frozenset[Joint] = frozenset()
+    rebooted: frozenset[Joint] = frozenset()
+
+    def with_later(self, joint: Joint, *, rebooted: bool) -> "TorqueOff":
+        """The report once the servo of an unconfirmed joint has answered again and was read back as off."""
+        return replace(
+            self,
+            confirmed=(*self.confirmed, joint),
+            unconfirmed=tuple(each for each in self.unconfirmed if each[0] != joint),
+            later=self.later | {joint},
+            rebooted=self.rebooted | ({joint} if rebooted else set()),
+        )
 
     def __str__(self) -> str:
+        return " ".join((self._outcome(), *self._answers()))
+
+    def _answers(self) -> Iterator[str]:
+        """Sentences about servos that were silent or were rebooted, and have answered since."""
+        for joint in self.confirmed:
+            if joint in self.later:
+                yield f"{joint.title} did not answer at first, and answers again."
+            if joint in self.rebooted:
+                yield (
+                    f"{joint.title} was rebooted: its Bus Watchdog is no longer armed. Check its supply and its "
+                    "connector; a dip of the voltage is enough."
+                )
+
+    def _outcome(self) -> str:
         if not self.unconfirmed:
             servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
             return f"Torque is off on {servos}, read back."
         names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
+        if self.confirmed:
+            names = f"{names} It is off, read back, on {', '.join(map(str, self.confirmed))}."
         alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
         if alone:
             return (
@@ -126,6 +156,29 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more."""
     for servo in servos.values():
         _uninterrupted(lambda servo=servo: servo.write("Bus Watchdog", 0), interrupts)  # type: ignore[misc]
+
+
+def cut_again(servo: Servo, *, armed: bool) -> bool:
+    """Cut the torque of a servo that did not answer before; return whether it was rebooted. Raises as `Servo.write`.
+
+    armed: its Bus Watchdog was armed before torque came on; it is switched off.
+    """
+    if servo.read("Torque Enable"):
+        servo.write("Torque Enable", 0)
+    rebooted = armed and was_rebooted(servo)
+    if armed:
+        servo.write("Bus Watchdog", 0)
+    return rebooted
+
+
+def was_rebooted(servo: Servo) -> bool:
+    """Whether a servo has lost the watchdog that it was armed with; False if it does not answer.
+
+    A late reply to an earlier question would be taken for the answer, so another register is read before and after.
+    """
+    with suppress(DriverError):
+        return servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id
+    return False
 
 
 def _confirm(servo: Servo, attempts: int | None, interrupts: list[BaseException]) -> Exception | None:

@@ -11,6 +11,18 @@ EstimationError
 └── PeriodicityError      the simulated arm does not settle into periodic motion
 """
 
+__all__ = [
+    "ConvergenceError",
+    "EstimationError",
+    "ExcitationError",
+    "ModelError",
+    "PeriodicityError",
+    "RecordingError",
+    "ShapeError",
+    "StandstillError",
+    "UnidentifiableError",
+]
+
 
 class EstimationError(Exception):
     """The root: catch this to catch everything that the estimator raises."""

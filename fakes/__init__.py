@@ -1,5 +1,7 @@
 """Simulated servos at byte level: control tables, a half-duplex bus, and a simulated arm behind it."""
 
+__all__ = ["allow_code", "register", "register_for"]
+
 
 def register() -> None:
     """Register the pyserial URL `fake://PATH/TO/ARM.toml`; see `hil.fakes.protocol_fake`. Safe to call twice."""

@@ -23,6 +23,8 @@ from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, 
 from hil.fakes.servo.servo import EmulatedServo
 from hil.toml_errors import Described, describe
 
+__all__ = ["DescriptionError", "FakeArm", "FakeServo", "beside", "found_beside", "load_fake", "make_bus"]
+
 
 class DescriptionError(ValueError):
     """The [fake] table is unreadable or invalid. The message names the file, the key, the value and what is allowed."""

@@ -23,6 +23,8 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.description import FakeArm, make_bus
 from hil.fakes.remote_hand import HandSocket
 
+__all__ = ["Counts", "LinkError", "PtyServer", "ServerClock"]
+
 OVERRUN_S = 1e-3
 """A reply delivered later than this after it was due counts as a real-time overrun [s]."""
 

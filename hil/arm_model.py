@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hil.estimator.models.friction import direction, dry_level, viscous
 
+__all__ = ["ArmModel", "JointFacts"]
+
 Array = NDArray[np.float64]
 
 _CHUNK = 16384  # samples per block, chosen so that temporaries stay in the processor's cache

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hil.arm_model import ArmModel, Array
+from hil.estimator.chain.model.tilt import TILT, tilted
 
 _INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))
 
@@ -19,7 +20,8 @@ class Geometry:
     """Joint geometry, for all joints in order.
 
     rotation, translation: pose of the joint's frame relative to the previous link's frame at angle zero: (joints, 3, 3)
-    and (joints, 3) [m]. axis: joint axis in its own frame (joints, 3). gravity: in the base frame (3,) [m/s^2].
+    and (joints, 3) [m]. axis: joint axis in its own frame (joints, 3). gravity: in the frame of the base as
+    configured, before any identified tilt (3,) [m/s^2].
     """
 
     rotation: Array
@@ -49,12 +51,17 @@ class ChainArmModel(ArmModel):
             columns.append(self._torque(angles, np.zeros_like(angles), unit, np.zeros(3)))
         return np.asarray(np.moveaxis(np.stack(columns), (0, 1), (-1, -2)))
 
+    @property
+    def base_gravity(self) -> Array:
+        """Gravity in the frame of the base (3,) [m/s^2], with the identified tilt."""
+        return tilted(self.geometry.gravity, *(self.values.get(name, 0.0) for name in TILT))
+
     def _rigid_body(self, q: Array, dq: Array, ddq: Array) -> Array:
-        return self._torque(q, dq, ddq, self.geometry.gravity)
+        return self._torque(q, dq, ddq, self.base_gravity)
 
     def _gravity(self, q: Array) -> Array:
         nothing = np.zeros_like(q)
-        return self._torque(q, nothing, nothing, self.geometry.gravity)
+        return self._torque(q, nothing, nothing, self.base_gravity)
 
     def _torque(self, q: Array, dq: Array, ddq: Array, gravity: Array) -> Array:
         """Joint torques (joints, ...) [N m] without friction; q, dq and ddq have the joints first."""

@@ -24,6 +24,25 @@ hil.estimator.errors.EstimationError  1   the recording does not determine the p
 import signal
 from enum import Enum
 
+__all__ = [
+    "Cause",
+    "ConfigError",
+    "CsvError",
+    "DidNotMove",
+    "ExperimentError",
+    "ExportError",
+    "HilError",
+    "MissingExtra",
+    "NoSafeTorque",
+    "NotSettled",
+    "RecordingCutShort",
+    "ResultError",
+    "RunFolderError",
+    "SafetyStop",
+    "SchedulerLost",
+    "StopRequested",
+]
+
 
 class Cause(Enum):
     """What the guard detected. If measurement and drive still work, the stop may brake first."""

@@ -25,10 +25,7 @@ def _read(path: Path) -> dict[str, Any]:
     """The object in a run folder's result.json, or in the JSON or TOML file `path`. Raises ResultError."""
     file = _file(path)
     if path.is_dir() and not file.is_file():
-        raise ResultError(
-            f"{path} has no result.json: its identification did not finish. If it has samples.npy, estimate it "
-            f"first: {command('estimate', path)}"
-        )
+        raise ResultError(_no_result(path))
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -46,6 +43,23 @@ def _read(path: Path) -> dict[str, Any]:
             f"{'a newer' if _newer(result['schema']) else 'another'} version. Install that version, or estimate again."
         )
     return result
+
+
+def _no_result(folder: Path) -> str:
+    """What a folder without a result lacks, and the command that helps."""
+    if (folder / "samples.npy").is_file():
+        return (
+            f"{folder} has no result.json: its identification did not finish. Estimate it first: "
+            f"{command('estimate', folder)}"
+        )
+    below = sorted(each.parent for each in folder.glob("*/result.json"))
+    if below:
+        listed = command("runs", folder)
+        return f"{folder} is not a run folder, but holds some: did you mean {below[-1]}? List them: {listed}"
+    return (
+        f"{folder} is not a run folder: it has neither a result nor a recording. {command('identify', 'ARM.toml')} "
+        f"creates one; list those that you have: {command('runs')}"
+    )
 
 
 def read_result(path: Path) -> Result:

@@ -2,10 +2,13 @@
 
 import shlex
 
+NEXT = "Next: "
+"""How the line begins that names the next command."""
+
 
 def next_step(*words: object) -> str:
     """The line that names the next command, quoted for a shell."""
-    return f"Next: {command(*words)}"
+    return f"{NEXT}{command(*words)}"
 
 
 def command(*words: object) -> str:

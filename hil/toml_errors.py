@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from hil.unit_hints import allowed_by, in_other_units, unit_of
+
 UNSAID = "~"
 """Prefix of alternatives that pydantic adds to a location although they do not appear in the file."""
 
@@ -22,6 +24,7 @@ _EXPECTED = {
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
 }
+_BOUNDS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 
 
 class _PlainErrors(type(BaseModel)):  # type: ignore[misc]  # pydantic's metaclass has no public name
@@ -103,19 +106,32 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
         about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
         return f"{about}: {context['error']}" if key else str(context["error"])
     message = _EXPECTED.get(kind) or _constraint(kind, context, detail["input"]) or str(detail["msg"])
-    return f"{key} = {_shown(detail['input'])}: {message}"
+    return f"{key} = {_shown(detail['input'])}: {message}{_unit_hint(detail, root)}"
+
+
+def _unit_hint(detail: Any, root: type[BaseModel]) -> str:
+    """Name the unit in which a number beyond its bounds would make sense, and what to write."""
+    value = detail["input"]
+    if detail["type"] not in _BOUNDS or isinstance(value, bool) or not isinstance(value, int | float):
+        return ""
+    keys = [part for part in detail["loc"] if isinstance(part, str) and not part.startswith(UNSAID)]
+    field = fields_of(_table(detail["loc"], root)).get(keys[-1]) if keys else None
+    if field is None:
+        return ""
+    hint = in_other_units(value, unit_of(field.description), allowed_by(field))
+    return f". {hint}" if hint else ""
 
 
 def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None:
     match kind:
         case "greater_than":
-            return f"must be greater than {context['gt']}"
+            return f"must be greater than {_bound(context['gt'])}"
         case "greater_than_equal":
-            return f"must be at least {context['ge']}"
+            return f"must be at least {_bound(context['ge'])}"
         case "less_than":
-            return f"must be less than {context['lt']}"
+            return f"must be less than {_bound(context['lt'])}"
         case "less_than_equal":
-            return f"must be at most {context['le']}"
+            return f"must be at most {_bound(context['le'])}"
         case "multiple_of":
             return f"must be a multiple of {context['multiple_of']}"
         case "enum":
@@ -123,7 +139,7 @@ def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None
             near = difflib.get_close_matches(repr(value), known.split(", "), n=1)
             return f"did you mean {near[0]}? Known: {known}" if near else f"must be one of {known}"
         case "literal_error":
-            return f"must be one of {context['expected']}"
+            return f"must be one of {context['expected']}{_in_thousands(context['expected'], value)}"
         case "string_too_short":
             return "must not be empty"
         case "string_too_long":
@@ -133,6 +149,31 @@ def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None
         case "too_long":
             return f"may have at most {context['max_length']} entries"
     return None
+
+
+def _in_thousands(expected: str, value: object) -> str:
+    """Name the listed number that is meant if it was given in thousands or millions, such as a rate in Mbaud."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return ""
+    for name, factor in (("thousands", 1e3), ("millions", 1e6)):
+        meant = f"{value * factor:.0f}"
+        if meant in expected.replace(",", "").split():
+            return f". If it is in {name}, write {meant}"
+    return ""
+
+
+def not_toml(path: Path, error: Exception) -> str:
+    """What to say of a file that the TOML parser rejects."""
+    other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
+    kind = other.get(path.suffix.lower())
+    if kind is None:
+        return f"{path}: not valid TOML: {error}."
+    return f"{path}: it is {kind}, by its name; hil's files are TOML. `hil init` writes one."
+
+
+def _bound(value: float) -> str:
+    """Write 12.566370614359172 as 12.57 and leave 100 and 0.05 as they are."""
+    return f"{value:.4g}" if len(str(value)) > 9 else str(value)
 
 
 def _key(location: Sequence[str | int]) -> str:
@@ -151,28 +192,42 @@ def _shown(value: object) -> str:
 
 
 def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
+    names = [name for name, field in fields_of(_table(location, root)).items() if not field.exclude]
+    close = difflib.get_close_matches(str(location[-1]), names, n=1)
+    return f"did you mean {close[0]}?" if close else f"allowed: {', '.join(names)}"
+
+
+def fields_of(model: Any) -> dict[str, Any]:
+    """The fields of a table by the keys that stand in the file."""
+    return {field.alias or name: field for name, field in model.model_fields.items()}
+
+
+def _table(location: Sequence[str | int], root: type[BaseModel]) -> Any:
+    """Return the model of the table in which the last part of a location stands."""
+    keys = [place for place, part in enumerate(location) if isinstance(part, str) and not part.startswith(UNSAID)]
+    last = max(keys, default=0)
     model: Any = root
     free = False  # whether the next part is a key of the user's own
-    for part in location[:-1]:
+    for part in location[:last]:
         if not isinstance(part, str) or part.startswith(UNSAID):
             continue
         if free:
             free = False
             continue
-        fields = {field.alias or name: field for name, field in model.model_fields.items()}
+        fields = fields_of(model)
+        if part not in fields:  # pydantic's name of an alternative
+            continue
         free = get_origin(fields[part].annotation) is dict
-        model = _model_in(fields[part].annotation)
-    names = [field.alias or name for name, field in model.model_fields.items() if not field.exclude]
-    close = difflib.get_close_matches(str(location[-1]), names, n=1)
-    return f"did you mean {close[0]}?" if close else f"allowed: {', '.join(names)}"
+        model = model_in(fields[part].annotation)
+    return model
 
 
-def _model_in(annotation: Any) -> Any:
+def model_in(annotation: Any) -> Any:
     """The pydantic model inside `list[Model]`, `tuple[Model, ...]` or `Model | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in get_args(annotation):
-        found = _model_in(argument)
+        found = model_in(argument)
         if found is not None:
             return found
     return None

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import serial
+from threadpoolctl import threadpool_limits
 
 from hil.config.schema import Config, load_config
 from hil.estimation.settled_estimate import estimate_run
@@ -19,6 +20,13 @@ from tests.support.paths import CONFIGS
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the tests that take a minute each, so that no worker is left with one at the end."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread() -> Iterator[None]:
+    """As in `hil.cli.app.main`, which comes too late here: on two cores, two workers would wait for each other."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

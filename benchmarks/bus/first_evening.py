@@ -1,6 +1,6 @@
 """docs/first_evening.md typed word by word against a fake arm, behind a pseudo-terminal or in virtual time.
 
-    python -m benchmarks.first_evening --out /tmp/evening
+    python -m benchmarks.bus.first_evening --out /tmp/evening
 
 Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`; in
 virtual time nobody moves them, and init accepts that. It fails if a step fails, shows a traceback, or does not name the

@@ -1,6 +1,6 @@
 """`hil diff` on pairs of runs of one fake arm: changes found, and false alarms.
 
-    python -m benchmarks.wear --runs 6
+    python -m benchmarks.effects.wear --runs 6
 
 The arm is identified `--runs` times unchanged, and twice after each friction term of each joint has changed by 10 %.
 With --other-motion every run plays another excitation; without it, runs of the noiseless fake arms are identical.

@@ -75,6 +75,9 @@ class Kind(StrEnum):
     OBSTACLE = "obstacle"
     SNAG = "snag"
     LOAD_CHANGED = "load_changed"
+    FADING = "fading"
+    IDS_SWAPPED = "ids_swapped"
+    SUSPENDED = "suspended"
 
 
 ON_REPLIES = frozenset({Kind.HOLD, Kind.SPLIT, Kind.DROP, Kind.CUT, Kind.REPEAT, Kind.FLIP, Kind.COLLISION}) | {
@@ -91,6 +94,7 @@ ON_MOTORS = frozenset({Kind.WEAK, Kind.SATURATED, Kind.PUSHED, Kind.GRIPPED, Kin
     Kind.OBSTACLE,
     Kind.SNAG,
     Kind.LOAD_CHANGED,
+    Kind.FADING,
 }
 ON_INSTRUCTIONS = frozenset({Kind.DEAF, Kind.DEAF_TO_GOALS, Kind.TWICE_TOLD, Kind.GOAL_FIGHT})
 ON_TIME = frozenset({Kind.RIVAL, Kind.HICCUPS})

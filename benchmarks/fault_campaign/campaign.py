@@ -34,11 +34,15 @@ from hil.errors import HilError
 from hil.estimator.excitation.multisine import Multisine, design_multisine
 from hil.plan import plan as plan_module
 from hil.plan.plan import make_plan
+from hil.plan.stabiliser import must_balance
 from hil.runs.recording import load_samples
 from hil.setup import bus_rate
 
 AFTER_S = 0.5
 """Time for which the arm is observed after the program has ended [s]."""
+
+BALANCE_S = 1.2
+"""The last part of a run, in which an upright arm is balanced before its torque is cut [s]."""
 
 Document = dict[str, Any]
 STATE = "XDG_STATE_HOME"
@@ -118,7 +122,9 @@ def prepare(
 def inject(setting: Setting, seed: int, period: float = PERIOD_S) -> Outcome:
     """Draw faults and inject them into one run."""
     ready = prepare(setting, period)
-    drawn = draw(f"{setting.name} {setting.rate} {seed}", ready.undisturbed.ended, [j.id for j in ready.config.joints])
+    ended = ready.undisturbed.ended
+    balances = ended - BALANCE_S if must_balance(ready.config) else None
+    drawn = draw(f"{setting.name} {setting.rate} {seed}", ended, [j.id for j in ready.config.joints], balances)
     return inject_drawn(ready, drawn, seed)
 
 

@@ -14,6 +14,9 @@ PAIRS = 0.35
 TOGETHER_S = 0.3
 """Half of the pairs follow each other within this time [s]."""
 
+OFTEN = 0.25
+"""Share of the faults that meet the phase that is to be met often."""
+
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
@@ -115,6 +118,9 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.OBSTACLE: _FORGED | {LIMIT},
     Kind.SNAG: _FORGED | {LIMIT},
     Kind.LOAD_CHANGED: _FORGED | {LIMIT, POSE},
+    Kind.FADING: _FORGED | {LIMIT},
+    Kind.IDS_SWAPPED: _LOST_GOALS | {LIMIT, POSE, MIXED, ENCODER},
+    Kind.SUSPENDED: frozenset({PROGRAM, LATE}),
     FaultKind.LOST_REPLY: frozenset({SILENCE}),
     FaultKind.CORRUPTED_REPLY: _BYTES,
     FaultKind.TRUNCATED_REPLY: _BYTES,
@@ -140,6 +146,7 @@ _INSTRUCTIONS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTR
 UNHEARD = _INSTRUCTIONS | {
     Kind.DEAF,
     Kind.STALL,
+    Kind.SUSPENDED,
     Kind.KILLED,
     Kind.NEW_ID,
     Kind.NEW_BAUD,
@@ -152,7 +159,7 @@ UNHEARD = _INSTRUCTIONS | {
 }
 """Faults during which the program cannot reach a servo, so that the watchdog's timeout applies."""
 
-SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.HICCUPS, Kind.SPLIT, FaultKind.LATE_REPLY})
+SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SUSPENDED, Kind.HICCUPS, Kind.SPLIT, FaultKind.LATE_REPLY})
 """Faults after which the program may play its plan later than in an undisturbed run."""
 
 HARMLESS = frozenset({Kind.CLOCK_WRAP, Kind.CLOCK_SET, Kind.RAISED_LIMIT})
@@ -194,10 +201,15 @@ class Drawn:
         return " and ".join(told)
 
 
-def draw(seed: object, until: float, ids: Sequence[int]) -> Drawn:
-    """Draw one or two faults for a run that lasts `until` [s] undisturbed; the same seed gives the same faults."""
+def draw(seed: object, until: float, ids: Sequence[int], often_since: float | None = None) -> Drawn:
+    """Draw one or two faults for a run that lasts `until` [s] undisturbed; the same seed gives the same faults.
+
+    often_since: beginning of a phase that a quarter of the faults meet, although it is short [s].
+    """
     random = Random(f"drawn {seed}")
     first = random.uniform(0.0, until)
+    if often_since is not None and random.random() < OFTEN:
+        first = random.uniform(often_since, until)
     times = [first]
     if random.random() < PAIRS:
         close = first + random.uniform(0.0, TOGETHER_S)
@@ -267,6 +279,8 @@ def _amount(kind: Kind, field: str, random: Random) -> float:
         Kind.OBSTACLE: sign * random.uniform(0.5, 3.0),
         Kind.SNAG: random.uniform(0.3, 3.0),
         Kind.LOAD_CHANGED: sign * random.uniform(0.3, 2.0),
+        Kind.FADING: 10 ** random.uniform(-1.0, 1.0),
+        Kind.SUSPENDED: random.uniform(3.0, 12.0),
         Kind.ANSWERS_LESS: float(random.randrange(2)),
     }.get(kind, 0.0)
 

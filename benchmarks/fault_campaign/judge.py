@@ -163,7 +163,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
                 ("is beyond a limit", _beyond(config, joint, own), 1, GAP_MS),
                 (
                     "is not where it would be",
-                    _astray(drawn, joint, own, undisturbed.record[:, joint]),
+                    _astray(config, drawn, joint, own, undisturbed.record[:, joint]),
                     LASTING_MS,
                     GAP_MS,
                 ),
@@ -176,6 +176,20 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
         if fault.kind == FaultKind.CABLE_PULLED and fault.at < story.ended:
             found.append(("the cable was unplugged", fault.at))
     return [reason for reason in found if reason is not None]
+
+
+def overruled_ms(config: Config, drawn: Drawn, story: Story) -> float:
+    """Longest time for which a motor carried a current that the program had not commanded [ms]."""
+    time = story.record["time"][:, 0]
+    told = _Told(config, story.traffic, drawn.start)
+    longest = 0
+    for joint in range(len(config.joints)):
+        own = story.record[:, joint]
+        at = np.flatnonzero(told.disobeys(joint, time, own, 1.0 / config.experiment.rate) & own["driven"])
+        breaks = np.flatnonzero(np.diff(at) > GAP_MS)
+        for start, end in zip(at[np.r_[0, breaks + 1]], at[np.r_[breaks, at.size - 1]], strict=True) if at.size else ():
+            longest = max(longest, int(end - start) + 1)
+    return float(longest)
 
 
 def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int, gap_ms: int) -> Reason | None:
@@ -289,14 +303,29 @@ def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(outside | (np.abs(own["velocity"]) > 1.02 * fastest))
 
 
-def _astray(drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[Any]) -> NDArray[np.bool_]:
+def _astray(
+    config: Config, drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[Any]
+) -> NDArray[np.bool_]:
     count = min(own.size, undisturbed.size)
     wrong = np.zeros(own.size, bool)
     if set(drawn.kinds) & SHIFTED:
         return wrong
+    if config.stabiliser is None:
+        count = _same_plan(own[:count], undisturbed[:count])
     most = ASTRAY_RAD + ASTRAY_SHARE * float(np.ptp(undisturbed["position"]))
     wrong[:count] = np.abs(own["position"][:count] - undisturbed["position"][:count]) > most
     return wrong
+
+
+def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
+    """For how many milliseconds a servo was given the goals of the undisturbed run.
+
+    Later another plan is played: a disturbed period is no repetition of the one before, so one more is needed.
+    """
+    largest = np.abs(undisturbed["goal"][undisturbed["driven"]]).max(initial=1)
+    other = np.abs(own["goal"] - undisturbed["goal"]) > OBEYED * largest
+    lasting = np.convolve(other, np.ones(LASTING_MS), "valid") > LASTING_MS - GAP_MS
+    return int(np.argmax(lasting)) if lasting.any() else own.size
 
 
 def describe(verdict: Verdict) -> str:

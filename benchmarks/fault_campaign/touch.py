@@ -53,7 +53,7 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
         case Kind.KILLED:
             port.dead = True
             raise Killed
-        case Kind.STALL:
+        case Kind.STALL | Kind.SUSPENDED:
             port.clock.wait_until(port.clock.now() + attack.amount)
         case Kind.DISK_FULL:
             return [_fill_disk()]
@@ -61,6 +61,12 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
             return [_set_clock(attack.amount)]
         case Kind.SHADOWED:
             return _shadow(attack, port.bus._servos)
+        case Kind.IDS_SWAPPED if len(port.bus._servos) == 2:
+            first, second = port.bus._servos
+            ids = first.id, second.id
+            for servo in (first, second):  # with torque on, a servo refuses another ID
+                servo.write(64, b"\x00")
+            return [_change(first, "ID", ids[1]), _change(second, "ID", ids[0])]
         case _:
             return [
                 undo

@@ -9,6 +9,7 @@ nothing, and the run counts as one in which the fault was visible.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from scipy.optimize import least_squares
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.fakes.plants import motor
 from hil.fakes.plants.arm import Arm, Drive, Link
 from hil.fakes.plants.plant import make_plant
 
@@ -31,6 +33,17 @@ _FRICTION, _CENTRE, _TORQUE = np.log(5.0), np.log(2.0), np.log(1.25)
 _TILT_RAD = 0.2
 _EVALUATIONS = 6
 _STEP = 0.01  # of the finite differences
+_COARSE_S = 0.005
+"""Interval of the replies and commands in the search [s]; the arm it finds is then compared with all of them."""
+
+_COARSE_STEP_S = 2.5e-3
+"""Longest step of the simulation in the search [s]."""
+
+_CORRECTIONS = 3
+"""Steps of Newton's method on all replies, with the search's derivatives, that follow it."""
+
+_HOPELESS = 6.0
+"""Multiple of the largest difference of angles at which the search's arm is not followed up."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +80,26 @@ class Heard:
         )
 
     def until(self, end: float) -> "Heard":
-        early = self.time <= end
-        return Heard(self.time[early], self.angle[early], self.velocity[early], self.commanded_at, self.commands)
+        return self.at(np.flatnonzero(self.time <= end))
+
+    def at(self, index: NDArray[np.intp]) -> "Heard":
+        """Only the replies with these indices."""
+        return Heard(self.time[index], self.angle[index], self.velocity[index], self.commanded_at, self.commands)
+
+    def every(self, step: float) -> NDArray[np.intp]:
+        """Indices of the first reply in each `step` [s]."""
+        _, first = np.unique(np.floor((self.time - self.time[0]) / step), return_index=True)
+        return np.asarray(first, np.intp)
+
+    def averaged(self) -> "Heard":
+        """With one command between each two replies: the mean of what was commanded."""
+        begun = self.commanded_at < self.time[-1]
+        changes = np.concatenate((self.commanded_at[begun], self.time[-1:]))
+        sums = np.zeros((changes.size, self.commands.shape[1]))
+        sums[1:] = np.cumsum(self.commands[begun] * np.diff(changes)[:, None], axis=0)
+        edges = np.concatenate((changes[:1], self.time[self.time > changes[0]]))
+        until = np.column_stack([np.interp(edges, changes, each) for each in sums.T])
+        return Heard(self.time, self.angle, self.velocity, edges[:-1], np.diff(until, axis=0) / np.diff(edges)[:, None])
 
 
 def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
@@ -82,12 +113,12 @@ def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
     if not isinstance(arm, Arm) or any(joint.drive_mode is Mode.PWM for joint in config.joints) or told.time.size < 2:
         return False
     limits = _limits(len(arm.links), _UNDESCRIBED if config.arm.link_lengths is None else _DESCRIBED)
+    picked = told.every(_COARSE_S)
+    coarse = told.at(picked).averaged()
 
     def residuals(parameters: Array) -> Array:
-        angle, velocity = _played(arm, parameters, told)
-        return np.concatenate(
-            ((angle - told.angle).ravel() / SAME_RAD, (velocity - told.velocity).ravel() / SAME_RAD_S)
-        )
+        with mock.patch.object(motor, "LONGEST_STEP", _COARSE_STEP_S):
+            return _differences(_stick(arm), parameters, coarse)
 
     found = least_squares(
         residuals,
@@ -97,10 +128,34 @@ def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
         max_nfev=_EVALUATIONS,
         loss="soft_l1",
     )
-    angle, velocity = _played(arm, found.x, told)
-    far = float(np.abs(angle - told.angle).max())
-    off = float(np.sqrt(np.mean((velocity - told.velocity) ** 2, axis=0)).max())
-    return far <= SAME_RAD and off <= SAME_RAD_S
+    if np.abs(found.fun[: coarse.angle.size]).max() > _HOPELESS:
+        return False
+    parameters = found.x
+    slopes = np.column_stack([(residuals(found.x + _STEP * each) - found.fun) / _STEP for each in np.eye(limits.size)])
+    for _ in range(_CORRECTIONS + 1):
+        different = _differences(arm, parameters, told)
+        if _is_same(different, told):
+            return True
+        rows = different.reshape(2, *told.angle.shape)[:, picked].ravel()
+        parameters = np.clip(parameters - np.linalg.lstsq(slopes, rows, rcond=1e-3)[0], -limits, limits)
+    return False
+
+
+def _stick(arm: Arm) -> Arm:
+    """The arm with stiction in place of smooth friction, which would need short steps."""
+    drives = tuple(drive.model_copy(update={"coulomb_width": 0.0}) for drive in arm.drives)
+    return arm.model_copy(update={"drives": drives})
+
+
+def _differences(arm: Arm, parameters: Array, told: Heard) -> Array:
+    """Differences of angles, then of velocities, relative to those that are ordinary (2 n joints,)."""
+    angle, velocity = _played(arm, parameters, told)
+    return np.concatenate(((angle - told.angle).ravel() / SAME_RAD, (velocity - told.velocity).ravel() / SAME_RAD_S))
+
+
+def _is_same(different: Array, told: Heard) -> bool:
+    angle, velocity = different.reshape(2, *told.angle.shape)
+    return bool(np.abs(angle).max() <= 1.0 and np.sqrt(np.mean(velocity**2, axis=0)).max() <= 1.0)
 
 
 def _limits(links: int, range_of_masses: float) -> Array:

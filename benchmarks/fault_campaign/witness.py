@@ -19,6 +19,9 @@ GRIP_RAD_S = 0.1
 SLIPS_S = 0.05
 """Time in which a joint slips on its shaft [s]."""
 
+HALF = 0.5
+"""Share of its torque constant that a motor loses when its magnet overheats."""
+
 SOFT_RAD = 0.02
 """Way on which an obstacle, or a cable that snags, comes to its full force [rad]."""
 
@@ -106,6 +109,9 @@ class Witness:
                     self._missing[joint] += before - felt[joint]
                 case Kind.SLIP:
                     self._slip(joint, each, now)
+                case Kind.FADING:
+                    felt[joint] = before * (1.0 - HALF * min(1.0, (now - each.start) / each.amount))
+                    self._missing[joint] += before - felt[joint]
                 case _:
                     felt[joint] = before + most * self._resists(joint, each)
                     self._missing[joint] += before - felt[joint]
@@ -140,12 +146,14 @@ class Witness:
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         plant = self._plant
+        if self._next <= until:
+            told = [_told(servo) for servo in self._servos]  # no servo receives anything within this time
         while self._next <= until:
             plant.advance(self._next, self._driven_by(current, self._next) if self._disturbed else current)
             self._rows.append(
                 [
-                    (self._next, *_told(servo), *state)
-                    for servo, *state in zip(self._servos, plant.current, plant.position, plant.velocity, strict=True)
+                    (self._next, *each, *state)
+                    for each, *state in zip(told, plant.current, plant.position, plant.velocity, strict=True)
                 ]
             )
             self._next += STEP_S

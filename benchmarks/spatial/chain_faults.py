@@ -8,11 +8,15 @@ The faults are those of benchmarks/faults.py, injected into the whole command on
 record, which the program never sees, decides:
 
 can command     the faults are of kinds that leave commands and readings true (`COMMANDABLE`), the record shows no
-                servo that was silent, disobeyed or told something false, and nothing held the arm by force
-unsafe          current that lasted longer than the bound: 100 ms, or the servos' watchdog, after a servo was silent or
-                the cable unplugged; otherwise the time in which the arm is lowered, which is watched all the way.
-                Links that came closer to each other while motors drove them than in the undisturbed run, and touched.
-                A joint that went further beyond its limits meanwhile than a lowering may
+                servo that was silent, disobeyed or reported something false, and nothing held the arm by force
+unsafe          judged by what the program can do: servos that obey may be driven until the arm is lowered, since
+                nothing else lays it down; a motor whose current the program does not decide must be off within 100 ms;
+                one that hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was
+                not commanded for more than 100 ms (the watchdog's time where a servo hears nothing), also while the
+                arm was lowered; current for longer than that after a servo was silent or the cable unplugged; after
+                any other reason, current for longer than the lowering takes. Links that, while motors drove them, came
+                closer to each other than in the undisturbed run, and touched. A joint that overshot its limits further
+                than a lowering may
 lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
                 current was only switched off there
 """
@@ -38,7 +42,7 @@ from benchmarks.fault_campaign.arms import Setting
 from benchmarks.fault_campaign.attack import Kind
 from benchmarks.fault_campaign.campaign import DoesNotRun, Ready, play, prepare
 from benchmarks.fault_campaign.draw import UNHEARD, Drawn, draw
-from benchmarks.fault_campaign.judge import BOUND_MS, TRIP_MS, Reason, Story, judge_words, reasons_of
+from benchmarks.fault_campaign.judge import BOUND_MS, TRIP_MS, Reason, Story, judge_words, overruled_ms, reasons_of
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.plan.way_home import WayHome
@@ -65,6 +69,7 @@ UNREACHED = ("was not heard", "the cable was unplugged")
 MOST_BEYOND_RAD = 0.2
 
 _BY_FORCE = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.OBSTACLE, Kind.SNAG, Kind.LOAD_CHANGED})
+_SIGNALS = frozenset({Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP})
 COMMANDABLE = _BY_FORCE | {
     *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP),
     *(Kind.RAISED_LIMIT, Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG),
@@ -88,7 +93,8 @@ class ChainOutcome:
     owed: why the run had to end, "" if there was no reason. can_command: see above; None if nothing stopped the run.
     lies: whether it ended lying in its rest pose. late_ms: how long current flowed after the reason. clearance: least
     distance while motors drove the arm, beyond that of the undisturbed run if that is negative [m]. beyond: largest
-    overshoot beyond a position limit meanwhile [rad].
+    overshoot beyond a position limit meanwhile [rad]. overruled_ms: longest time for which a motor carried a current
+    that was not commanded, of `cut_ms` allowed.
     """
 
     setting: Setting
@@ -97,8 +103,10 @@ class ChainOutcome:
     late_ms: float
     bound_ms: float
     lower_ms: float
+    cut_ms: float
     clearance: float
     beyond: float
+    overruled_ms: float
     stopped: bool
     can_command: bool
     lies: bool
@@ -111,7 +119,7 @@ class ChainOutcome:
     @property
     def unsafe(self) -> bool:
         is_late = self.late_ms > (self.lower_ms if self.lies else self.bound_ms)
-        return is_late or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
+        return is_late or self.overruled_ms > self.cut_ms or self.clearance < 0.0 or self.beyond > MOST_BEYOND_RAD
 
     @property
     def dropped(self) -> bool:
@@ -123,8 +131,8 @@ class ChainOutcome:
         flags += ["unnamed"] * (self.stopped and not self.named)
         return (
             f"{self.setting.name} {self.setting.rate} Hz: {self.drawn}: {self.owed or 'nothing owed'}, current for "
-            f"{self.late_ms:.0f} ms of {self.bound_ms:.0f}, clearance {1e3 * self.clearance:.0f} mm, "
-            f"{', '.join(flags) or 'good'}\n    {self.text.strip()[-600:]}"
+            f"{self.late_ms:.0f} ms of {self.bound_ms:.0f}, overruled {self.overruled_ms:.0f} of {self.cut_ms:.0f}, "
+            f"clearance {1e3 * self.clearance:.0f} mm, {', '.join(flags) or 'good'}\n    {self.text.strip()[-600:]}"
         )
 
 
@@ -182,8 +190,10 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
         1e3 * float(flowed[-1] - since) if flowed.size else 0.0,
         bound,
         lower_ms,
+        cut_ms,
         _clearance(config, record) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
         float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
+        overruled_ms(config, drawn, story),
         stopped,
         not cannot and _leaves_command(drawn, story.ended),
         _lies(config, record["position"][last[-1] if last.size else -1]),
@@ -218,11 +228,15 @@ def longest_lowering(path: Path) -> float:
 
 
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
-    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end."""
+    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end.
+
+    A second request to stop asks for torque to be cut at once, so it does not.
+    """
     forced = any(
         each.kind in _BY_FORCE and each.start < ended < each.end and abs(each.amount) > WEAKER for each in drawn.attacks
     )
-    return set(drawn.kinds) <= COMMANDABLE and not forced
+    asked = sum(each.kind in _SIGNALS and each.start < ended for each in drawn.attacks)
+    return set(drawn.kinds) <= COMMANDABLE and not forced and asked <= 1
 
 
 def _clearance(config: Config, record: NDArray[Any]) -> float:

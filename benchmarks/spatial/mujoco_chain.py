@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hil.estimation.mujoco_peer import import_mujoco
+from hil.estimation.comparison.mujoco_peer import import_mujoco
 from hil.estimator.chain.fit.stage1 import fit_lines
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel

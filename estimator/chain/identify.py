@@ -7,6 +7,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
+from hil.estimator.chain.fit.coordinates import ANGLES, kind_of
 from hil.estimator.chain.fit.stage1 import ChainLinear, fit_lines
 from hil.estimator.chain.fit.stage2 import DEFAULTS, ChainFit, ChainOptions, fit_periods
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -32,7 +33,9 @@ class ChainEstimate(FittedParameters):
     start: Array
     """Angles and velocities at the first sample (2, joints)."""
     position: Array
-    """One-step-ahead prediction (joints, samples) [rad]."""
+    """One-step-ahead prediction of the first period (joints, samples) [rad]."""
+    positions: tuple[Array, ...]
+    """The same of each period."""
     iterations: int
     outliers: int
     white_std: Array
@@ -41,25 +44,34 @@ class ChainEstimate(FittedParameters):
     """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
     from_prior: tuple[str, ...]
     """Base parameters that the data hardly determine, so that their values come from the prior."""
+    unseen: tuple[str, ...]
+    """Zero errors and tilts that the data hardly determine, so that they are taken as zero."""
 
 
 @one_blas_thread
-def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate:
+def identify_chain(
+    periods: SettledPeriod | Sequence[SettledPeriod],
+    model: ChainModel,
+    prior: Prior,
+    added: Sequence[Array | None] = (),
+) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
-    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. Raises ModelError if `model` and a
-    period differ in their number of joints, ConvergenceError if no minimum is found.
+    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. `added`: see `fit_lines`; for a
+    model with `added_mass`. Raises ModelError if `model` and a period differ in their number of joints,
+    ConvergenceError if no minimum is found.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:
         if model.joints != period.joints:
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
-    linear = fit_lines(used, model, prior)
-    fit = _best_fit(used, model, linear, prior, DEFAULTS)
+    linear = fit_lines(used, model, prior, added)
+    fit = _best_fit(used, model, linear, prior, DEFAULTS, added)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     count = model.base.count
-    wide = np.sqrt(np.diag(fit.covariance))[:count] > BELIEVED * prior.std
+    std = np.sqrt(np.diag(fit.covariance))
+    wide = std[:count] > BELIEVED * prior.std
     return ChainEstimate(
         names=model.names,
         units=model.units,
@@ -71,28 +83,40 @@ def identify_chain(periods: SettledPeriod | Sequence[SettledPeriod], model: Chai
         linear_value=linear.value,
         start=fit.starts[0],
         position=fit.positions[0],
+        positions=fit.positions,
         iterations=fit.iterations,
         outliers=fit.outliers + spikes,
         white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
         softness=fit.softness,
         from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
+        unseen=tuple(
+            name
+            for name, each in zip(model.names, std, strict=True)
+            if each > BELIEVED * ANGLES.get(kind_of(name), np.inf)
+        ),
     )
 
 
 def _best_fit(
-    periods: Sequence[SettledPeriod], model: ChainModel, linear: ChainLinear, prior: Prior, options: ChainOptions
+    periods: Sequence[SettledPeriod],
+    model: ChainModel,
+    linear: ChainLinear,
+    prior: Prior,
+    options: ChainOptions,
+    added: Sequence[Array | None],
 ) -> ChainFit:
     """Fit; if the motion is not explained, fit once more from a narrower Coulomb step and keep the better minimum.
 
     Where a joint often turns or sticks, the sum of squares has several minima in the shape of its friction.
     """
-    first = fit_periods(periods, model, linear, prior, options)
+    first = fit_periods(periods, model, linear, prior, options, added)
     before = _worst_residual(periods, first)
     if before <= EXPLAINED_RESIDUAL * ROUNDING:
         return first
     try:
-        again = fit_periods(periods, model, linear, prior, replace(options, initial_width=options.other_initial_width))
+        narrow = replace(options, initial_width=options.other_initial_width)
+        again = fit_periods(periods, model, linear, prior, narrow, added)
     except ConvergenceError:
         return first
     after = _worst_residual(periods, again)

@@ -17,6 +17,9 @@ the joint stands still, and a fraction of the largest planned torque. The noise 
 model lacks (Stribeck friction, backlash, flexibility) widen the admissible range. A deviation that may become an alarm
 enters that estimate only once it has ended without one; otherwise a joint that is held for long would widen the range
 until nothing exceeds it. While a joint stands still its noise is lower, since most of it needs motion.
+
+Errors of the model last longer than a lesson, and so does the rounding of a velocity that stays below one tick: they
+are not new information each time. The parameters therefore learn from each lesson as if it were a fraction of one.
 """
 
 import math
@@ -35,7 +38,9 @@ NAMES = (
 """Names of the parameters. Tilts are components of gravity perpendicular to the direction assumed for angle zero."""
 
 FILTER_S = 0.02
-HOLD_S = 0.02
+HOLD_S = 0.05
+"""Time for which the missing torque must exceed its thresholds [s]: longer than a gear takes to cross its play."""
+
 TIMES = 4.0
 FLOOR_SHARE = 0.25
 """Fraction of the largest planned torque below which a missing torque never raises an alarm."""
@@ -48,8 +53,10 @@ _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned t
 _NOISE_S = 1.0  # time constant of the noise estimate
 _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
+_LESSONS = 2.0  # number of lessons in a row that share an error of the model
+_STANDING_LESSONS = 28.0  # the same, for the rounding of velocities that stay below a tick while a joint hardly moves
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
-_MOST_WEIGHT = 4.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
+_MOST_WEIGHT = 6.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
 _OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at slow rates
 _WARM_S = 3 * FILTER_S
 _LONGEST_GAP = 3.0  # number of intervals between two samples after which the observer restarts
@@ -187,11 +194,26 @@ def _held_by_friction(m: Any, j: int) -> float:
     return float(_STATIC * max(dry, 0.0) * min(max(m[_SINGLE, _STANDS + j], 0.0), 1.0))
 
 
-def _of_rounding(m: Any, j: int, slope: float) -> float:
-    """Return the variance of the missing torque due to the rounding of velocities to ticks."""
-    inertia = m[_THETA, 0] + m[_THETA, 2] + 2.0 * abs(m[_THETA, 1]) if j == 0 else m[_THETA, 2] + m[_THETA, 3]
-    rounding = slope * _VELOCITY_STD * max(inertia, 0.0)
-    return float(rounding * rounding)
+def _second_moment(m: Any, weight_1: float, coupling: float, weight_2: float, armature: float) -> float:
+    """Return the mean square of a weighted sum of the inertial parameters, over all arms that they may belong to."""
+    mean = variance = 0.0
+    weights = (weight_1, coupling, weight_2, armature)
+    for i in range(4):
+        mean += weights[i] * m[_THETA, i]
+        for n in range(4):
+            variance += weights[i] * weights[n] * m[_COVARIANCE + i, n]
+    return mean * mean + max(variance, 0.0)
+
+
+def _of_rounding(m: Any, j: int, slope: float, cos_2: float) -> float:
+    """Return the variance of the missing torque due to the rounding of both velocities to ticks.
+
+    As long as the inertias are not known, this counts each as large as it may be.
+    """
+    across = _second_moment(m, 0.0, cos_2, 1.0, 0.0)
+    own = _second_moment(m, 1.0, 2.0 * cos_2, 1.0, 0.0) if j == 0 else _second_moment(m, 0.0, 0.0, 1.0, 1.0)
+    rounding = slope * _VELOCITY_STD
+    return float(rounding * rounding * (own + across))
 
 
 def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
@@ -202,7 +224,7 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
     if share <= 1.0:
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
         return False
-    single[_HELD + j] += dt * min(share, _MOST_WEIGHT)
+    single[_HELD + j] += dt * min(max(share - 0.5, 1.0), _MOST_WEIGHT)
     single[_SAMPLES + j] += 1.0
     # Where samples are far apart, a sudden fault may show in a single one.
     enough = single[_SAMPLES + j] >= 2.0 or (dt >= HOLD_S and share >= _OBVIOUS)
@@ -248,7 +270,7 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
             continue
         lacking, left_open = _lacks(m, j, row, gain)
         single[_LACKING + j] = lacking
-        holds, rounding = _held_by_friction(m, j), _of_rounding(m, j, slope)
+        holds, rounding = _held_by_friction(m, j), _of_rounding(m, j, slope, math.cos(q2))
         quiet = 1.0 - (1.0 - _STANDING_NOISE) * min(max(single[_STANDS + j], 0.0), 1.0)
         spread = left_open + rounding + quiet * quiet * single[_NOISE + j]
         beyond = max(abs(lacking) - holds, 0.0)
@@ -258,12 +280,13 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
         taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
         _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt, single[_SAMPLES + j] > 0.0)
         if lesson and not is_beyond:
-            _learn(m, gain, lacking, spread + holds * holds)
+            taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
+            _learn(m, gain, lacking, left_open + taught_by + holds * holds)
     return alarm
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
-_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms, _teach_noise = map(
-    _inner, (_regressors, _begin_anew, _filter, _lacks, _learn, _held_by_friction, _of_rounding, _alarms, _teach_noise)
-)
+_regressors, _begin_anew, _filter, _lacks, _learn = map(_inner, (_regressors, _begin_anew, _filter, _lacks, _learn))
+_held_by_friction, _second_moment, _of_rounding = map(_inner, (_held_by_friction, _second_moment, _of_rounding))
+_alarms, _teach_noise = map(_inner, (_alarms, _teach_noise))
 _observe: Callable[..., int] = numba.njit(cache=True, nogil=True, error_model="numpy")(_observe_loop)

@@ -13,6 +13,26 @@ from typing import Literal, get_args
 
 from hil.estimator.errors import ModelError
 
+__all__ = [
+    "DRIVES",
+    "FRICTIONS",
+    "OPTIONS",
+    "RIGID_BODY",
+    "TERMS",
+    "Drive",
+    "Friction",
+    "Option",
+    "Scale",
+    "Term",
+    "base_names",
+    "constants",
+    "extra_names",
+    "joint_of",
+    "kind_of",
+    "term_of",
+    "units_of",
+]
+
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]
 Drive = Literal["delay", "lag", "delay_lag"]
 Option = Literal[

@@ -162,15 +162,15 @@ class FakeBus:
         """
         now = self.clock.now()
         deadline = now + timeout_s
-        if timeout_s > 0:
+        if timeout_s > 0 and deadline <= now:
             # Advance time even when the timeout is too small to change the sum, so that a client polling in a loop
             # until its timeout expires does get there.
-            deadline = max(deadline, math.nextafter(now, math.inf))
+            deadline = math.nextafter(now, math.inf)
         taken = b""
         while True:
             change = self._origin + self.faults.next_change
-            part, came = self._wire.take(size - len(taken), min(deadline, change), now)
-            taken += part
+            part, came = self._wire.take(size - len(taken), deadline if deadline < change else change, now)
+            taken = taken + part if taken else part
             if len(taken) == size or deadline < change or self.cable_is_out or change == math.inf:
                 break
             self.clock.wait_until(change)
@@ -308,12 +308,31 @@ class FakeBus:
     def _receive(self, packet: Packet, now: float) -> None:
         self.advance(now)
         self.packets += not packet.damaged
+        if self.faults.on_instructions:
+            self._receive_with_faults(packet, now)
+        else:
+            self._instructions.receive(packet, now)
+
+    def _receive_with_faults(self, packet: Packet, now: float) -> None:
+        """As `_receive`. A fault of one servo makes that servo miss every packet, also those to all servos."""
+        deaf: set[int] = set()
         for fault in self.faults.on_instructions:
-            if self.faults.strikes(fault, packet.id, now - self._origin):
-                if fault.kind == FaultKind.LOST_INSTRUCTION:
-                    return
+            if not self.faults.strikes(fault, packet.id if fault.servo is None else fault.servo, now - self._origin):
+                continue
+            if fault.kind == FaultKind.CORRUPTED_INSTRUCTION and fault.servo in (None, packet.id):
                 packet = packet._replace(damaged=True)
-        self._instructions.receive(packet, now)
+            elif fault.servo is None:
+                return
+            else:
+                deaf.add(fault.servo)
+        cut_off = [servo for servo in self._servos if servo.connected and servo.id in deaf]
+        for servo in cut_off:
+            servo.connected = False
+        try:
+            self._instructions.receive(packet, now)
+        finally:
+            for servo in cut_off:
+                servo.connected = True
 
     def send(self, replies: Sequence[Reply], now: float) -> None:
         """Put replies on the wire.

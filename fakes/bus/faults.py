@@ -20,6 +20,18 @@ from pydantic import Field, ValidationError
 
 from hil.toml_errors import Described, describe
 
+__all__ = [
+    "FAULTS",
+    "INSTRUCTION_FAULTS",
+    "REPLY_FAULTS",
+    "Fault",
+    "FaultFacts",
+    "FaultKind",
+    "Faults",
+    "Happened",
+    "parse_fault",
+]
+
 
 class FaultKind(StrEnum):
     """Every kind of fault that can be injected."""
@@ -59,8 +71,10 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.DUPLICATED_REPLY: FaultFacts("a status packet arrives twice"),
     FaultKind.LATE_REPLY: FaultFacts("the adapter delays a status packet", "seconds", 0.02),
     FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8),
-    FaultKind.LOST_INSTRUCTION: FaultFacts("no servo receives an instruction packet"),
-    FaultKind.CORRUPTED_INSTRUCTION: FaultFacts("the servos receive an instruction packet with a wrong CRC"),
+    FaultKind.LOST_INSTRUCTION: FaultFacts("an instruction packet is not received, by one servo or by all"),
+    FaultKind.CORRUPTED_INSTRUCTION: FaultFacts(
+        "an instruction packet arrives with a wrong CRC, at one servo or at all"
+    ),
     FaultKind.STATUS_ERROR: FaultFacts(
         "a servo refuses commands and answers with an error; with 128 (only the Alert bit) it obeys and sets Alert",
         "ERR byte",

@@ -22,6 +22,8 @@ from hil.fakes.bus.joints import Joints
 from hil.fakes.plants.plant import CanBeHeld, Plant, PlantError
 from hil.toml_errors import Described, describe
 
+__all__ = ["Hand", "Move", "parse_move"]
+
 _PULL_S = 0.01
 """Time constant with which the hand corrects the joint's deviation from the planned path [s]."""
 
@@ -30,10 +32,15 @@ class Move(Described):
     """One movement of the hand, after which it holds the joint for `hold` seconds, indefinitely by default."""
 
     servo: Annotated[int, Field(ge=0, le=252, description="bus ID of a servo of the joint")]
-    to: Annotated[float | None, Field(allow_inf_nan=False, description="joint angle at the end [rad]")] = None
+    to: Annotated[
+        float | None,
+        Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False, description="joint angle at the end [rad]"),
+    ] = None
     ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
-    at: Annotated[float, Field(ge=0, allow_inf_nan=False, description="delay before it starts [s]")] = 0.0
-    duration: Annotated[float, Field(gt=0, allow_inf_nan=False, description="duration of the movement [s]")] = 1.0
+    at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before it starts [s]")] = 0.0
+    duration: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, description="duration of the movement [s]")] = (
+        1.0
+    )
     hold: Annotated[float, Field(ge=0, description="how long the joint is held afterwards [s]")] = math.inf
 
     @model_validator(mode="after")

@@ -11,71 +11,80 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
+Angle = Annotated[float, Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False)]
+
 
 class Link(Described):
     """One rigid link, without the servo bodies."""
 
-    length: Positive = Field(description="distance from its joint to the next joint [m]")
-    mass: NotNegative = Field(description="mass [kg]")
-    centre: Finite = Field(description="distance from its joint to its centre of mass [m]")
-    inertia: NotNegative = Field(description="inertia about its centre of mass [kg m^2]")
+    length: Positive = Field(le=3, description="distance from its joint to the next joint [m]")
+    mass: NotNegative = Field(le=20, description="mass [kg]")
+    centre: Finite = Field(ge=-3, le=3, description="distance from its joint to its centre of mass [m]")
+    inertia: NotNegative = Field(le=10, description="inertia about its centre of mass [kg m^2]")
 
 
 class Drive(Described):
     """One servo: body, rotor and gears, current loop, friction."""
 
-    mass: NotNegative = Field(description="mass of the servo's body, which is located at its joint [kg]")
-    rotor_inertia: NotNegative = Field(description="inertia of the rotor on the motor side of the gears [kg m^2]")
-    gear_ratio: Positive = Field(description="turns of the rotor per turn of the joint")
-    torque_constant: Positive = Field(description="torque at the output shaft per motor current [N m/A]")
-    current_lag: NotNegative = Field(0.0, description="time constant of the current loop, first order [s]")
+    mass: NotNegative = Field(le=5, description="mass of the servo's body, which is located at its joint [kg]")
+    rotor_inertia: NotNegative = Field(
+        le=1e-3, description="inertia of the rotor on the motor side of the gears [kg m^2]"
+    )
+    gear_ratio: Positive = Field(le=10000, description="turns of the rotor per turn of the joint")
+    torque_constant: Positive = Field(le=100, description="torque at the output shaft per motor current [N m/A]")
+    current_lag: NotNegative = Field(0.0, le=0.1, description="time constant of the current loop, first order [s]")
     saturation: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
         0.0, description="fraction of the torque lost at saturation_current"
     )
-    saturation_current: Positive = Field(1.0, description="current at which the fraction `saturation` is lost [A]")
-    viscous: NotNegative = Field(0.0, description="viscous friction, warm [N m s/rad]")
-    coulomb: NotNegative = Field(0.0, description="Coulomb friction, warm [N m]")
+    saturation_current: Positive = Field(
+        1.0, le=100, description="current at which the fraction `saturation` is lost [A]"
+    )
+    viscous: NotNegative = Field(0.0, le=20, description="viscous friction, warm [N m s/rad]")
+    coulomb: NotNegative = Field(0.0, le=20, description="Coulomb friction, warm [N m]")
     cold_viscous: NotNegative = Field(
-        0.0, description="excess of viscous friction at time 0, as a fraction of the warm one"
+        0.0, le=10, description="excess of viscous friction at time 0, as a fraction of the warm one"
     )
     cold_coulomb: NotNegative = Field(
-        0.0, description="excess of Coulomb friction at time 0, as a fraction of the warm one"
+        0.0, le=10, description="excess of Coulomb friction at time 0, as a fraction of the warm one"
     )
-    warm_up_time: Positive = Field(60.0, description="time constant of the warm-up [s]")
+    warm_up_time: Positive = Field(60.0, le=36000, description="time constant of the warm-up [s]")
     coulomb_width: NotNegative = Field(
         0.0,
+        le=1,
         description="0: stiction; above 0: smooth friction, coulomb * tanh(velocity / width) [rad/s]",
     )
     stribeck_rise: NotNegative = Field(
-        0.0, description="excess of static over Coulomb friction, as a fraction of the latter"
+        0.0, le=10, description="excess of static over Coulomb friction, as a fraction of the latter"
     )
-    stribeck_velocity: Positive = Field(0.1, description="velocity at which stribeck_rise has fallen to 1/e [rad/s]")
-    load: NotNegative = Field(0.0, description="additional dry friction per motor torque [N m per N m]")
+    stribeck_velocity: Positive = Field(
+        0.1, le=5, description="velocity at which stribeck_rise has fallen to 1/e [rad/s]"
+    )
+    load: NotNegative = Field(0.0, le=1, description="additional dry friction per motor torque [N m per N m]")
     presliding_stiffness: NotNegative = Field(
-        0.0, description="stiffness of the presliding contact; 0 for rigid stiction [N m/rad]"
+        0.0, le=100000, description="stiffness of the presliding contact; 0 for rigid stiction [N m/rad]"
     )
-    presliding_damping: NotNegative = Field(0.0, description="damping of the presliding contact [N m s/rad]")
-    offset: Finite = Field(0.0, description="constant load torque [N m]")
+    presliding_damping: NotNegative = Field(0.0, le=100, description="damping of the presliding contact [N m s/rad]")
+    offset: Finite = Field(0.0, ge=-20, le=20, description="constant load torque [N m]")
     cable_stiffness: NotNegative = Field(
-        0.0, description="stiffness of a cable that pulls the joint to cable_angle [N m/rad]"
+        0.0, le=100, description="stiffness of a cable that pulls the joint to cable_angle [N m/rad]"
     )
-    cable_angle: Finite = Field(0.0, description="joint angle at which the cable is slack [rad]")
+    cable_angle: Angle = Field(0.0, description="joint angle at which the cable is slack [rad]")
     ripple: NotNegative = Field(
-        0.0, description="amplitude of the torque ripple over the angle, as a fraction of torque"
+        0.0, le=1, description="amplitude of the torque ripple over the angle, as a fraction of torque"
     )
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
-    cogging: NotNegative = Field(0.0, description="amplitude of the cogging torque at the output shaft [N m]")
+    cogging: NotNegative = Field(0.0, le=10, description="amplitude of the cogging torque at the output shaft [N m]")
     cogging_cycles: Positive = Field(1.0, description="cycles of cogging per turn of the joint")
-    backlash: NotNegative = Field(0.0, description="total play of the gears [rad]")
+    backlash: NotNegative = Field(0.0, le=0.2, description="total play of the gears [rad]")
     gear_stiffness: Positive = Field(
-        1500.0, description="stiffness of the gears in contact; only with backlash [N m/rad]"
+        1500.0, le=1e06, description="stiffness of the gears in contact; only with backlash [N m/rad]"
     )
     gear_damping: NotNegative = Field(
-        2.0, description="damping of the gears in contact; only with backlash [N m s/rad]"
+        2.0, le=10000, description="damping of the gears in contact; only with backlash [N m s/rad]"
     )
-    stops: tuple[Finite, Finite] | None = Field(None, strict=False, description="joint angles of the hard stops [rad]")
-    stop_stiffness: Positive = Field(200.0, description="stiffness of a hard stop [N m/rad]")
-    stop_damping: NotNegative = Field(1.0, description="damping of a hard stop [N m s/rad]")
+    stops: tuple[Angle, Angle] | None = Field(None, strict=False, description="joint angles of the hard stops [rad]")
+    stop_stiffness: Positive = Field(200.0, le=1e06, description="stiffness of a hard stop [N m/rad]")
+    stop_damping: NotNegative = Field(1.0, le=10000, description="damping of a hard stop [N m s/rad]")
 
     @property
     def warms_up(self) -> bool:
@@ -116,11 +125,11 @@ class Drive(Described):
 class Arm(Described):
     """A planar arm of one or two joints; joint 1 is measured from the horizontal, joint 2 from link 1."""
 
-    gravity: NotNegative = Field(9.81, description="acceleration of gravity; 0 for a horizontal arm [m/s^2]")
+    gravity: NotNegative = Field(9.81, le=30, description="acceleration of gravity; 0 for a horizontal arm [m/s^2]")
     tilt: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)] = Field(
         0.0, description="inclination of the arm's plane from the vertical; pi/2 is horizontal [rad]"
     )
-    start: tuple[Finite, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
+    start: tuple[Angle, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
     links: tuple[Link, ...] = Field(
         strict=False, min_length=1, max_length=2, description="links from the base outwards"
     )

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from hil.description.arm import ArmDescription, Body
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
-from hil.fakes.plants.arm import Drive, Finite, NotNegative, Positive
+from hil.fakes.plants.arm import Angle, Drive, NotNegative, Positive
 from hil.toml_errors import Described
 
 MOST_JOINTS = 7
@@ -17,6 +17,7 @@ PLANAR_ONLY = (
     *("backlash", "presliding_stiffness", "cogging", "saturation"),
     *("cold_viscous", "cold_coulomb", "cable_stiffness"),
 )
+_Place = Annotated[float, Field(ge=-3, le=3)]
 
 
 class ChainArm(Described):
@@ -29,16 +30,20 @@ class ChainArm(Described):
         max_length=MOST_JOINTS,
         description="joint names in the URDF, from the base outwards",
     )
-    start: tuple[Finite, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
-    gravity: NotNegative = Field(9.81, description="acceleration of gravity [m/s^2]")
-    base: Annotated[tuple[Finite, Finite, Finite], Field(strict=False)] = Field(
+    start: tuple[Angle, ...] = Field(strict=False, description="joint angles at time 0 [rad]")
+    gravity: NotNegative = Field(9.81, le=30, description="acceleration of gravity [m/s^2]")
+    base: Annotated[tuple[Angle, Angle, Angle], Field(strict=False)] = Field(
         (0.0, 0.0, 0.0), description="roll, pitch and yaw of the base [rad]"
     )
-    mass_scale: tuple[Positive, ...] | None = Field(
+    mass_scale: tuple[Annotated[Positive, Field(le=100)], ...] | None = Field(
         None, strict=False, description="ratio of true mass and inertia to the URDF's, per link"
     )
-    centre_shift: tuple[Finite, ...] | None = Field(
+    centre_shift: tuple[Annotated[float, Field(ge=-1, le=1)], ...] | None = Field(
         None, strict=False, description="shift of each link's true centre of mass along its frame's x axis [m]"
+    )
+    payload: NotNegative = Field(0.0, le=50, description="point mass bolted to the last link [kg]")
+    payload_at: Annotated[tuple[_Place, _Place, _Place], Field(strict=False)] = Field(
+        (0.0, 0.0, 0.0), description="its place in that link's frame [m]"
     )
     drives: tuple[Drive, ...] = Field(strict=False, description="drives, one per joint; their mass is not used")
 
@@ -68,16 +73,27 @@ class ChainArm(Described):
         """The true mass properties of the links."""
         count = len(self.joints)
         scales, shifts = self.mass_scale or (1.0,) * count, self.centre_shift or (0.0,) * count
-        return tuple(
+        bare = [
             Body(
                 scale * joint.body.mass,
                 joint.body.centre + np.array([shift, 0.0, 0.0]),
                 scale * joint.body.inertia,
             )
             for joint, scale, shift in zip(self.description.joints, scales, shifts, strict=True)
-        )
+        ]
+        return (*bare[:-1], _loaded(bare[-1], self.payload, np.array(self.payload_at)))
 
     @property
     def gravity_vector(self) -> np.ndarray:
         """Gravity in the base's frame (3,) [m/s^2]."""
         return np.asarray(rotation_of(*self.base).T @ np.array([0.0, 0.0, -self.gravity]))
+
+
+def _loaded(body: Body, mass: float, at: np.ndarray) -> Body:
+    """A body with a point mass fixed to it."""
+    if mass == 0.0:
+        return body
+    total = body.mass + mass
+    away = at - body.centre
+    inertia = body.inertia + body.mass * mass / total * (away @ away * np.eye(3) - np.outer(away, away))
+    return Body(total, (body.mass * body.centre + mass * at) / total, inertia)

@@ -16,20 +16,23 @@ class Thermal(Described):
     """A single thermal mass, heated by the motor's I^2 R and cooled by the surroundings."""
 
     resistance_k_w: Annotated[
-        float, Field(gt=0, allow_inf_nan=False, description="thermal resistance from motor to surroundings [K/W]")
+        float,
+        Field(gt=0, le=1000, allow_inf_nan=False, description="thermal resistance from motor to surroundings [K/W]"),
     ]
-    time_s: Annotated[float, Field(gt=0, allow_inf_nan=False, description="time constant [s]")]
-    ambient_c: Annotated[float, Field(ge=-40, le=100, description="temperature of the surroundings [C]")] = 25.0
+    time_s: Annotated[float, Field(gt=0, le=36000, allow_inf_nan=False, description="time constant [s]")]
+    ambient_c: Annotated[
+        float, Field(ge=-40, le=100, allow_inf_nan=False, description="temperature of the surroundings [C]")
+    ] = 25.0
 
 
 class Overload(Described):
     """Shutdown after too long a time at a high current."""
 
     current_a: Annotated[
-        float, Field(gt=0, allow_inf_nan=False, description="motor current above which the timer runs [A]")
+        float, Field(gt=0, le=100, allow_inf_nan=False, description="motor current above which the timer runs [A]")
     ]
     time_s: Annotated[
-        float, Field(gt=0, allow_inf_nan=False, description="longest permitted time above that current [s]")
+        float, Field(gt=0, le=3600, allow_inf_nan=False, description="longest permitted time above that current [s]")
     ]
 
 

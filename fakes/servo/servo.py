@@ -409,7 +409,9 @@ class EmulatedServo(Powered):
         self._current_limit: int = memory.get("Current Limit") if "Goal Current" in memory else -1
         by_goal = memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
         known = bool(self.model.operating_modes)
-        self._takes_goal_current = known and self._current_limit >= 0 and not by_goal and watchdog != WATCHDOG_TRIPPED
+        # The fast path bypasses the controller, which computes the current where the supply limits it.
+        fast = known and not self._voltage_limited and self._current_limit >= 0
+        self._takes_goal_current = fast and not by_goal and watchdog != WATCHDOG_TRIPPED
         if self.needs_ticks:
             self.controller.goals = Goals.read(self._mode, memory)
         self.changed()

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
@@ -10,8 +10,9 @@ from pathlib import Path
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.config.schema import Config, load_config
-from hil.errors import ConfigError, StopRequested
-from hil.estimation.after_a_stop import after_a_stop
+from hil.drivers.errors import DriverError
+from hil.errors import ConfigError, ExperimentError, StopRequested
+from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress as StreamProgress
@@ -75,7 +76,7 @@ def identify(
     def say(message: str) -> None:
         tell(Progress("experiment", message))
 
-    with _discarding(run, shown):
+    with _discarding(run, "identify", shown):
         if checked.experiment.pilot:
             from hil.pilot import identify_in_steps
 
@@ -111,7 +112,7 @@ def record(
         )
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
-    with _discarding(run, shown):
+    with _discarding(run, "record", shown):
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
     tell(Progress("experiment", torque))
     return load_run(run.path)
@@ -127,17 +128,24 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
     return read_result(path)
 
 
+def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:
+    if isinstance(stopped, KeyboardInterrupt | StopRequested):
+        return after_a_stop(run, command, shown)
+    return after_a_failure(run, shown) if isinstance(stopped, ExperimentError | DriverError) else []
+
+
 @contextmanager
-def _discarding(run: RunFolder, shown: Path) -> Iterator[None]:
+def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
     """Remove the run folder if the experiment fails before the first sample, so that it does not block the next
-    attempt. After a stop by the user, add to the exception what is kept and how to go on.
+    attempt. After a stop, add to the exception what is kept and how to go on.
     """
     try:
         yield
     except BaseException as stopped:
-        if not run.discard_if_unused() and isinstance(stopped, KeyboardInterrupt | StopRequested):
-            for line in after_a_stop(run, shown):
-                stopped.add_note(line)
+        if not run.discard_if_unused():
+            with suppress(Exception):  # a hint must never take the place of what stopped the arm, and of its torque
+                for line in _how_to_go_on(stopped, run, command, shown):
+                    stopped.add_note(line)
         raise
 
 

@@ -11,6 +11,12 @@ from typing import Any
 import numba
 import numpy as np
 
+from hil.estimator.chain.model.kernels import place
+from hil.estimator.compiled import compiled
+
+BASE = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+"""Frame of the base: rotation matrix row by row, then origin."""
+
 FLOOR, BOXES = -1, -2
 """Second member of a pair: the index of another capsule, FLOOR, or `BOXES - index` for a box."""
 
@@ -79,27 +85,6 @@ def _box(a: Any, box: Any) -> float:
     return min(near_left, near_right)
 
 
-def _place(rotation: Any, translation: Any, axis: Any, q: Any, frame: Any) -> None:
-    """Fill `frame` (joints + 1, 12) for base and links: rotation matrix row by row, then origin."""
-    for r in range(12):
-        frame[0, r] = 1.0 if r in (0, 4, 8) else 0.0
-    for i in range(q.size):
-        p, f, t, turn = frame[i], frame[i + 1], translation[i], rotation[i]
-        for r in range(3):
-            f[9 + r] = p[9 + r] + p[3 * r] * t[0] + p[3 * r + 1] * t[1] + p[3 * r + 2] * t[2]
-            for c in range(3):
-                f[3 * r + c] = p[3 * r] * turn[0, c] + p[3 * r + 1] * turn[1, c] + p[3 * r + 2] * turn[2, c]
-        x, y, z = axis[i, 0], axis[i, 1], axis[i, 2]
-        cosine, sine = math.cos(q[i]), math.sin(q[i])
-        rest = 1.0 - cosine
-        for r in range(3):
-            a, b, c = f[3 * r], f[3 * r + 1], f[3 * r + 2]
-            along = rest * (a * x + b * y + c * z)
-            f[3 * r] = cosine * a + along * x + sine * (b * z - c * y)
-            f[3 * r + 1] = cosine * b + along * y + sine * (c * x - a * z)
-            f[3 * r + 2] = cosine * c + along * z + sine * (a * y - b * x)
-
-
 def _at(frame: Any, link: Any, ends: Any, out: Any) -> None:
     """Fill `out` (capsules, 2, 3) with the ends of all capsules in the base frame."""
     for k in range(link.size):
@@ -129,8 +114,10 @@ def _all_loop(chain: Any, shapes: Any, pairs: Any, q: Any, out: Any) -> None:
     rotation, translation, axis = chain
     link, ends, radius, floor, boxes = shapes
     frame, at = np.empty((q.shape[1] + 1, 12)), np.empty(ends.shape)
+    frame[0] = BASE
+    motion = np.empty((q.shape[1], 6, 6))
     for k in range(q.shape[0]):
-        _place(rotation, translation, axis, q[k], frame)
+        place(rotation, translation, axis, q[k], frame[1:], motion)
         _at(frame, link, ends, at)
         for p in range(pairs.shape[0]):
             out[k, p] = _distance(pairs[p, 0], pairs[p, 1], at, radius, floor, boxes)
@@ -144,6 +131,8 @@ def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: 
     rotation, translation, axis = chain
     link, ends, radius, floor, boxes = shapes
     frame, at = np.empty((q.shape[1] + 1, 12)), np.empty(ends.shape)
+    frame[0] = BASE
+    motion = np.empty((q.shape[1], 6, 6))
     middle, half = np.empty((link.size, 3)), np.empty(link.size)
     for k in range(link.size):
         length = 0.0
@@ -151,7 +140,7 @@ def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: 
             length += (ends[k, 1, r] - ends[k, 0, r]) ** 2
         half[k] = 0.5 * math.sqrt(length) + radius[k]
     for k in range(q.shape[0]):
-        _place(rotation, translation, axis, q[k], frame)
+        place(rotation, translation, axis, q[k], frame[1:], motion)
         _at(frame, link, ends, at)
         for c in range(link.size):
             for r in range(3):
@@ -175,6 +164,6 @@ def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: 
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-_segments, _to_box, _box, _place, _at, _distance = map(_inner, (_segments, _to_box, _box, _place, _at, _distance))
-all_distances: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_all_loop)
-least_room: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_least_loop)
+_segments, _to_box, _box, _at, _distance = map(_inner, (_segments, _to_box, _box, _at, _distance))
+all_distances: Callable[..., None] = compiled(_all_loop)
+least_room: Callable[..., None] = compiled(_least_loop)

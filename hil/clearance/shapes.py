@@ -1,4 +1,4 @@
-"""Capsules that enclose each link: from the collision geometry of its URDF, otherwise from the joint positions.
+"""Capsules that enclose each link: from the collision geometry of its file, otherwise from the joint positions.
 
 A capsule is the set of points within its radius of a line segment. Spheres are represented exactly. A cylinder is
 enclosed by one capsule, a box by one or a row of them, and a mesh by those of its bounding box. A link whose geometry
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from hil.clearance.mesh import find_mesh, mesh_corners
 from hil.description.arm import ArmDescription, ArmFileError
+from hil.description.files import is_mjcf
+from hil.description.mjcf import Geom, read_geoms
 from hil.description.urdf import parse_urdf, rotation_of
 
 Array = NDArray[np.float64]
@@ -56,11 +58,13 @@ def shapes_of(arm: ArmDescription) -> Shapes:
     """Enclose the links of an arm in capsules. Raises ArmFileError."""
     names = (arm.base, *(joint.link for joint in arm.joints))
     placed = _placed(arm)
+    geoms = _geoms(arm)
     capsules: list[Capsule] = []
     guessed = []
     for link in range(len(names)):
         here = [each for each in placed if each[0] == link]
         found, is_whole = _around(here, arm, link)
+        found += [Capsule(link, *each) for geom in geoms if geom.link == link for each in _of_geom(geom)]
         if not found or not is_whole:
             guessed.append(names[link])
             found += _from_joints(arm, link, [shift for _, _, shift, _ in here]) if link > 0 else []
@@ -75,7 +79,7 @@ def shapes_of(arm: ArmDescription) -> Shapes:
 
 @dataclass(frozen=True)
 class Solid:
-    """A primitive of a URDF's collision geometry, in the frame of its moving link.
+    """A primitive of a file's collision geometry, in the frame of its moving link.
 
     link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as MuJoCo counts it: half
     edges, or radius and half length [m]; empty for a mesh. rotation: (3, 3); translation: (3,) [m].
@@ -89,8 +93,11 @@ class Solid:
 
 
 def solids_of(arm: ArmDescription) -> list[Solid]:
-    """The primitives of a URDF. Raises ArmFileError."""
-    found = []
+    """The primitives of a URDF or MJCF. Raises ArmFileError."""
+    found = [
+        Solid(each.link, each.kind, () if each.kind == "mesh" else each.size, each.rotation, each.translation)
+        for each in _geoms(arm)
+    ]
     for link, rotation, translation, element in _placed(arm):
         for shape, turn, shift in () if element is None else _geometry(element):
             place = rotation @ turn, rotation @ shift + translation
@@ -106,6 +113,24 @@ def _size_of(shape: ET.Element) -> tuple[float, ...]:
     if shape.tag in ("cylinder", "capsule"):
         return float(shape.get("radius", "nan")), 0.5 * float(shape.get("length", "nan"))
     return ()
+
+
+def _geoms(arm: ArmDescription) -> list[Geom]:
+    return read_geoms(arm.path, [joint.name for joint in arm.joints]) if is_mjcf(arm.path) else []
+
+
+def _of_geom(geom: Geom) -> list[tuple[Array, float]]:
+    """Ends (2, 3) in the link's frame and radii of capsules that enclose a shape of an MJCF file."""
+    size = geom.size
+    if geom.kind == "sphere":
+        around = [(np.zeros((2, 3)), size[0])]
+    elif geom.kind == "capsule":
+        around = [(np.array([[0.0, 0.0, -size[1]], [0.0, 0.0, size[1]]]), size[0])]
+    elif geom.kind == "cylinder":
+        around = [_of_cylinder(size[0], 2.0 * size[1])]
+    else:
+        around = _of_box(np.zeros(3), 2.0 * np.array(size))
+    return [(ends @ geom.rotation.T + geom.translation, radius) for ends, radius in around]
 
 
 def _pieces(capsule: Capsule) -> list[Capsule]:

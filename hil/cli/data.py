@@ -17,9 +17,12 @@ def compare(
     mujoco: Annotated[bool, typer.Option("--mujoco", help="Include mujoco.sysid; needs the extra `peers`.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Apply other methods to the same recording: RLS, EKF, UKF, IDIM-LS, the seed paper's, mujoco.sysid."""
+    """Apply other methods to the same recording: RLS, EKF, UKF, IDIM-LS, the seed paper's, mujoco.sysid.
+
+    For a spatial arm: least squares on Fourier lines, and IDIM-LS.
+    """
     from hil.cli.terminal import Terminal
-    from hil.estimation.compare import compare_run
+    from hil.estimation.comparison.compare import compare_run
     from hil.results.json_form import to_json
     from hil.runs.run_folder import RunFolder
 
@@ -45,30 +48,34 @@ def calibrate(
     ],
     mass: Annotated[float, typer.Option("--mass", min=1e-6, metavar="KG", help="Mass bolted to the last link.")],
     distance: Annotated[
-        float,
+        float | None,
         typer.Option("--distance", min=1e-6, metavar="M", help="Distance of its centre of mass from the last joint."),
-    ],
+    ] = None,
     length: Annotated[
         float | None, typer.Option("--length", min=1e-6, metavar="M", help="Length of link 1; default: known.length_1.")
     ] = None,
     inertia: Annotated[
         float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia about its own centre of mass.")
     ] = 0.0,
+    at: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--at", metavar="X Y Z", help="Spatial arm: its place in the frame of its link, in m."),
+    ] = None,
+    joint: Annotated[
+        str | None,
+        typer.Option("--joint", metavar="NAME", help="Spatial arm: joint that moves that link; default: the last."),
+    ] = None,
     json_only: Json = False,
 ) -> None:
     """Determine each joint's torque constant from a second run with a known mass bolted on."""
     from hil.cli.terminal import Terminal
-    from hil.estimation.calibrate import calibrate_runs, calibration_lines
-    from hil.estimator.calibration import KnownMass
+    from hil.estimation.calibrate import AddedMass, calibrate_runs, calibration_lines
     from hil.results.json_form import to_json
     from hil.runs.run_folder import RunFolder
 
     if without.resolve() == with_mass.resolve():
         raise typer.BadParameter(f"{without} is given twice: one run without the mass, one with it.")
     runs = RunFolder.open(without), RunFolder.open(with_mass)
-    known = runs[0].load_config().known
-    if length is None and known is not None and known.length_1 is not None:
-        length = known.quantities()["length_1"].value
     with Terminal(quiet=json_only).busy("Calibrating"):
-        result = calibrate_runs(*runs, KnownMass(mass, distance, inertia, length or 0.0))
+        result = calibrate_runs(*runs, AddedMass(mass, inertia, distance, length, at, joint))
     print(strict_json.dumps(to_json(result)) if json_only else "\n".join(calibration_lines(result)))

@@ -1,5 +1,7 @@
 """Conversion of exceptions to messages and exit codes."""
 
+from hil.next_step import NEXT
+
 
 def exit_code(error: Exception) -> int | None:
     """Exit code of an expected error; None for a bug in the program."""
@@ -15,9 +17,13 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """Message with its notes and, if the error occurred while another one was handled, that error's message."""
+    """Message with its notes and, if the error occurred while another one was handled, that error's message.
+
+    The last line is the next command, if a note names one.
+    """
     lines = [f"hil: {error}", *getattr(error, "__notes__", [])]
     cause = error.__context__
     if cause is not None and error.__cause__ is None and isinstance(cause, Exception) and exit_code(cause) is not None:
-        lines.append(f"Preceded by: {cause}")
+        behind = len(lines) - 1 if lines[-1].startswith(NEXT) else len(lines)
+        lines.insert(behind, f"Preceded by: {cause}")
     return "\n".join(lines)

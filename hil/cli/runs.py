@@ -11,7 +11,12 @@ import typer
 from hil import strict_json
 from hil.cli.options import Json, RunPath
 
+_WHOLE = 100.0
+"""Change [%] beyond which no figure is given: these runs say nothing about that term."""
+
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from hil.estimation.changes.diff import Difference
     from hil.runs.collection import RunSummary
 
@@ -102,7 +107,7 @@ def _print_difference(difference: "Difference") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from hil.printing import print_table, result_console, say
+    from hil.printing import print_fitting, result_console, say
 
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("parameter", no_wrap=True)
@@ -114,12 +119,24 @@ def _print_difference(difference: "Difference") -> None:
         shown = (f"{change.before:.5g}", f"{change.after:.5g}", percent, f"{change.z:+.1f}")
         table.add_row(escape(change.name), *shown, "changed" if change.changed else "")
     console = result_console()
-    print_table(console, table)
+    print_fitting(console, table)
     for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):
         if names:
             say(console, f"Not in the model {lacking}: {', '.join(names)}.")
-    if difference.detectable:
-        least = ", ".join(f"{name} {percent:.2g} %" for name, percent in difference.detectable.items())
-        say(console, f"Changes that two runs like these show with 95 % probability, at least: {least}.")
+    for line in _would_show(difference.detectable):
+        say(console, line)
     found = ", ".join(change.name for change in difference.changed)
     say(console, f"Significant changes: {found}." if found else "No significant changes.")
+
+
+def _would_show(detectable: "Mapping[str, float]") -> list[str]:
+    """Say which change of one term of friction alone two such runs would have shown [% by name], and which none."""
+    least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
+    never = [name for name, percent in detectable.items() if percent > _WHOLE]
+    lines = []
+    if least:
+        known = "A smaller change of one term alone may not show (from there on 95 of 100 such pairs show it)"
+        lines.append(f"{known}: {', '.join(least)}.")
+    if never:
+        lines.append(f"Not even a doubling would show: {', '.join(never)}.")
+    return lines

@@ -1,5 +1,7 @@
 """Progress shown while the arm moves: a bar and each joint's position and current. Disabled by -q."""
 
+import re
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -7,6 +9,7 @@ from pathlib import Path
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.spinner import Spinner
 
 from hil.api.progress import OnProgress
 from hil.api.progress import Progress as Report
@@ -29,6 +32,15 @@ _PHASES = {
     Phase.BRAKING: "braking",
 }
 
+_NARROW = 76
+"""Columns below which the bar would not fit."""
+
+_QUIET_S = 0.7
+"""Time without a report after the arm has come to rest, from which on the display says what goes on [s]."""
+
+_CELLS = 3
+"""Number of cells from which on a line is a row of a table."""
+
 
 class Terminal:
     """Messages on standard error; standard output is reserved for results."""
@@ -37,7 +49,7 @@ class Terminal:
         self.console = Console(stderr=True, quiet=quiet or is_quiet(), highlight=False)
 
     def say(self, text: str) -> None:
-        self.console.print(text, markup=False)
+        self.console.print(rows_below(text, self.console.width) if self.console.is_terminal else text, markup=False)
 
     @contextmanager
     def busy(self, text: str) -> Iterator[None]:
@@ -50,11 +62,13 @@ class Terminal:
         """Show the progress of a long call: a live view of the arm while it moves, otherwise a message or a spinner."""
         with ExitStack() as showing:
             watch: Watch | None = None
+            showing.enter_context(self.busy("Preparing"))
 
             def follow(report: Report) -> None:
                 nonlocal watch
                 if report.stream is not None and config is not None:
                     if watch is None:
+                        showing.close()
                         watch = showing.enter_context(self.streaming(load_config(config)))
                     watch(report.stream)
                 elif report.stage == "experiment":
@@ -88,24 +102,65 @@ class Terminal:
         if not self.console.is_terminal or self.console.quiet:
             yield lambda _: None
             return
-        bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            TextColumn("{task.completed:.0f} of about {task.total:.0f} s of arm time,"),
-            TimeRemainingColumn(),
-            TextColumn("left"),
-            console=self.console,
-        )
+        bar = _bar(self.console)
         task = bar.add_task("", total=1.0)
         rate = config.experiment.rate
         view = LiveView(config, self.console.width)
+        computing = Spinner("dots", "Computing with what was recorded ...")
+        shown: Group | Progress = bar
+        told_at, is_over = 0.0, False
 
-        with Live(bar, console=self.console, refresh_per_second=10) as live:
+        def current() -> Group | Progress | Spinner:
+            return computing if is_over and time.monotonic() - told_at > _QUIET_S else shown
+
+        with Live(get_renderable=current, console=self.console, refresh_per_second=10):
 
             def watch(progress: StreamProgress) -> None:
+                nonlocal shown, told_at, is_over
                 total = max(progress.expected, progress.taken) / rate
                 description = f"{progress.role.replace('_', ' ')}: {_PHASES[progress.phase]}"
                 bar.update(task, completed=progress.taken / rate, total=total, description=description)
-                live.update(Group(bar, view.draw(progress)))
+                shown = Group(bar, view.draw(progress))
+                told_at, is_over = time.monotonic(), progress.phase is Phase.COMING_TO_REST
 
             yield watch
+
+
+def _bar(console: Console) -> Progress:
+    """The line above the joints, in as many words as the terminal is wide."""
+    if console.width < _NARROW:
+        return Progress(
+            TextColumn("{task.description}"),
+            TextColumn("{task.completed:.0f}/{task.total:.0f} s"),
+            console=console,
+        )
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        TextColumn("{task.completed:.0f} of about {task.total:.0f} s of arm time,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+        console=console,
+    )
+
+
+def rows_below(text: str, width: int) -> str:
+    """The text, with each row of a table in it as lines of their own where the table is wider than `width`.
+
+    A row's cells are two spaces or more apart; the first row holds the headings.
+    """
+    lines = text.split("\n")
+    rows = [re.split(r" {2,}", line.strip()) for line in lines]
+    if max(map(len, lines)) <= width or max(map(len, rows)) < _CELLS:
+        return text
+    shown: list[str] = []
+    headings: list[str] = []
+    for line, cells in zip(lines, rows, strict=True):
+        if len(cells) < _CELLS:
+            shown.append(line)
+        elif not headings:
+            headings = cells
+        else:
+            shown.append(f"  {cells[0]}")
+            shown += [f"    {heading} {cell}" for heading, cell in zip(headings, cells[1:], strict=False)]
+    return "\n".join(shown)

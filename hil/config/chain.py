@@ -13,6 +13,7 @@ from hil.description.files import read_arm
 from hil.description.planar import is_planar
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
+from hil.unit_hints import in_other_units
 
 if TYPE_CHECKING:
     from hil.config.schema import Config
@@ -55,13 +56,7 @@ def only_planar(config: "Config", what: str) -> None:
 def chain_slips(config: "Config") -> Iterator[str]:
     """Yield one sentence per mistake in the configuration of a spatial arm; nothing for a valid planar arm."""
     if config.arm.urdf is None:
-        if len(config.joints) > _PLANAR:
-            yield (
-                f"joints: {len(config.joints)} joints need arm.urdf, which gives the geometry; without it, an "
-                "arm has one or two joints"
-            )
-        if config.joint_path is not None:
-            yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
+        yield from _planar_slips(config)
         return
     try:
         described_arm(config)
@@ -69,6 +64,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
         yield f"arm.urdf: {error}"
         return
     if not config.is_chain:
+        yield from _planar_slips(config)
         return
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
@@ -92,6 +88,18 @@ def chain_slips(config: "Config") -> Iterator[str]:
     yield from _path_slips(config)
 
 
+def _planar_slips(config: "Config") -> Iterator[str]:
+    if config.arm.urdf is None and len(config.joints) > _PLANAR:
+        yield (
+            f"joints: {len(config.joints)} joints need arm.urdf, which gives the geometry; without it, an "
+            "arm has one or two joints"
+        )
+    if config.arm.urdf is None and config.joint_path is not None:
+        yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
+    if config.model.base_tilt:
+        yield "model.base_tilt: the tilt of a planar arm is the zero error of its first joint: use model.zeros"
+
+
 def _path_slips(config: "Config") -> Iterator[str]:
     if config.experiment.band is None:
         yield (
@@ -100,6 +108,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
         )
     if config.joint_path is None:
         return
+    least = min(joint.velocity_limit for joint in config.joints)
     parts = zip(config.joints, *config.joint_path.model_dump().values(), strict=False)
     for joint, centre, swing, speed in parts:
         low, high = joint.position_limit
@@ -109,7 +118,11 @@ def _path_slips(config: "Config") -> Iterator[str]:
                 f"position_limit [{low:g}, {high:g}]"
             )
         if speed > joint.velocity_limit:
-            yield f"joint_path.speed: {speed:g} rad/s of {joint.name!r}: its velocity_limit is {joint.velocity_limit:g}"
+            hint = in_other_units(speed, "rad/s", lambda limited: limited <= least)
+            yield (
+                f"joint_path.speed: {speed:g} rad/s of {joint.name!r}: its velocity_limit is {joint.velocity_limit:g}"
+                + (f". {hint}" if hint else "")
+            )
 
 
 def _changed(path: str) -> float:

@@ -2,11 +2,17 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, PositiveFloat
+from pydantic import Discriminator, Field, Tag
 
-from hil.config.table import Table
+from hil.config.table import Table, Turned
+from hil.toml_errors import UNSAID
 
-Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+Point = Annotated[list[Annotated[float, Field(ge=-10, le=10)]], Field(min_length=3, max_length=3)]
+
+_Floor = Annotated[
+    Annotated[float, Field(ge=-5, le=5), Tag(f"{UNSAID}height")] | Annotated[Literal["none"], Tag(f"{UNSAID}none")],
+    Discriminator(lambda value: f"{UNSAID}none" if isinstance(value, str) else f"{UNSAID}height"),
+]
 
 
 class BoxConfig(Table):
@@ -14,15 +20,19 @@ class BoxConfig(Table):
 
     name: str = Field(min_length=1, max_length=40)
     centre: Point = Field(description="m")
-    size: Annotated[list[PositiveFloat], Field(min_length=3, max_length=3)] = Field(description="m along its edges")
-    turned: Point = Field([0.0, 0.0, 0.0], description="roll, pitch and yaw, rad")
+    size: Annotated[list[Annotated[float, Field(gt=0, le=20)]], Field(min_length=3, max_length=3)] = Field(
+        description="m along its edges"
+    )
+    turned: Annotated[list[Turned], Field(min_length=3, max_length=3)] = Field(
+        [0.0, 0.0, 0.0], description="roll, pitch and yaw, rad"
+    )
 
 
 class ClearanceConfig(Table):
     """`[clearance]`: how near a spatial arm may come to itself, the floor and boxes."""
 
     margin: float = Field(0.01, ge=0, le=0.5, description="m that must stay free along the whole planned motion")
-    floor: float | Literal["none"] = Field(
+    floor: _Floor = Field(
         0.0, description='height of the table or floor above the base\'s origin, m; "none" where there is none in reach'
     )
     boxes: list[BoxConfig] = Field([], description="what else is in the way")

@@ -23,9 +23,11 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 
 from hil.config.experiment import ModelConfig
 from hil.config.known_quantities import KnownConfig
+from hil.config.table import Angle, Turned
 from hil.errors import ConfigError
 from hil.toml_errors import describe
 
+Gain = Annotated[float, Field(gt=0, le=100)]
 Column = Annotated[str, Field(min_length=1)]
 TICKS = "ticks"
 PLANAR = 2
@@ -62,17 +64,17 @@ class Columns(_Table):
         "relative", description="absolute: every angle is counted from the same direction, not from the link before"
     )
     ticks_per_turn: PositiveFloat | None = Field(None, description="of the encoders, for positions in ticks")
-    zero: list[float] | None = Field(
+    zero: list[Angle] | None = Field(
         None, description="rad added to each position, so that joint 1 is measured from the horizontal"
     )
     position_step: PositiveFloat | None = Field(
-        None, description="rad per encoder step; detected from the data if absent"
+        None, le=0.05, description="rad per encoder step; detected from the data if absent"
     )
     torque: list[Column] | None = Field(None, description="one column per joint")
     torque_unit: Literal["N m", "mN m", "N cm", "kgf cm", "ozf in", "lbf in"] | None = None
     current: list[Column] | None = Field(None, description="one column per joint, in place of torque")
     current_unit: Literal["A", "mA"] | None = None
-    torque_constant: list[PositiveFloat] | None = Field(
+    torque_constant: list[Gain] | None = Field(
         None, description="N m/A per joint at the output shaft, with current; with resistance also for voltage"
     )
     voltage: list[Column] | None = Field(None, description="motor voltage, one column per joint, in place of torque")
@@ -80,8 +82,10 @@ class Columns(_Table):
     pwm: list[Column] | None = Field(None, description="share of the supply voltage, one column per joint")
     pwm_unit: Literal["1", "%"] | None = None
     supply_voltage: PositiveFloat | None = Field(None, le=1000, description="V, with pwm")
-    resistance: list[PositiveFloat] | None = Field(None, description="of the windings, ohm per joint")
-    torque_per_volt: list[PositiveFloat] | None = Field(
+    resistance: list[Annotated[float, Field(gt=0, le=1000)]] | None = Field(
+        None, description="of the windings, ohm per joint"
+    )
+    torque_per_volt: list[Gain] | None = Field(
         None, description="N m/V per joint at standstill: stall torque over voltage, or torque_constant / resistance"
     )
     between: Literal["held", "linear"] = Field("linear", description="held for a command, linear for a measurement")
@@ -150,7 +154,7 @@ class ArmFacts(BaseModel):
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     urdf: str | None = Field(None, description="URDF or MJCF of a spatial arm, relative to the TOML file")
-    base: list[float] = Field([0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch, yaw")
+    base: list[Turned] = Field([0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch, yaw")
 
 
 class RecordingConfig(BaseModel):

@@ -1,12 +1,13 @@
 """`[experiment]`, `[joint_path]` and `[model]`: the excitation, how it is streamed, and the model terms to fit."""
 
 import math
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from hil.config.table import Range, Table
+from hil.config.table import Angle, Range, Table
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
+from hil.unit_hints import in_other_units
 
 DRIFT = 5.0
 """Ratio of the accepted slow drift between periods to experiment.settle_within."""
@@ -52,11 +53,17 @@ class ExperimentConfig(Table):
         if self.band is not None:
             low, high = self.band
             if not 0 < low < high < self.rate / 4:
-                raise ValueError(f"band = [{low}, {high}]: must be 0 < low < high < rate / 4 = {self.rate / 4:g} Hz")
+                rule = f"must be 0 < low < high < rate / 4 = {self.rate / 4:g} Hz"
+                raise ValueError(f"band = [{low}, {high}]: {rule}{self._meant(self.band)}")
         for lines in self.lines or []:
             if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
                 raise ValueError(f"lines: each list needs different harmonics from 1 to {samples // 4:g}")
         return self
+
+    def _meant(self, band: list[float]) -> str:
+        """Name the unit in which a band that is not below a quarter of the rate would make sense."""
+        hint = in_other_units(band, "Hz", lambda line: 0.5 / self.period <= line < self.rate / 4)
+        return f". {hint}" if hint and band[0] < band[1] else ""
 
     @property
     def drift_within(self) -> float:
@@ -80,9 +87,11 @@ class ExperimentConfig(Table):
 class PathConfig(Table):
     """`[joint_path]`: the path that excites a spatial arm. The upper end of the band is its highest frequency."""
 
-    centre: list[float] = Field(description="rad per joint: centre of the path")
-    swing: list[PositiveFloat] = Field(description="rad per joint: amplitude around the centre")
-    speed: list[PositiveFloat] = Field(description="rad/s per joint: maximum speed")
+    centre: list[Angle] = Field(description="rad per joint: centre of the path")
+    swing: list[Annotated[float, Field(gt=0, le=4 * math.pi)]] = Field(
+        description="rad per joint: amplitude around the centre"
+    )
+    speed: list[Annotated[float, Field(gt=0, le=100)]] = Field(description="rad/s per joint: maximum speed")
 
 
 class ModelConfig(Table):
@@ -102,6 +111,7 @@ class ModelConfig(Table):
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
     lags: bool = Field(False, description=OPTIONS["lags"])
+    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity shows it")
 
     @property
     def fixed_friction(self) -> Friction:

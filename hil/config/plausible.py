@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from hil.drivers.servo_model import Mode, servo_model
+from hil.unit_hints import in_other_units
 
 if TYPE_CHECKING:
     from hil.config.joint import JointConfig
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
 _MOST_TURN_RAD = 4 * math.pi
 _LONGEST_M = 3.0
 _SHORTEST_M = 2e-3
-_MOST_INERTIA = 100.0  # kg m^2
+_LEAST_TIME_SQUARED = 0.1  # s^2/rad
+"""Largest plausible inertia per stall torque: such a joint accelerates at 10 rad/s^2 at most, a tenth of usual ones."""
+
+_MOST_ROTOR = 1e-4  # kg m^2, on the motor's side of the gears
 _GEAR = 8.0
 """Largest ratio of a torque constant to the published one: an external gear, or a very bad guess."""
 
@@ -27,6 +31,7 @@ _SPEED = 4.0
 _CURRENT = 2.0
 """Largest ratio of the current limit to the model's stall current."""
 
+_PERCENT = 100.0
 _LEVER_M = 0.05
 """A link mass is implausible if the servo's stall torque could not hold it at this lever arm [m]."""
 
@@ -56,34 +61,42 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
         yield (
             f"{name} of {where} = {joint.torque_per_goal:g} {unit} is {ratio:.3g} times the published {published:.3g} "
             f"{unit} of a {joint.model}. Use N m at the output shaft, not mN m, kgf cm or the torque of the bare motor"
+            + _meant(joint.torque_per_goal, unit, _GEAR * published, published / _GEAR)
+        )
+    std = joint.torque_per_goal_std
+    if std > joint.torque_per_goal:
+        percent = f"; if in percent, {std / 100 * joint.torque_per_goal:.3g}" if std < _PERCENT else ""
+        yield (
+            f"{name}_std of {where} = {std:g} {unit} is more than {name} itself"
+            + (_meant(std, unit, joint.torque_per_goal) or f". It is a standard error in {unit}")
+            + percent
         )
     fastest = max(stall.voltage for stall in model.stalls) / model.torque_per_ampere.low
     if joint.velocity_limit > _SPEED * fastest:
         yield (
             f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: a {joint.model} cannot exceed {fastest:.2g} "
-            f"rad/s. If it is in degrees/s, write {math.radians(joint.velocity_limit):.3g}; if in rpm, "
-            f"{joint.velocity_limit * math.pi / 30:.3g}"
+            f"rad/s{_meant(joint.velocity_limit, 'rad/s', _SPEED * fastest)}"
         )
     stall = max(stall.voltage if pwm else stall.current for stall in model.stalls)
     if joint.goal_limit > _CURRENT * stall:
         name, unit, kind = ("voltage_limit", "V", "supply") if pwm else ("current_limit", "A", "stall current")
         yield (
-            f"{name} of {where} = {joint.goal_limit:g} {unit}: the {kind} of a {joint.model} is {stall:g} {unit}. "
-            f"If it is in m{unit}, write {joint.goal_limit / 1000:.3g}"
+            f"{name} of {where} = {joint.goal_limit:g} {unit}: the {kind} of a {joint.model} is {stall:g} {unit}"
+            + _meant(joint.goal_limit, unit, _CURRENT * stall)
         )
 
 
 def _angles(key: str, values: Sequence[float], most: float = _MOST_TURN_RAD) -> Iterator[str]:
     if max(abs(value) for value in values) > most:
         shown = ", ".join(f"{value:g}" for value in values)
-        radians = ", ".join(f"{math.radians(value):.4g}" for value in values)
         turns = max(abs(value) for value in values) / (2 * math.pi)
-        yield f"{key} = [{shown}] rad: that is up to {turns:.2g} turns. If it is in degrees, write [{radians}]"
+        hint = in_other_units(values, "rad", lambda value: abs(value) <= most)
+        yield f"{key} = [{shown}] rad: that is up to {turns:.2g} turns" + (f". {hint}" if hint else "")
 
 
 def _length(key: str, length: float) -> Iterator[str]:
     if length > _LONGEST_M:
-        yield f"{key} = {length:g} m is longer than any servo arm. If it is in mm, write {length / 1000:.4g}"
+        yield f"{key} = {length:g} m is longer than any servo arm{_meant(length, 'm', _LONGEST_M)}"
     elif length < _SHORTEST_M:
         yield f"{key} = {length:g} m is shorter than any servo. Give it in metres, from joint to joint"
 
@@ -98,9 +111,9 @@ def _prior(config: "Config") -> Iterator[str]:
             "link_mass": (_heaviest(stall), "kg"),
             "servo_mass": (_heaviest(stall), "kg"),
             "link_centre": (_LONGEST_M, "m"),
-            "link_inertia": (_MOST_INERTIA, "kg m^2"),
-            "armature": (_MOST_INERTIA, "kg m^2"),
-            "viscous": (5 * stall, "N m s/rad"),
+            "link_inertia": (_LEAST_TIME_SQUARED * stall, "kg m^2"),
+            "armature": (_LEAST_TIME_SQUARED * stall, "kg m^2"),
+            "viscous": (2 * stall, "N m s/rad"),
             "coulomb": (stall, "N m"),
         }
         for key, (most, unit) in bounds.items():
@@ -114,15 +127,20 @@ def _stabiliser(config: "Config") -> Iterator[str]:
         return
     for index, joint in enumerate(config.joints):
         stall = _stall_torque(joint)
-        for key, unit in (("stiffness", "N m/rad"), ("damping", "N m s/rad")):
+        for key, unit, times in (("stiffness", "N m/rad", 20.0), ("damping", "N m s/rad", 2.0)):
             value = getattr(config.stabiliser, key)[index]
-            yield from _too_much(f"stabiliser.{key} of joint {joint.name!r}", value, 50 * stall, unit, joint)
+            yield from _too_much(f"stabiliser.{key} of joint {joint.name!r}", value, times * stall, unit, joint)
 
 
 def _known(config: "Config") -> Iterator[str]:
     if config.known is None:
         return
     strongest = max(config.joints, key=_stall_torque)
+    for name in ("rotor_inertia_1", "rotor_inertia_2"):
+        rotor = getattr(config.known, name)
+        if rotor is not None:
+            value = rotor if isinstance(rotor, float) else rotor.value
+            yield from _too_much(f"known.{name}", value, _MOST_ROTOR, "kg m^2", strongest)
     for name, known in config.known.quantities().items():
         key = f"known.{name}"
         if name.startswith(("length", "centre")):
@@ -131,7 +149,8 @@ def _known(config: "Config") -> Iterator[str]:
         elif name.startswith("mass"):
             yield from _too_much(key, known.value, _heaviest(_stall_torque(strongest)), "kg", strongest)
         else:
-            yield from _too_much(key, known.value, _MOST_INERTIA, "kg m^2", strongest)
+            most = _LEAST_TIME_SQUARED * _stall_torque(strongest)
+            yield from _too_much(key, known.value, most, "kg m^2", strongest)
 
 
 def _stall_torque(joint: "JointConfig") -> float:
@@ -150,6 +169,12 @@ def _heaviest(stall_torque: float) -> float:
 def _too_much(key: str, value: float, most: float, unit: str, joint: "JointConfig") -> Iterator[str]:
     if value > most:
         yield (
-            f"{key} = {value:g} {unit}: far more than a {joint.model} can move ({most:.3g} {unit}). Use SI units "
-            "for all quantities: kg, m, N m, rad, s"
+            f"{key} = {value:g} {unit}: far more than a {joint.model} can move ({most:.3g} {unit})"
+            + (_meant(value, unit, most) or ". Use SI units for all quantities: kg, m, N m, rad, s")
         )
+
+
+def _meant(value: float, unit: str, most: float, least: float = 0.0) -> str:
+    """Return ". If it is in mm, write 0.147" for the units in which the value would be plausible; "" if in none."""
+    hint = in_other_units(value, unit, lambda converted: least <= abs(converted) <= most)
+    return f". {hint}" if hint else ""

@@ -28,14 +28,27 @@ from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
-from hil.config.table import Table
+from hil.config.table import Table, Turned
 from hil.drivers.bus import BusConfig
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode
 from hil.errors import ConfigError
 from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
-from hil.toml_errors import describe
+from hil.toml_errors import describe, not_toml
+from hil.unit_hints import in_other_units
+
+__all__ = [
+    "ArmConfig",
+    "Config",
+    "PortConfig",
+    "PriorConfig",
+    "SafetyConfig",
+    "StabiliserConfig",
+    "load_config",
+    "parse_config",
+    "port_url",
+]
 
 FAKE_URL = "fake://"
 LYING_RAD = 0.25
@@ -81,7 +94,7 @@ class ArmConfig(Table):
     urdf: str | None = Field(
         None, description="URDF or MJCF of a spatial arm: a file beside this one; [[joints]] use its joint names"
     )
-    base: Annotated[list[float], Field(min_length=3, max_length=3)] = Field(
+    base: Annotated[list[Turned], Field(min_length=3, max_length=3)] = Field(
         [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of the base, rad"
     )
     rest_pose: list[float] = Field(description="rad: where the undriven arm comes to rest")
@@ -110,11 +123,11 @@ class SafetyConfig(Table):
     )
     max_late: int | None = Field(None, ge=1, le=1000, description="consecutive missed deadlines, instead of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
-    rest_velocity: PositiveFloat = Field(0.1, description="rad/s below which a joint counts as at rest")
-    slew: PositiveFloat = Field(100.0, description="A/s (V/s in PWM mode): maximum rate of change of goals")
+    rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s below which a joint counts as at rest")
+    slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")
     max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
-    min_voltage: float = Field(0.0, ge=0, description="V; default: the models' factory shutdown thresholds")
-    max_voltage: PositiveFloat = Field(30.0, description="V")
+    min_voltage: float = Field(0.0, ge=0, le=60, description="V; default: the models' factory shutdown thresholds")
+    max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
         0.3, le=1, description="fraction of the planned peak by which it may deviate for longer"
@@ -297,7 +310,7 @@ def parse_config(text: str, path: Path) -> Config:
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}.") from error
+        raise ConfigError(not_toml(path, error)) from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
     if "joints" not in values and "study" in values:
@@ -344,9 +357,10 @@ def _check_peak_torque(joint: JointConfig, peak: float) -> None:
     most = joint.goal_limit * joint.torque_per_goal
     product = "voltage_limit * torque_per_volt" if joint.drive_mode is Mode.PWM else "current_limit * torque_constant"
     if peak > most * (1 + 1e-9):
+        hint = in_other_units(peak, "N m", lambda torque: 0.001 * most < torque <= most)
         raise ValueError(
             f"experiment.peak_torque: {peak:g} N m for joint {joint.name!r} is more than "
-            f"{product} = {math.floor(most * 1000) / 1000:g} N m"
+            f"{product} = {math.floor(most * 1000) / 1000:g} N m" + (f". {hint}" if hint else "")
         )
 
 

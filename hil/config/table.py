@@ -1,5 +1,6 @@
 """The base class and field types shared by all tables of the TOML file."""
 
+import math
 from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
@@ -20,4 +21,10 @@ OneOrList = Annotated[
     Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
 ]
 """A single value or a list; validation errors refer to the form that was given."""
+Angle = Annotated[float, Field(ge=-4 * math.pi, le=4 * math.pi)]
+"""An angle of a joint [rad]: up to two turns, so that degrees are noticed."""
+
+Turned = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
+"""An angle by which something is mounted [rad]."""
+
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]

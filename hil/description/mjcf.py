@@ -16,6 +16,8 @@ WORLD = 0
 PIVOTS = {0: "free", 1: "ball", 2: "slide", 3: "hinge"}
 HINGE = 3
 LOOPS = {0: "connect", 1: "weld"}
+KINDS = {0: "plane", 2: "sphere", 3: "capsule", 5: "cylinder", 6: "box"}
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2}
 COUPLED = 2  # an equality of two joints' angles
 
 
@@ -50,6 +52,47 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         if not each.body.is_physical
     )
     return ArmDescription(path, "world", tuple(arm), tuple(held), doubts)
+
+
+@dataclass(frozen=True)
+class Geom:
+    """A shape of an MJCF file, in the frame of its moving link.
+
+    link: 0 for whatever is fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as MuJoCo
+    counts it, half edges or radius and half length [m]; of a mesh and any other shape, those of its bounding box.
+    """
+
+    link: int
+    kind: str
+    size: tuple[float, ...]
+    rotation: Array
+    translation: Array
+
+
+def read_geoms(path: Path, joints: Sequence[str]) -> list[Geom]:
+    """The shapes of the arm of these joints and of what is fixed to the world, without planes.
+
+    Shapes that touch nothing, such as those for pictures, count only for links that have no others. Raises
+    ArmFileError.
+    """
+    tree = _Tree(_compiled(path), path)
+    model = tree.model
+    number = {body: index for index, body in enumerate(tree.branch(list(joints)), start=1)}
+    found: list[tuple[bool, Geom]] = []
+    for index in range(model.ngeom):
+        kind = KINDS.get(int(model.geom_type[index]), "mesh")
+        if kind == "plane":
+            continue
+        turn, place = _rotation(model.geom_quat[index]), np.array(model.geom_pos[index])
+        size = model.geom_size[index][: SIZES.get(kind, 3)]
+        if kind == "mesh":
+            place = place + turn @ model.geom_aabb[index][:3]
+            size = model.geom_aabb[index][3:]
+        link, turn, place = tree.on_link(int(model.geom_bodyid[index]), turn, place, number)
+        touches = bool(model.geom_contype[index] or model.geom_conaffinity[index])
+        found.append((touches, Geom(link, kind, tuple(map(float, size)), turn, place)))
+    solid = {geom.link for touches, geom in found if touches}
+    return [geom for touches, geom in found if touches or geom.link not in solid]
 
 
 def _compiled(path: Path) -> Any:
@@ -147,6 +190,16 @@ class _Tree:
             turn, place = self._placed(part)
             rotation, translation = turn @ rotation, turn @ translation + place
         return rotation, translation + rotation @ self._pivot(body) - self._pivot(before)
+
+    def on_link(
+        self, body: int, rotation: Array, translation: Array, number: dict[int, int]
+    ) -> tuple[int, Array, Array]:
+        """The moving link to which a body is fixed, and a pose in the body expressed in that link's frame."""
+        while body != WORLD and body not in number:
+            turn, place = self._placed(body)
+            rotation, translation = turn @ rotation, turn @ translation + place
+            body = int(self.model.body_parentid[body])
+        return number.get(body, 0), rotation, translation - self._pivot(body)
 
     def rigid(self, body: int, chosen: set[int]) -> tuple[Body, list[str], list[str]]:
         """A body about its joint, merged with all that does not move against it; names of those, and of joints held."""

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.dry_run.bounded_energy import Boundary, boundary
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import scaled_feedback
 from hil.estimator.models.parameters import CONSTANTS, Physics
@@ -44,6 +45,11 @@ _AHEAD_S = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2)
 """Times over which position is extrapolated by velocity [s], to find the moments that lead to the largest overshoot."""
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
+_JUDGED_AFTER_S = (0.05, 0.2, 0.5)
+"""Times after torque off at which the remaining swing is omitted if the arm's energy keeps it within its limits [s].
+
+The first is many time constants of the current's lag, so that the motor no longer adds energy.
+"""
 _REACTION = 2
 """Samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
 
@@ -253,18 +259,31 @@ class _Stops:
     def farthest(self, physics: Physics, scale: Array, starts: list[_Start], commands: _Commands) -> Array:
         """The largest overshoot beyond a limit (joints,) [rad]."""
         reached = np.zeros_like(scale)
+        limits = {jammed: self._boundary(physics, jammed) for jammed in {start.jammed for start in starts}}
         for start in starts:
-            arm = physics if start.jammed is None else _held(physics, start.jammed)
             for pieces in commands(start):
                 state = start.state
-                for command, feedback, count in pieces:
-                    held = np.repeat((command * scale)[:, None], count, axis=1)
-                    moved = respond(arm, state, held, self._rate, scaled_feedback(feedback, scale))
-                    state = moved.state
-                    for joint, position in enumerate(moved.position):
-                        beyond = max(self._low[joint] - position.min(), position.max() - self._high[joint])
-                        reached[joint] = max(reached[joint], beyond)
+                for moved in self._moved(limits[start.jammed], scale, state, pieces):
+                    low, high = moved.position.min(axis=1), moved.position.max(axis=1)
+                    reached = np.maximum(reached, np.maximum(self._low - low, high - self._high))
         return reached
+
+    def _boundary(self, physics: Physics, jammed: int | None) -> Boundary:
+        return boundary(physics if jammed is None else _held(physics, jammed), self._low, self._high)
+
+    def _moved(self, limits: Boundary, scale: Array, state: Array, pieces: list[_Piece]) -> Iterator[Response]:
+        """The motion from `state`, piece by piece, as long as it may still leave the limits."""
+        for command, feedback, count in pieces:
+            held = np.repeat((command * scale)[:, None], count, axis=1)
+            off = command is self._off[0] and feedback is self._none
+            at = [round(after * self._rate) for after in _JUDGED_AFTER_S if off]
+            for part in np.split(held, [sample for sample in at if 0 < sample < count], axis=1):
+                torque = np.ascontiguousarray(part)
+                moved = respond(limits.physics, state, torque, self._rate, scaled_feedback(feedback, scale))
+                state = moved.state
+                yield moved
+                if off and limits.holds(state[0], state[1]):
+                    return
 
     def cut(self, start: _Start) -> Iterator[list[_Piece]]:
         yield [(start.goal, self._none, _REACTION), self._off]

@@ -1,19 +1,20 @@
-"""What a run that was stopped by its user still holds, and the command that goes on from there."""
+"""What a run that was stopped still holds, and the command that goes on from there."""
 
 from pathlib import Path
 
 from hil.errors import HilError
 from hil.estimation.settled_period import settled_period
+from hil.estimator.errors import EstimationError
 from hil.next_step import next_step
 from hil.plan.plan import IDENTIFY
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 
 
-def after_a_stop(run: RunFolder, shown: Path) -> list[str]:
+def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
     """Sentences about what is kept; the last one is the next command.
 
-    shown: the configuration's path as the user wrote it.
+    command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """
     if run.result_path.is_file():
         return ["The result is kept; the report is missing.", next_step("report", run.path)]
@@ -26,7 +27,14 @@ def after_a_stop(run: RunFolder, shown: Path) -> list[str]:
             "rougher than that of a finished run.",
             next_step("estimate", steps[-1]),
         ]
-    return [f"What was recorded until then is kept in {run.path}; no period had settled.", next_step("identify", shown)]
+    return [f"What was recorded until then is kept in {run.path}; no period had settled.", next_step(command, shown)]
+
+
+def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
+    """The same after a stop by the guard or a servo's failure: nothing moves again before the arm has been checked."""
+    if can_be_estimated(run.path):
+        return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
+    return [f"What was recorded until then is kept in {run.path}.", next_step("check", shown)]
 
 
 def can_be_estimated(path: Path) -> bool:
@@ -37,7 +45,7 @@ def can_be_estimated(path: Path) -> bool:
         if IDENTIFY not in facts.segments:
             return False
         settled_period(config, facts, load_samples(run.samples_path, len(config.joints)), IDENTIFY)
-    except (HilError, ValueError):
+    except (HilError, EstimationError, ValueError):
         return False
     return True
 

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
+from hil.estimation.chain_calibrate import calibrate_chain_runs, link_of
 from hil.estimation.model_from_config import voltage_driven, wanted_model
+from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimation.settled_period import settled_period
 from hil.estimator.calibration import Calibration, KnownMass, calibrate
+from hil.estimator.chain.calibration import ChainCalibration, MassOnLink
 from hil.estimator.identify import identify
 from hil.plan.plan import IDENTIFY
 from hil.results.json_form import Spread
@@ -64,11 +66,42 @@ class CalibrationResult:
     fit: CalibrationFit
 
 
-def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -> CalibrationResult:
+@dataclass(frozen=True)
+class AddedMass:
+    """The mass as the user gives it: `distance` and `length` for a planar arm, `at` and `joint` for a spatial one.
+
+    mass [kg], inertia about its own centre [kg m^2]. distance: from the last joint; length: of link 1 [m]. at: place in
+    the frame of the link that `joint` moves, by default the last joint [m].
+    """
+
+    mass: float
+    inertia: float = 0.0
+    distance: float | None = None
+    length: float | None = None
+    at: tuple[float, float, float] | None = None
+    joint: str | None = None
+
+
+def calibrate_runs(without: RunFolder, with_mass: RunFolder, added: AddedMass) -> CalibrationResult:
     """Estimate the torque constants; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
     config, other = without.load_config(), with_mass.load_config()
-    only_planar(config, "a calibration by a known mass")
     _same_arm(config, other)
+    if config.is_chain:
+        if added.at is None or added.distance is not None or added.length is not None:
+            raise ConfigError(
+                "a spatial arm: give the place of the mass in its link's frame, --at X Y Z in metres (and --joint NAME "
+                "if it is not on the last link), instead of --distance and --length."
+            )
+        mass = MassOnLink(added.mass, added.at, link_of(config, added.joint), added.inertia)
+        return _described_chain(config, calibrate_chain_runs((without, with_mass), (config, other), mass))
+    if added.distance is None or added.at is not None or added.joint is not None:
+        raise ConfigError(
+            "a planar arm: give --distance, of the mass from the last joint, instead of --at and --joint."
+        )
+    length = added.length
+    if length is None and config.known is not None and config.known.length_1 is not None:
+        length = config.known.quantities()["length_1"].value
+    known = KnownMass(added.mass, added.distance, added.inertia, length or 0.0)
     if config.arm.gravity == 0.0:
         raise ConfigError("arm.gravity = 0: gravity does not act on the mass; calibrate in a vertical plane.")
     periods = [
@@ -83,29 +116,50 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, known: KnownMass) -
 
 
 def _same_arm(config: Config, other: Config) -> None:
-    for one, two in zip(config.joints, other.joints, strict=False):
+    if len(config.joints) != len(other.joints):
+        raise ConfigError(f"one run has {len(config.joints)} joints and the other {len(other.joints)}.")
+    for one, two in zip(config.joints, other.joints, strict=True):
         if one.torque_per_goal != two.torque_per_goal:
             raise ConfigError(
                 f"joint {one.name!r}: one run assumes {one.torque_per_goal:g} N m per unit of goal, the other "
                 f"{two.torque_per_goal:g}; record both with the same TOML file."
             )
-    if len(config.joints) != len(other.joints):
-        raise ConfigError(f"one run has {len(config.joints)} joints and the other {len(other.joints)}.")
+
+
+def _constants(config: Config, factor: list[float], std: list[float]) -> dict[str, TorqueConstant]:
+    return {
+        joint.name: TorqueConstant(
+            value=joint.torque_per_goal * factor[i],
+            std=joint.torque_per_goal * std[i],
+            supposed=joint.torque_per_goal,
+            unit=f"N m/{'V' if joint.drive_mode.name == 'PWM' else 'A'}",
+        )
+        for i, joint in enumerate(config.joints)
+    }
+
+
+def _described_chain(config: Config, found: ChainCalibration) -> CalibrationResult:
+    names = found.estimate.model.linear_names
+    steps = found.residual_steps
+    return CalibrationResult(
+        schema=SCHEMA,
+        torque_per_goal=_constants(config, found.factor.tolist(), found.factor_std.tolist()),
+        parameters={
+            name: Estimated(float(value), float(error))
+            for name, value, error in zip(names, found.value, found.std, strict=True)
+        },
+        fit=CalibrationFit(
+            residual_rms_ticks=tuple(map(tuple, steps.tolist())),
+            misfit=float(np.mean((steps / QUANTISATION_FLOOR_TICKS) ** 2)),
+            joints=len(config.joints),
+        ),
+    )
 
 
 def _described(config: Config, found: Calibration) -> CalibrationResult:
-    factor, std = found.factor.tolist(), found.factor_std.tolist()
     return CalibrationResult(
         schema=SCHEMA,
-        torque_per_goal={
-            joint.name: TorqueConstant(
-                value=joint.torque_per_goal * factor[i],
-                std=joint.torque_per_goal * std[i],
-                supposed=joint.torque_per_goal,
-                unit=f"N m/{'V' if joint.drive_mode.name == 'PWM' else 'A'}",
-            )
-            for i, joint in enumerate(config.joints)
-        },
+        torque_per_goal=_constants(config, found.factor.tolist(), found.factor_std.tolist()),
         parameters={
             name: Estimated(float(value), float(error))
             for name, value, error in zip(found.names, found.value, found.std, strict=True)

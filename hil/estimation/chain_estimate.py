@@ -13,9 +13,11 @@ from hil.errors import RecordingCutShort
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimation.truth import back_emf
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
 from hil.fakes.plants.arm import armature
 from hil.plan.chain_model import KnownChain, known_chain
@@ -94,7 +96,7 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
-    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, scales)
+    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, scales, wanted.base_tilt)
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:
@@ -108,6 +110,11 @@ def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float]
     for quantity in ("viscous", "coulomb", "offset"):
         for joint, drive in enumerate(chain.drives, start=1):
             truth[f"{quantity}_{joint}"] = getattr(drive, quantity)
+    assert config.fake is not None
+    for name, damping in back_emf(config, config.fake, chain.drives).items():
+        truth[name] += damping
+    if config.model.base_tilt:
+        truth |= dict(zip(TILT, tilt_between(known.base.chain.gravity, chain.gravity_vector), strict=True))
     return truth
 
 
@@ -176,5 +183,10 @@ def _verdict(
         sentences.append(
             f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
             "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
+        )
+    if estimate.unseen:
+        sentences.append(
+            f"Gravity does not show {', '.join(estimate.unseen)} in this motion: they are not identifiable, and are "
+            "taken as zero within their standard errors."
         )
     return Verdict(trust, weakest, tuple(sentences))

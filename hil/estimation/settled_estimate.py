@@ -41,6 +41,8 @@ from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFacts, RunFolder
 from hil.runs.timing import timing
 
+__all__ = ["estimate_run"]
+
 log = logging.getLogger(__name__)
 
 

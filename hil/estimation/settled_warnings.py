@@ -14,6 +14,8 @@ SHORT = 0.85  # ratio of measured to commanded current below which the current w
 OFTEN = 0.05  # fraction of the samples with large goals
 LEAST_SWING = 30.0  # encoder steps
 LOST = 0.01  # fraction of the samples
+LATE = 0.25  # of the interval: a write that is later disturbs the motion visibly
+BY_LATENESS = 0.3  # of the lost samples: from this share of late ones on, the computer is the likely cause
 
 
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
@@ -29,11 +31,24 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
         if lost > LOST:
+            late = _late_share(config, samples)
+            remedy = (
+                f"this computer was late for {100 * late:.1f} %: close other programs, or lower experiment.rate."
+                if late > BY_LATENESS * lost
+                else "check cable, baud rate and sampling rate."
+            )
             found.append(
-                f"{joint.name}: {100 * lost:.1f} % of the samples are missing or far from their neighbours; check "
-                "cable, baud rate and sampling rate."
+                f"{joint.name}: {100 * lost:.1f} % of the samples are missing or far from their neighbours; {remedy}"
             )
     return found
+
+
+def _late_share(config: Config, samples: NDArray[np.void]) -> float:
+    """Fraction of the periodic samples that this computer wrote late, or left out because it was too late."""
+    played = samples[samples["phase"] == Phase.PERIODIC]
+    left_out = played["time_after_read"] <= played["time_before_write"]
+    late = played["time_before_write"] - played["deadline"] > LATE / config.experiment.rate
+    return float(np.mean(left_out | late)) if len(played) else 0.0
 
 
 def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
@@ -48,16 +63,19 @@ def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
 
 def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]) -> list[str]:
     """Detect a motor that receives less current than commanded, from a sagging supply or its own current limit."""
-    # Large goals change slowly near their peak, so a lagging current loop does not count as clipping.
-    large = (np.abs(goal) > LARGE * np.abs(goal).max()) & np.isfinite(measured)
+    # A sample's current answers the goal of the sample before it, and a lagging current loop is not clipping either:
+    # the smaller of two successive goals is what the motor has had time to follow.
+    least = np.minimum(np.abs(goal[1:]), np.abs(goal[:-1])) * (goal[1:] * goal[:-1] > 0.0)
+    measured = measured[1:]
+    large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured)
     if not large.any():
         return []
-    short = np.abs(measured[large]) < SHORT * np.abs(goal[large])
+    short = np.abs(measured[large]) < SHORT * least[large]
     part = float(np.mean(short))
     if part <= OFTEN:
         return []
     return [
         f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
         "high-torque samples: the servo's own current limit or, at speed, the supply voltage clips it; lower "
-        "peak_torque or raise the supply voltage."
+        "peak_torque (with pilot = true: current_limit) or raise the supply voltage."
     ]

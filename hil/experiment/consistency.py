@@ -56,7 +56,10 @@ samples per period, the fastest that is played, needs 0.27.
 
 
 class Consistency:
-    """Compares one joint's position [rad] with its velocity [rad/s]."""
+    """Compares one joint's position [rad] with its velocity [rad/s].
+
+    It runs for each joint in each exchange, so it is written for speed: comparisons instead of abs and max.
+    """
 
     def __init__(self) -> None:
         self._position: float | None = None
@@ -76,42 +79,40 @@ class Consistency:
 
         unsure: excess duration of its exchange [s], in which the time of the measurement is not known.
         """
-        former, self._position = self._position, position
-        before, self._velocity = self._velocity, velocity
-        short = self._short
+        former, before = self._position, self._velocity
+        self._position, self._velocity = position, velocity
         if former is None:
-            short.restart(velocity)
+            self._short.restart(velocity)
             self._long.restart(velocity)
             self._forget_sums()
             return False
         moved = position - former
+        turned = velocity - before if velocity > before else before - velocity
         difference = moved - 0.5 * (before + velocity) * seconds
-        curved = CURVED * seconds * abs(velocity - before)
-        unknown = unsure * abs(velocity)
+        curved = CURVED * seconds * turned
+        unknown = unsure * velocity if velocity > 0.0 else -unsure * velocity
+        known = LAG_S * turned + SCALE * (moved if moved > 0.0 else -moved) + curved + unknown
+        if self._steps.look((difference if difference > 0.0 else -difference) - known, seconds):
+            return True
+        short = self._short
         short.add(moved, difference, velocity, seconds, curved, unknown)
-        known = LAG_S * abs(velocity - before) + SCALE * abs(moved) + curved + unknown
-        if self._steps.look(abs(difference) - known, seconds):
+        if short.is_wrong(velocity, self._lag, self._scale):
             return True
-        if short.is_wrong(velocity, self._lag, self._scale) or self._looks_long(
-            moved, difference, velocity, seconds, curved, unknown
-        ):
-            return True
-        if self._learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
-            self._learn(velocity, seconds)
-        return False
-
-    def _looks_long(
-        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
-    ) -> bool:
-        """Add an interval to the long memory, which takes several at once: it is slow anyway, and time is scarce."""
-        self._sum_seconds += seconds
+        # The long memory takes several intervals at once: it is slow anyway, and time is scarce.
         self._sum_moved += moved
         self._sum_difference += difference
         self._sum_unknown += unknown
         if curved > self._most_curved:
             self._most_curved = curved
-        if self._sum_seconds < LONG_EVERY_S:
-            return False
+        self._sum_seconds += seconds
+        if self._sum_seconds >= LONG_EVERY_S and self._looks_long(velocity):
+            return True
+        if self._learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
+            self._learn(velocity, seconds)
+        return False
+
+    def _looks_long(self, velocity: float) -> bool:
+        """Add the intervals since the last time to the long memory; return whether it shows a disagreement."""
         long = self._long
         long.add(
             self._sum_moved, self._sum_difference, velocity, self._sum_seconds, self._most_curved, self._sum_unknown
@@ -159,7 +160,10 @@ class _Steps:
             return False
         self._since += seconds
         self._age += seconds
-        square = step * step if step > 0.0 else 0.0
+        if step <= 0.0:  # nearly always
+            self._square -= seconds / (self._age if self._age < LONG_S else LONG_S) * self._square
+            return self._count >= STEPS
+        square = step * step
         most = max(STEP_RAD * STEP_RAD, STEP_TIMES * STEP_TIMES * self._square)
         if square > most and self._age > SHORT_S:  # before that, the usual differences are being learnt
             self._count = self._count + 1 if self._since < STEPS_S else 1

@@ -26,6 +26,8 @@ from hil.experiment.status_check import StatusCheck
 from hil.experiment.work import Work
 from hil.plan.find_torque import how_to_find_torque
 
+__all__ = ["MOST_OUTSIDE_RAD", "Guard"]
+
 JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
 
@@ -43,6 +45,9 @@ MOST_OUTSIDE_RAD = 0.15
 
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
+
+NONE_HEARD = "No servo was heard"
+"""Of a stop because all replies are missing."""
 
 
 class _Limits(NamedTuple):
@@ -245,8 +250,8 @@ class Guard:
     def _silence_remedy(self) -> str:
         if len(self._missing) == 1 or not all(self._missing):
             return "Check its cable and its supply."
-        # With Fast Sync Read a servo that is silent also hides those that would answer after it.
-        shared = "No servo was heard: check the adapter, the cables and the supply"
+        # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
+        shared = f"{NONE_HEARD}: check the adapter, the cables and the supply"
         if self._silence.is_busy:
             return f"{shared}, and whether other programs keep this computer busy: this program was late just before."
         return f"{shared}."

@@ -31,14 +31,43 @@ _FRICTIONS = 8.0
 _TILT_SHARE = 0.2  # standard deviation of gravity out of the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
 """Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
+_UNDESCRIBED = {"gravity": 10.0, "viscous": 6.0, "offset": 0.3}
+"""Standard deviations for an arm without a description, as multiples of the planned torque in SI units; others 1.
+
+A small first torque moves an arm by a tenth of a radian: its gravity is ten times as large.
+"""
 _STILL_RAD_S = 0.06
-_STEP_S = 0.06
+_STEP_S = 0.02
 """Time for which a joint must seem to stand under a torque that is held over several exchanges [s]."""
 
 _LAG_S = 0.012
 """Time constant with which a step of the torque shows in the velocity [s]: current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
+_WINDOW_S = 0.3
+"""Time over which the commanded torques are told of a joint that stands still [s]: a multisine often crosses zero."""
+
+
+class _Range:
+    """Smallest and largest value within the last `_WINDOW_S`, or the last half of it."""
+
+    def __init__(self) -> None:
+        self._began = -math.inf
+        self._former = self._present = (0.0, 0.0)
+
+    def add(self, value: float, now: float) -> None:
+        if now - self._began >= 0.5 * _WINDOW_S:
+            self._former, self._present, self._began = self._present, (value, value), now
+            return
+        low, high = self._present
+        if value < low:
+            self._present = value, high
+        elif value > high:
+            self._present = low, value
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        return min(self._former[0], self._present[0]), max(self._former[1], self._present[1])
 
 
 class ModelWatch:
@@ -67,6 +96,7 @@ class ModelWatch:
         held = interval < 0.99 / config.experiment.rate
         self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
         self._felt = [0.0] * len(largest)
+        self._commanded = [_Range() for _ in largest]
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
 
@@ -86,7 +116,9 @@ class ModelWatch:
         torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
         if self._follows < 1.0:
             follows = self._follows
-            torque = self._felt = [felt + follows * (now - felt) for felt, now in zip(self._felt, torque, strict=True)]
+            torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
+        for commanded, each in zip(self._commanded, torque, strict=True):
+            commanded.add(each, now)
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint < 0:
             self._stands_for = 0.0
@@ -102,9 +134,10 @@ class ModelWatch:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
+            low, high = self._commanded[joint].limits
             said = (
-                f"{name} stands still, with {abs(self._felt[joint]):.3f} N m commanded at this moment: any arm "
-                "consistent with the prior and the data so far would move. Something blocks it, or its encoder is "
+                f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
+                "arm consistent with the prior and the data so far would move. Something blocks it, or its encoder is "
                 "frozen."
             )
         else:
@@ -145,7 +178,6 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
 
     Friction decides whether a joint that stands still is held: without a bound on it, any torque might be too small.
     """
-    each = {"gravity": 3.0, "tilt": 1.0, "offset": 1.0, "viscous": 3.0, "armature": 3.0, "inertia": 3.0}
     guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
     mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
     spread = np.zeros(len(NAMES))
@@ -157,5 +189,5 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
         if term == "coulomb":
             spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
         else:
-            spread[index] = each.get(term, 3.0) * largest[joint]
+            spread[index] = _UNDESCRIBED.get(term, 1.0) * largest[joint]
     return mean, np.diag(spread**2)

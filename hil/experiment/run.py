@@ -14,7 +14,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.experiment.guard import MOST_OUTSIDE_RAD
+from hil.experiment.guard import MOST_OUTSIDE_RAD, NONE_HEARD
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
@@ -26,7 +26,9 @@ from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
 from hil.setup.realtime import on_time
-from hil.setup.servo_session import has_moved, servo_session
+from hil.setup.servo_session import REBOOT_S, has_moved, servo_session
+
+__all__ = ["run_experiment"]
 
 _LAST_SAMPLES = 100
 """Number of samples attached to an exception."""
@@ -131,7 +133,37 @@ def _play(
             error.add_note(str(bus.torque_off_report))
         cause = error.__context__ if isinstance(error, TorqueNotOff) else error
         note(f"stopped: {cause or 'at its end:'} {bus.torque_off_report}")
+        if isinstance(error, TorqueNotOff):
+            _try_again(bus, note)
+            error.args = (str(bus.torque_off_report),)
+        if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):
+            cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
+            note(who)
         raise
+
+
+def _try_again(bus: ServoBus, note: Note) -> None:
+    """Cut the torque of servos that did not answer, once more after the time in which a servo boots."""
+    bus.port.clock.wait_until(bus.port.clock.now() + REBOOT_S)
+    for drive in bus.drives:
+        with suppress(DriverError):
+            if bus.confirm_later(drive):
+                note(f"{drive.title} answers again; {bus.torque_off_report}")
+
+
+def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
+    """If no servo was heard: which ones answered when torque was cut, since a silent servo hides those after it."""
+    report = bus.torque_off_report
+    if not isinstance(stop, SafetyStop) or stop.cause is not Cause.MISSING or report is None:
+        return ""
+    silent = {joint for joint, _ in report.unconfirmed} | report.later | report.rebooted
+    heard = [str(joint) for joint in bus.drives if joint not in silent]
+    if NONE_HEARD not in str(stop) or not silent or not heard:
+        return ""
+    return (
+        f"No servo was heard then, but {' and '.join(heard)} answered afterwards and {' and '.join(map(str, silent))} "
+        "did not: a silent servo hides those after it. Check its cable and its supply."
+    )
 
 
 def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> None:

@@ -9,7 +9,10 @@ from hil.export.xml_text import comment, numbers
 
 def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
     """Add actuators controlled by a goal [A, or V in pwm mode]: gain gives torque, bias the offset, filter the drive's
-    lag.
+    lag. Each has its joint's name.
+
+    A cable is the joint's own spring; one that pushes the joint away from its angle, which a joint cannot have, is
+    part of the bias.
     """
     actuators = ET.SubElement(root, "actuator")
     units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)
@@ -17,14 +20,13 @@ def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
     lag = model.values.get("lag", 0.0)
     drive = {"dyntype": "filterexact", "dynprm": numbers(lag)} if lag > 0 else {}
     for number, facts in enumerate(model.joints, start=1):
+        away = min(0.0, model.values.get(f"cable_stiffness_{number}", 0.0))
         ET.SubElement(
             actuators,
             "general",
-            drive,
-            name=facts.name,
-            joint=facts.name,
+            {"name": facts.name, "joint": facts.name, **drive},
             gainprm=numbers(model.torque_per_goal(number)),
             biastype="affine",
-            biasprm=numbers(-model.values.get(f"offset_{number}", 0.0), 0, 0),
+            biasprm=numbers(-model.values.get(f"offset_{number}", 0.0), -away, 0),
             ctrlrange=numbers(-facts.goal_limit, facts.goal_limit),
         )

@@ -80,12 +80,12 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     """Write the MJCF `path`; return what MJCF cannot represent. Raises ExportError."""
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
-    solids = [] if is_mjcf(found.path) else solids_of(found.arm)
-    kept = ("offset_", "lag")
+    solids = solids_of(found.arm)
+    kept = ("offset_", "lag", "base_tilt")
     left = [*_not_in_mjcf(found, solids), *(each for each in found.left_out if not each.startswith(kept))]
     _describe(root, model, found, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    ET.SubElement(root, "option", gravity=numbers(*model.geometry.gravity), timestep="0.001", integrator="implicitfast")
+    ET.SubElement(root, "option", gravity=numbers(*model.base_gravity), timestep="0.001", integrator="implicitfast")
     parent = ET.SubElement(root, "worldbody")
     for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
         number = index + 1
@@ -112,9 +112,10 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
 
 
 def _not_in_mjcf(found: ChainLinks, solids: Sequence[Solid]) -> list[str]:
-    if is_mjcf(found.path):
-        return ["the shapes, sites and sensors of the file that described the arm"]
-    meshes = ["the URDF's meshes"] if any(not solid.size for solid in solids) else []
+    is_known = not is_mjcf(found.path)
+    meshes = [f"the {'URDF' if is_known else 'MJCF'}'s meshes"] if any(not solid.size for solid in solids) else []
+    if not is_known:
+        return [*meshes, "the sites, sensors and actuators of the file that described the arm"]
     return [*meshes, "the URDF's effort limits and fixed frames"]
 
 

@@ -12,6 +12,7 @@ from hil.errors import ExportError
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.physical_links import nearest_links
+from hil.estimator.chain.model.tilt import TILT
 from hil.export.source import Source
 
 FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added
@@ -39,7 +40,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     except ArmFileError as error:
         raise ExportError(f"The URDF used for the run is needed: {error}.") from error
     geometry = model.geometry
-    base = BaseParameters.of(Chain(geometry.rotation, geometry.translation, geometry.axis, geometry.gravity))
+    chain = Chain(geometry.rotation, geometry.translation, geometry.axis, geometry.gravity)
+    base = BaseParameters.of(chain, tilts=TILT[0] in model.values)
     value = np.array([model.values[name] for name in base.names])
     std = np.array([model.stds[name] for name in base.names])
     rotors = np.array([max(model.values.get(f"armature_{n}", 0.0), 1e-3) for n in range(1, len(model.joints) + 1)])

@@ -24,6 +24,8 @@ from hil.export.foxglove import (
 from hil.export.moving_scene import moving_scene
 from hil.export.source import Recorded
 
+__all__ = ["export_mcap"]
+
 _SHOWN_HZ = 50.0
 """Rate of the frames [Hz]: as smooth as a screen shows."""
 _WHOLE = ("phase", "segment", "period", "error", "missing")

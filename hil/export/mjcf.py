@@ -12,7 +12,7 @@ from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text
 from hil.export.xml_text import axis, describe, numbers, to_text
 
-_CARRIED = ("armature", "offset", "lag")
+_CARRIED = ("armature", "offset", "lag", "cable_stiffness")
 
 
 def export_mjcf(source: Source, path: Path) -> list[str]:
@@ -39,9 +39,12 @@ def export_mjcf(source: Source, path: Path) -> list[str]:
 def _add_body(parent: ET.Element, model: ArmModel, index: int, link: LinkMass, along: float) -> ET.Element:
     facts, number = model.joints[index], index + 1
     body = ET.SubElement(parent, "body", name=f"link_{number}", pos=numbers(along, 0, 0))
+    cable = model.values.get(f"cable_stiffness_{number}", 0.0)
+    spring = {"stiffness": numbers(cable), "springref": "0"} if cable > 0 else {}
     ET.SubElement(
         body,
         "joint",
+        spring,
         name=facts.name,
         type="hinge",
         axis=axis(model),

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
+from hil.chain_model import ChainArmModel
 from hil.errors import ExportError, RunFolderError
+from hil.estimator.models.terms import kind_of
 from hil.export.mjcf import export_mjcf
 from hil.export.source import Source
 from hil.export.urdf import export_urdf
@@ -27,6 +29,12 @@ TABLE = "arms.parquet"
 MOST_SAMPLES = 100_000
 _TRIES = 20
 """Rounds in which draws without physical masses are replaced."""
+
+_FRICTION = ("viscous", "coulomb")
+_LEAST_WIDTH = 1e-4
+"""Smallest width of a drawn arm's Coulomb step [rad/s]: hardly different from friction that truly sticks."""
+_POSES = 20
+"""Poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 
 _IN_TORQUE = ("N m", "kg m^2")
 """Parameters whose units start like this scale with the torque constant."""
@@ -58,6 +66,8 @@ def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: 
     rng = np.random.default_rng(seed)
     values = mean + _matched(rng, samples, len(names)) @ _root(covariance).T
     values, redrawn = _physical(source, names, mean, covariance, values, rng)
+    width = np.array([kind_of(name) == "coulomb_width" for name in names])
+    values = np.where(width, np.maximum(values, _LEAST_WIDTH), values)
     spread = _torque_spread(source.model) if torque_constants else 0.0
     factor = np.exp(spread * _matched(rng, samples, 1)[:, 0])
     factor /= factor.mean()
@@ -83,6 +93,7 @@ def export_samples(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunFolderError(f"{out} cannot be created: {error.strerror}.") from error
+    _nothing_older(formats, out, samples)
     for name in formats:
         if name == "parquet":
             _write_table(source, drawn, out / TABLE)
@@ -91,6 +102,20 @@ def export_samples(
         for number, model in enumerate(drawn.models):
             write(replace(source, model=model), out / f"arm_{number:04d}.{ending}")
     return drawn
+
+
+def _nothing_older(formats: Sequence[str], out: Path, samples: int) -> None:
+    """Raise ExportError if arms of an earlier draw would remain in the folder beside those that are written now."""
+    for name in formats:
+        if name in FORMATS:
+            ending = FORMATS[name][1]
+            older = [path for path in out.glob(f"arm_*.{ending}") if path.stem[4:].isdigit()]
+            remaining = sum(int(path.stem[4:]) >= samples for path in older)
+            if remaining:
+                raise ExportError(
+                    f"{out} holds {len(older)} arms of an earlier draw, of which {remaining} would remain: give "
+                    "another --out, or remove them."
+                )
 
 
 def _posterior(source: Source) -> tuple[tuple[str, ...], Array, Array]:
@@ -148,6 +173,11 @@ def _physical(
 
 def _is_physical(model: ArmModel) -> bool:
     p = model.values
+    if isinstance(model, ChainArmModel):
+        # Its base parameters are sums of either sign: the mass matrix tells whether any links have them.
+        poses = np.random.default_rng(_POSES).uniform(-np.pi, np.pi, (_POSES, len(model.joints)))
+        friction = [value for name, value in p.items() if kind_of(name) in _FRICTION]
+        return min(friction) >= 0.0 and bool(np.linalg.eigvalsh(model.mass_matrix(poses)).min() > 0.0)
     positive = [
         value for name, value in p.items() if name.startswith(("inertia", "armature", "viscous_1", "viscous_2"))
     ]

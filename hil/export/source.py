@@ -17,6 +17,8 @@ from hil.model_file import model_of, read_usable_result
 from hil.results.result import Result
 from hil.runs.run_folder import RunFolder
 
+__all__ = ["Recorded", "Source", "write_text"]
+
 
 @dataclass(frozen=True)
 class Source:

@@ -17,7 +17,7 @@ from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import unsafe
 from hil.dry_run.prediction import peaks_of
-from hil.errors import ExperimentError, NoSafeTorque
+from hil.errors import DidNotMove, ExperimentError, NoSafeTorque, NotSettled
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stop_request import StopRequest
@@ -26,6 +26,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.punctual import punctual
 from hil.pilot.steps import Say, Step, tells_of_the_arm
+from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
@@ -92,7 +93,11 @@ class ChainSearch:
         """Find the first of the shares that is safe for all simulated arms. Raises NoSafeTorque."""
         said = ""
         for share in shares:
-            plan = self.paths.plan(config, self.belief.torque, share)
+            try:
+                plan = self.paths.plan(config, self.belief.torque, share)
+            except NoHeadroom as error:  # the arm is heavier than the paths were designed for
+                said = said or str(error)
+                continue
             foreseen = predict_chain(config, plan, self.belief.arms.first(SEARCH_ARMS))
             said = said or unsafe(config, foreseen)
             if unsafe(config, foreseen):
@@ -118,9 +123,14 @@ class ChainSearch:
         below = self.run.below(folder, config)
         error = self.play(config, below, name, found)
         if error is not None:
-            self.cap = min(self.cap, AFTER_LIMIT * found.share)
+            self.limit_after(error, found)
         self.learn(config, below)
         return found
+
+    def limit_after(self, error: ExperimentError, found: Found) -> None:
+        """Allow less of the path after a run that met a limit; not after one in which friction held a joint."""
+        if not isinstance(error, NotSettled | DidNotMove):
+            self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
         """Play a run; return the error that ended it early, or None.
@@ -208,9 +218,11 @@ def _full(search: ChainSearch) -> str:
         if number == tries:
             raise error
         search.learn(config, search.run)
-        search.say("Repeating with less amplitude.")
+        before = search.cap
+        search.limit_after(error, found)
+        how = "less amplitude" if search.cap < before else "the friction that this run has shown"
+        search.say(f"Repeating with {how}.")
         search.run.set_aside(f"stopped-{number}", config)
-        search.cap = AFTER_LIMIT * found.share
     raise AssertionError  # the loop returns or raises
 
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.chain import described_arm
+from hil.config.chain import base_gravity, described_arm
 from hil.config.schema import Config
-from hil.description.urdf import rotation_of
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
@@ -50,8 +49,7 @@ class ChainTorque:
 def known_chain(config: Config) -> KnownChain:
     """Read the configuration's description. Raises ArmFileError."""
     arm = described_arm(config)
-    gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
-    base = BaseParameters.of(Chain(*arm.geometry, gravity))
+    base = BaseParameters.of(Chain(*arm.geometry, base_gravity(config)), tilts=config.model.base_tilt)
     rotors = np.full(len(arm.joints), ARMATURE)
     unsure = torque_constant_stds(config)
     prior = Prior.of(base, arm.parameters, scale_std=unsure if unsure.any() else None)

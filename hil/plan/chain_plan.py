@@ -57,6 +57,10 @@ class PathSegment(Segment):
         return self.back
 
 
+class NoHeadroom(ConfigError):
+    """A path needs nearly all the torque of a joint."""
+
+
 def plan_of(config: Config) -> Plan:
     """Make the plan of this configuration's arm. Raises ConfigError."""
     return make_chain_plan(config) if config.is_chain else make_plan(config)
@@ -175,9 +179,10 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
     peaks, limits = np.abs(thought.of(path)).max(axis=1), torque_limits(config)
     for joint, peak, most in zip(config.joints, peaks.tolist(), limits.tolist(), strict=True):
         if peak > TORQUE_SHARE * most:
-            raise ConfigError(
-                f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path but has "
-                f"{most:.3g}: lower joint_path.speed or swing, or raise its current_limit."
+            raise NoHeadroom(
+                f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path, more than "
+                f"{100 * TORQUE_SHARE:.0f} % of its {most:.3g} N m, too little room for errors of the described "
+                "masses: lower joint_path.speed or swing, or raise its current_limit."
             )
 
 

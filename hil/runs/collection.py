@@ -13,6 +13,7 @@ from typing import Any
 
 from hil.errors import ResultError, RunFolderError
 from hil.model_file import read_result
+from hil.next_step import command
 from hil.runs.run_folder import write_json
 
 NOTE_FILE = "note.json"
@@ -78,7 +79,7 @@ def summarise(path: Path) -> RunSummary:
 def read_note(path: Path) -> Note:
     """The note of a run, empty if there is none. Raises RunFolderError if it is damaged, or there is no run."""
     if not _is_run(path):
-        raise RunFolderError(f"{path} is not a run folder: it has neither run.json nor samples.npy.")
+        raise _no_run(path)
     file = path / NOTE_FILE
     if not file.is_file():
         return Note()
@@ -89,10 +90,17 @@ def read_note(path: Path) -> Note:
         raise RunFolderError(f"{file} cannot be read: {error}. Write it again with hil note.") from error
 
 
+def _no_run(path: Path) -> RunFolderError:
+    return RunFolderError(
+        f"{path} is not a run folder: it has neither run.json nor samples.npy. List those that you have: "
+        f"{command('runs')}"
+    )
+
+
 def write_note(path: Path, note: Note) -> None:
     """Store a name and a note with the run. Raises RunFolderError."""
     if not _is_run(path):
-        raise RunFolderError(f"{path} is not a run folder: it has neither run.json nor samples.npy.")
+        raise _no_run(path)
     if len(note.name) > _LONGEST or len(note.text) > _LONGEST:
         raise RunFolderError(f"A name or note may have at most {_LONGEST} characters.")
     write_json(path / NOTE_FILE, asdict(note))

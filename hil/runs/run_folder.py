@@ -32,10 +32,14 @@ from hil.clearance.kept import keep_shapes
 from hil.config.chain import described_arm
 from hil.config.experiment import ExperimentConfig
 from hil.config.schema import Config, StabiliserConfig, parse_config
+from hil.description.kept_file import kept_bytes
 from hil.errors import RunFolderError
+from hil.next_step import command
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
+
+__all__ = ["SCHEMA", "Excitation", "RunFacts", "RunFolder", "RunRecord", "taken", "write_json"]
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +124,7 @@ class RunFolder:
                 raise taken(path)
             run.config_path.write_bytes(config.path.read_bytes())
             for urdf in _urdfs(config):
-                (path / urdf.name).write_bytes(urdf.read_bytes())
+                (path / urdf.name).write_bytes(kept_bytes(urdf))
             if config.is_chain:
                 keep_shapes(described_arm(config), path)
         except OSError as error:
@@ -156,7 +160,9 @@ class RunFolder:
             )
         for needed in (run.config_path, run.run_path, run.samples_path):
             if not needed.is_file():
-                raise RunFolderError(f"{path} is not a run folder: it has no {needed.name}.")
+                raise RunFolderError(
+                    f"{path} is not a run folder: it has no {needed.name}. List those that you have: {command('runs')}"
+                )
         return run
 
     @property

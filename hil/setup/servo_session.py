@@ -15,7 +15,7 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import DriverError, TorqueNotOff
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
@@ -27,6 +27,8 @@ from hil.setup.current_limit import current_limit_ticks
 from hil.setup.others import others_on_the_bus
 from hil.setup.settings_file import Kept
 
+__all__ = ["SETTINGS_NAME", "Say", "ServoSession", "has_moved", "left_behind", "recover", "servo_session", "to_stderr"]
+
 Say = Callable[[str], None]
 
 SETTINGS_NAME = "servo_settings.json"
@@ -35,6 +37,10 @@ SETTINGS_NAME = "servo_settings.json"
 
 REBOOT_S = 0.6
 """Time before a servo that does not answer at the end, and may be booting, is tried again [s]."""
+
+
+COUNT_DOWN_S = 5.0
+"""Time between the announcement that an arm whose last run was stopped moves again by itself, and torque [s]."""
 
 
 def to_stderr(text: str) -> None:
@@ -50,10 +56,10 @@ class ServoSession:
     bus: ServoBus
     _say: Say
     _kept: dict[Joint, Kept] = field(default_factory=dict)
-    _cut_since: set[Joint] = field(default_factory=set)
-    """Servos whose torque could not be confirmed as off at first, and has been since."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
+    was_stopped: bool = False
+    """Whether the last inner block ended with an exception: the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
         """Check that the servos answer and that nobody holds the arm, then save their settings. Raises as
@@ -98,6 +104,21 @@ class ServoSession:
             )
             self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
+    def warn(self) -> None:
+        """If the last run was stopped, announce that the arm is about to move again, and give people time to step back.
+
+        Whoever saw it go limp may believe that the program has ended, and reach into the arm.
+        """
+        if not self.was_stopped:
+            return
+        self.was_stopped = False
+        self._say(
+            f"THE ARM MOVES AGAIN IN {COUNT_DOWN_S:.0f} s: the run before was stopped, but this command goes on. Keep "
+            "clear of the arm; Ctrl-C ends it here."
+        )
+        clock = self.bus.port.clock
+        clock.wait_until(clock.now() + COUNT_DOWN_S)
+
     def end(self) -> None:
         """Restore every servo's settings and report those that cannot be restored. Never raises DriverError."""
         failed = self._put_back(self._kept)
@@ -116,24 +137,13 @@ class ServoSession:
         failed: dict[Joint, DriverError] = {}
         for joint in joints:
             try:
-                self._cut_again(joint)
+                self.bus.confirm_later(joint)
                 put_back(self.bus.drives[joint], self._kept[joint].settings)
             except DriverError as error:
                 failed[joint] = error
             else:
                 settings_file.forget(self._kept[joint])
         return failed
-
-    def _cut_again(self, joint: Joint) -> None:
-        """Cut the torque of a servo that could not be confirmed as off before, and say that it is off now."""
-        report = self.bus.torque_off_report
-        if report is None or joint in report.confirmed or joint in self._cut_since:
-            return
-        servo = self.bus.drives[joint]
-        if servo.read("Torque Enable"):
-            servo.write("Torque Enable", 0)
-        self._cut_since.add(joint)
-        self._say(f"{joint.title} answers again: its torque is off, read back.")
 
 
 _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=None)
@@ -143,6 +153,8 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
     """Open the bus with every servo in its mode and torque off, prepared for exchanges; restore settings at the end.
 
+    A TorqueNotOff that leaves the block says how things stand at the very end: servos that answer again are read back.
+
     folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises as
     `ServoBus.open`, and RunFolderError.
     """
@@ -150,21 +162,32 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
         outer.bus.config = config.bus
         outer.shared += 1
+        outer.warn()
         outer.bus.prepare()
-        yield outer.bus
+        try:
+            yield outer.bus
+        except BaseException:
+            outer.was_stopped = True
+            raise
         return
     fakes.register_for(config.url)
     with ServoBus.connect(config.bus) as bus:
         session = ServoSession(bus, say)
         token = _outermost.set(session)
+        not_off: TorqueNotOff | None = None
         try:
             session.begin(config, folder)
             bus.prepare()
             yield bus
+        except TorqueNotOff as error:
+            not_off = error
+            raise
         finally:
             _outermost.reset(token)
             with signals_held_back():
                 session.end()
+            if not_off is not None:  # a servo may have answered again since
+                not_off.args = (str(bus.torque_off_report),)
 
 
 def has_moved() -> bool:

@@ -18,6 +18,8 @@ from hil.study.schema import EngineTable
 if TYPE_CHECKING:
     from distributed import Client
 
+__all__ = ["executor", "versions", "workers"]
+
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "HIL_THREADS"), "1"
 )

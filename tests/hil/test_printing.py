@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from rich.table import Table
 
+from hil.cli.terminal import rows_below
 from hil.printing import print_fitting, say, say_behind
 
 HEADINGS = ("joint", "predicted peak", "unit", "median", "limit")
@@ -72,3 +73,20 @@ def test_no_word_is_broken(words: list[str], width: int) -> None:
     assert behind.split() == ["warning", *words]
     assert max(map(len, behind.splitlines())) <= width
     assert all(line.startswith(" " * 9) for line in behind.splitlines()[1:])
+
+
+PEAKS = (
+    "Pilot, peak torque 0.308, 0.162 N m:\n"
+    "                           predicted      99 % within    seen\n"
+    "  lowest position [rad]    -1.93, -0.27   -2.46, -0.89   -1.95, -0.33\n"
+    "  velocity [rad/s]         2.55, 1.38     5.70, 4.28     2.85, 1.89"
+)
+
+
+def test_a_table_of_peaks_becomes_lines_of_their_own_where_it_does_not_fit() -> None:
+    assert rows_below(PEAKS, 80) == PEAKS
+    narrow = rows_below(PEAKS, 40)
+    assert max(map(len, narrow.splitlines())) <= 40
+    assert "  lowest position [rad]\n    predicted -1.93, -0.27\n    99 % within -2.46, -0.89\n    seen" in narrow
+    sentence = "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
+    assert rows_below(sentence, 40) == sentence

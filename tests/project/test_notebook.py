@@ -34,6 +34,15 @@ def nothing() -> None:
     """The output for a value without such a method."""
 
 
+def assert_as_shown(shown: str, now: str) -> None:
+    """The stored text is what the program says now: the same words, and the same numbers within 30 %."""
+    number = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+    assert number.sub("#", shown).split() == number.sub("#", now).split(), f"execute the notebook again: {now}"
+    pairs = zip(map(float, number.findall(shown)), map(float, number.findall(now)), strict=True)
+    for stored, found in pairs:
+        assert stored == pytest.approx(found, rel=0.3, abs=1e-9), f"execute the notebook again: {now}"
+
+
 def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
     monkeypatch.chdir(tmp_path)
@@ -44,6 +53,7 @@ def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytes
         assert len(shown) == (value is not None), cell["source"]
         if value is None:
             continue
+        assert_as_shown("".join(shown[0]["text/plain"]), repr(value))
         for kind, method in (("text/html", "_repr_html_"), ("image/png", "_repr_png_")):
             assert (kind in shown[0]) == (getattr(value, method, nothing)() is not None)
     assert (tmp_path / "run" / "report.html").is_file()
@@ -51,7 +61,7 @@ def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytes
 
 def test_the_values_it_shows_are_those_of_the_fake_arm() -> None:
     """Tolerances that any version of the estimator must meet, because its error bars may change."""
-    shown = next(text for text in texts() if "trust it: yes" in text)
+    shown = next(text for text in texts() if "trust this model: yes" in text)
     truth = load_config(bundled_configs()["fake_two_link"]).fake
     assert truth is not None
     for name, value in base_parameters(truth.arm).items():

@@ -51,11 +51,9 @@ class Kill:
 
     @property
     def safe(self) -> bool:
-        """Whether every servo that had torque at the kill has a tripped watchdog, and all goals are 0."""
-        stopped = [
-            watchdog in {-1, 255} or not torque for watchdog, torque in zip(self.watchdogs, self.torque, strict=True)
-        ]
-        return all(stopped) and not any(self.goals)
+        """Whether every servo has no torque, or a tripped watchdog and a goal of 0."""
+        servos = zip(self.watchdogs, self.torque, self.goals, strict=True)
+        return all(not torque or (watchdog in {-1, 255} and goal == 0) for watchdog, torque, goal in servos)
 
 
 def kill_campaign(kills: int, folder: Path, seed: int = 1) -> list[Kill]:

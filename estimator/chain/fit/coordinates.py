@@ -20,10 +20,11 @@ POSITIVE = {
     "stribeck_velocity": 1e-3,
     "load": 1e-4,
     "torque_scale": 1e-3,
+    "added_mass_scale": 1e-2,
     "lag": 1e-5,
 }
 """Kinds of positive parameters and the minimum initial value of each [its unit]."""
-SMALL = {"offset": 0.01, "zero": 0.02, "delay": 1e-3}
+SMALL = {"offset": 0.01, "zero": 0.02, "delay": 1e-3, "base_tilt_x": 0.02, "base_tilt_y": 0.02}
 """Scales of the other parameters that are not base parameters [their unit]."""
 SHAPES = {
     "coulomb_width": (0.01, 2.5),
@@ -35,6 +36,8 @@ SHAPES = {
 
 Without them, these parameters would be undetermined for a joint that never moves slowly.
 """
+ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
+"""Priors on small angles that gravity may not show: standard deviations around zero [rad]."""
 RESHAPING = 1.0  # maximum change of their logarithms in one step
 NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase of a width's logarithm in one step
 LONGEST = 2.0  # maximum change of any coordinate in one step
@@ -81,11 +84,18 @@ class ChainCoordinates:
         )
 
     @cached_property
-    def likely_shapes(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the friction-shape parameters, their typical coordinates and the standard deviations of these."""
-        index = np.array([i for i, kind in enumerate(self._kinds) if kind in SHAPES], dtype=np.int64)
-        pairs = np.array([SHAPES[self._kinds[i]] for i in index]).reshape(-1, 2)
-        return index, np.log(pairs[:, 0]), pairs[:, 1]
+    def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
+        """Indices of the parameters with a prior of their own: friction shapes and small angles.
+
+        With their typical coordinates and the standard deviations of these.
+        """
+        found = [
+            (i, np.log(SHAPES[kind][0]), SHAPES[kind][1]) if kind in SHAPES else (i, 0.0, ANGLES[kind] / SMALL[kind])
+            for i, kind in enumerate(self._kinds)
+            if kind in SHAPES or kind in ANGLES
+        ]
+        index, typical, spread = np.array(found).reshape(-1, 3).T
+        return index.astype(np.int64), typical, spread
 
     @cached_property
     def torque_scales(self) -> npt.NDArray[np.int64]:

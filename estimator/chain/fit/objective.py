@@ -13,7 +13,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.coordinates import LONGEST, ChainCoordinates
-from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation, pieces
 from hil.estimator.data.settled_period import SettledPeriod
@@ -63,6 +63,8 @@ class ChainProblem:
     `steps` is 1."""
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
+    added: tuple[Array | None, ...] = ()
+    """Known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing."""
     _latest: _Latest = field(init=False, repr=False, compare=False, default_factory=_Latest)
 
     @property
@@ -156,7 +158,8 @@ class ChainProblem:
         found = []
         for index, period in enumerate(self.periods):
             run = self.run_of(period, parameters)
-            simulation = Simulation(self.model.base, parameters, self.start(x, index), self.gain(period))
+            moved = self._of_period(index, parameters)
+            simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period))
             position, _ = simulation.go_on(run, slice(0, period.samples))
             if position is None:
                 return None
@@ -212,10 +215,13 @@ class ChainProblem:
             return
         run = self.run_of(period, parameters)
         names = self.coordinates.names
-        simulation = Simulation(self.model.base, parameters, self.start(x, index), self.gain(period), names)
+        moved, added = self._of_period(index, parameters), self._added(index)
+        simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period), names)
         kept = []
         for part in pieces(len(run.measured)):
             position, derivative = simulation.go_on(run, part)
+            if added is not None:
+                derivative[:, :, names.index(ADDED_MASS)] = derivative[:, :, : added.size] @ added
             if position is None:
                 yield part, None, derivative
                 return
@@ -226,6 +232,17 @@ class ChainProblem:
                 kept.append((part, r, derivative))
         if latest.size < MOST_KEPT:
             latest.parts[index] = kept
+
+    def _added(self, index: int) -> Array | None:
+        return self.added[index] if self.added else None
+
+    def _of_period(self, index: int, parameters: dict[str, float]) -> dict[str, float]:
+        """Return the parameters of the arm as it was in a period, with what had been added to it."""
+        added = self._added(index)
+        if added is None:
+            return parameters
+        names, scale = self.model.base.names, parameters[ADDED_MASS]
+        return parameters | {name: parameters[name] + scale * float(x) for name, x in zip(names, added, strict=True)}
 
     def _where(self, x: Array, index: int) -> tuple[list[int], Array]:
         """Return the coordinates on which a period's motion depends, and the slopes of parameters and state by them."""
@@ -242,7 +259,7 @@ class ChainProblem:
         miss, by = (value[:base] - self.prior.value) / self.prior.std, slope[:base] / self.prior.std
         normal[at, at] += by * by
         gradient[at] += by * miss
-        shapes, likely, spread = self.coordinates.likely_shapes
+        shapes, likely, spread = self.coordinates.likely
         away = (x[shapes] - likely) / spread
         normal[shapes, shapes] += 1.0 / spread**2
         gradient[shapes] += away / spread

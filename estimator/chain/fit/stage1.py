@@ -35,15 +35,21 @@ class ChainLinear:
     """RMS of the torque residual relative to that of the torque (joints,)."""
 
 
-def fit_lines(periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainLinear:
-    """Estimate the parameters in which the torque is linear from settled periods."""
+def fit_lines(
+    periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior, added: Sequence[Array | None] = ()
+) -> ChainLinear:
+    """Estimate the parameters in which the torque is linear from settled periods.
+
+    added: known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing.
+    """
     lines = [lines_of(period.filled()) for period in periods]
     highest = list(map(cut_off, lines))
     motions = tuple(
         motion_of(line, most, period.fundamental, period.samples)
         for line, most, period in zip(lines, highest, periods, strict=True)
     )
-    equations = [_equations(*each, model) for each in zip(periods, motions, highest, strict=True)]
+    known = tuple(added) or (None,) * len(periods)
+    equations = [_equations(*each, model) for each in zip(periods, motions, highest, known, strict=True)]
     A = np.concatenate([columns for columns, _ in equations], axis=1)
     torque = np.concatenate([goal for _, goal in equations], axis=1)
     level = np.sqrt(np.mean(np.abs(torque) ** 2, axis=1))
@@ -97,10 +103,14 @@ def solve(columns: Array | Lines, torque: Array | Lines, weight: Array, prior: P
     return theta / norm, spread / norm
 
 
-def _equations(period: SettledPeriod, motion: PeriodicMotion, highest: int, model: ChainModel) -> tuple[Lines, Lines]:
+def _equations(
+    period: SettledPeriod, motion: PeriodicMotion, highest: int, added: Array | None, model: ChainModel
+) -> tuple[Lines, Lines]:
     """Return one period's columns (joints, lines, unknowns) and torques (joints, lines)."""
     Y = columns_of(model, motion)
     columns = np.stack([np.fft.rfft(rows, axis=0)[: highest + 1] for rows in Y]) / period.samples
     torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, : highest + 1]
+    if added is not None:
+        torque = torque - columns[:, :, : added.size] @ added
     slope = 1j * period.fundamental * np.arange(highest + 1) * torque
     return np.concatenate((columns, slope[:, :, None]), axis=2), torque

@@ -15,7 +15,7 @@ from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.uncertainty import coloured_covariance
-from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
@@ -31,7 +31,7 @@ from hil.estimator.fit.noise_weights import noise_weights
 from hil.estimator.options import CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
-START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0}
+START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0, ADDED_MASS: 1.0}
 
 
 @dataclass(frozen=True)
@@ -119,12 +119,14 @@ def fit_periods(
     linear: ChainLinear,
     prior: Prior,
     options: ChainOptions = DEFAULTS,
+    added: Sequence[Array | None] = (),
 ) -> ChainFit:
     """Return the maximum-likelihood parameters of `model`, starting from stage 1's result `linear`.
 
-    Raises ConvergenceError.
+    added: see `fit_lines`. Raises ConvergenceError.
     """
     problem, x = _problem(periods, model, linear, prior, options)
+    problem = replace(problem, added=tuple(added))
     # Undivided steps cannot resolve friction near standstill: its shape, fitted to them, would end up far away in a
     # curved valley, along which the later fits progress slowly.
     coarse = replace(problem, steps=_steps(periods, options.coarse_step), reach=0.0)

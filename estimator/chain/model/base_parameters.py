@@ -6,7 +6,7 @@ its parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991
 short, such as `moment_x_3 + 0.124 mass_4`, since a link's mass acts like a moment of the previous link.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.dynamics import TERMS, Columns, regressor
 from hil.estimator.chain.model.geometry import Chain, parameter_names, unit_of
+from hil.estimator.chain.model.tilt import GENERIC, tilted
 
 ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, inertias, armature, mass
 SAMPLES = 150
@@ -35,9 +36,14 @@ class BaseParameters:
     """Matrix from all parameters to base parameters (base parameters, all)."""
 
     @classmethod
-    def of(cls, chain: Chain, seed: int = 1) -> "BaseParameters":
-        """Return the base parameters of this chain."""
-        Y = _random_regressor(chain, seed)
+    def of(cls, chain: Chain, seed: int = 1, *, tilts: bool = False) -> "BaseParameters":
+        """Return the base parameters of this chain.
+
+        tilts: those for any direction of gravity, since the base may be tilted. A first joint that is vertical then
+        counts as one that gravity may turn, so there are more of them.
+        """
+        anywhere = replace(chain, gravity=tilted(chain.gravity, *GENERIC)) if tilts else chain
+        Y = _random_regressor(anywhere, seed)
         norm = np.linalg.norm(Y, axis=0)
         kept: list[int] = []
         basis = np.zeros((Y.shape[0], 0))

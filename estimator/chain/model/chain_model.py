@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hil.estimator.chain.model.base_parameters import BaseParameters
+from hil.estimator.chain.model.tilt import TILT
 from hil.estimator.errors import ModelError
 
 Friction = Literal["coulomb", "stribeck", "stribeck_load"]
@@ -15,6 +16,8 @@ FRICTION: dict[str, dict[str, str]] = {
     "stribeck": {"coulomb_width": "rad/s", "stribeck_rise": "1", "stribeck_velocity": "rad/s"},
     "stribeck_load": {"coulomb_width": "rad/s", "stribeck_rise": "1", "stribeck_velocity": "rad/s", "load": "1"},
 }
+ADDED_MASS = "added_mass_scale"
+"""Torque of a known added mass in units of the first joint's assumed torque constant: ratio of assumed to true one."""
 DRIVE = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 
 
@@ -24,6 +27,8 @@ class ChainModel:
 
     zeros: estimate zero errors of the encoders of all joints but the first, as far as gravity reveals them.
     torque_scale: estimate torque scales of all joints but the first, whose torque constant is trusted.
+    base_tilt: estimate the tilt of the base; `base` must be made for it (`BaseParameters.of(..., tilts=True)`).
+    added_mass: some periods were recorded with a known mass added, which reveals the first joint's torque constant too.
     Raises ModelError.
     """
 
@@ -32,6 +37,8 @@ class ChainModel:
     drive: Drive = "lag"
     zeros: bool = False
     torque_scale: bool = False
+    base_tilt: bool = False
+    added_mass: bool = False
 
     def __post_init__(self) -> None:
         if self.friction not in FRICTION:
@@ -59,6 +66,10 @@ class ChainModel:
             terms += [(f"zero_{joint}", "rad") for joint in self._numbers[1:]]
         if self.torque_scale:
             terms += [(f"torque_scale_{joint}", "1") for joint in self._numbers[1:]]
+        if self.base_tilt:
+            terms += [(name, "rad") for name in TILT]
+        if self.added_mass:
+            terms.append((ADDED_MASS, "1"))
         return terms + [(name, "s") for name in DRIVE[self.drive]]
 
     @property
@@ -75,7 +86,8 @@ class ChainModel:
     @property
     def description(self) -> str:
         """Text naming the friction, options and drive."""
-        words = {"zeros": self.zeros, "torque scales": self.torque_scale}
+        words = {"zeros": self.zeros, "torque scales": self.torque_scale, "base tilt": self.base_tilt}
+        words |= {"added mass": self.added_mass}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 
     @property

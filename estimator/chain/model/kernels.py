@@ -297,6 +297,21 @@ def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
         Y[i, at[10]] = a[i]
 
 
+def pull(gravity: Any, room: Any, column: int, out: Any) -> None:
+    """Set a column of `out` (joints, columns) to the torques that hold all links still under this gravity alone.
+
+    Requires `move`. It is linear in gravity, so a change of gravity gives the change of the torques.
+    """
+    motion, body = room[1], room[2]
+    x, y, z = -gravity[0], -gravity[1], -gravity[2]
+    for i in range(motion.shape[0]):
+        s, b = motion[i, AXIS], body[1, i]
+        out[i, column] = (
+            (s[0] * (b[2] * z - b[3] * y) + s[1] * (b[3] * x - b[1] * z) + s[2] * (b[1] * y - b[2] * x))
+            + b[0] * (s[3] * x + s[4] * y + s[5] * z)
+        )  # fmt: skip
+
+
 def _into(f: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Rotate a vector into the link's own frame."""
     return (
@@ -344,6 +359,6 @@ compiled: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True
 )
 _cross, _dot, _push, _carry, _flow, _into = map(compiled, (_cross, _dot, _push, _carry, _flow, _into))
-place, move, accelerate, differentiate, regress, invert = map(
-    compiled, (place, move, accelerate, differentiate, regress, invert)
+place, move, accelerate, differentiate, regress, pull, invert = map(
+    compiled, (place, move, accelerate, differentiate, regress, pull, invert)
 )

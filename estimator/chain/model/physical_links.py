@@ -12,12 +12,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from hil.estimator.arrays import Array
+from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
 
 PULL = 0.03  # weight of a unit change of a coordinate, relative to one standard error of a base parameter
 LEAST_MASS = 1e-4  # kg
 LEAST_SPREAD = 1e-3  # m: minimum radius of gyration, for links that the description makes a point mass
+STEP = 1e-4  # of the central differences, relative to a coordinate's typical step
 LEAST_ROTOR = 1e-7  # kg m^2
 _UPPER = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
@@ -34,6 +36,7 @@ class PhysicalLinks:
     """Largest deviation of a base parameter from the identified one, in standard errors."""
 
 
+@one_blas_thread
 def nearest_links(base: BaseParameters, value: Array, std: Array, described: Array, armature: Array) -> PhysicalLinks:
     """Return the links and rotors nearest to the described ones that agree with the identified base parameters.
 
@@ -59,8 +62,17 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
     def residual(x: Array) -> Array:
         return np.concatenate((misfit(x), PULL * (x - start) / scale))
 
+    def slopes(x: Array) -> Array:
+        # A coordinate changes one link's parameters only, so the blocks are differentiated one by one.
+        by_x = np.zeros((TERMS * joints, x.size))
+        for link in range(joints):
+            own = slice(10 * link, 10 * link + 10)
+            by_x[TERMS * link : TERMS * link + 10, own] = _link_slopes(x[own])
+            by_x[TERMS * link + 10, 10 * joints + link] = np.exp(x[10 * joints + link])
+        return np.concatenate((base.grouping @ by_x / floor[:, None], np.diag(PULL / scale)))
+
     scale = np.concatenate((np.tile(_scales(), joints), np.ones(joints)))
-    found = least_squares(residual, start, x_scale=scale, max_nfev=200)
+    found = least_squares(residual, start, slopes, x_scale=scale, max_nfev=200)
     table = parameters(found.x)
     assert table.shape == (joints, TERMS)
     return PhysicalLinks(table[:, :-1], table[:, -1], float(np.abs(misfit(found.x)).max()))
@@ -76,6 +88,17 @@ def _link(x: Array) -> Array:
     second, moment, mass = pseudo[:3, :3], pseudo[:3, 3], pseudo[3, 3]
     inertia = np.trace(second) * np.eye(3) - second
     return np.array([mass, *moment, *inertia[np.triu_indices(3)]])
+
+
+def _link_slopes(x: Array) -> Array:
+    """Return the derivatives of `_link` by its coordinates (10, 10)."""
+    columns = []
+    for k, step in enumerate(STEP * _scales()):
+        ahead, behind = x.copy(), x.copy()
+        ahead[k] += step
+        behind[k] -= step
+        columns.append((_link(ahead) - _link(behind)) / (2.0 * step))
+    return np.column_stack(columns)
 
 
 def _coordinates(link: Array) -> Array:

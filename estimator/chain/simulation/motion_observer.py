@@ -30,6 +30,7 @@ FLOOR_SHARE = 0.25
 FIRST_NOISE_SHARE = 0.1
 STANDING = 0.05  # rad/s: below this, dry friction may hold a joint
 STATIC = 1.5  # ratio of static to Coulomb friction
+MOSTLY = 0.5  # filtered indicator of standstill, above which a joint counts as standing
 VELOCITY_STD = 0.0135  # rad/s: resolution of the register and some noise
 NOISE_S = 1.0
 CLIPPED = 9.0
@@ -195,7 +196,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
                 alarm = j
         taught = min(beyond * beyond, CLIPPED * spread) - left_open - rounding
         memory[NOISE, j] += min(dt / NOISE_S, 1.0) * (max(taught, least_noise[j]) - memory[NOISE, j])
-        if lesson and beyond <= limit:
+        # Static friction takes up any torque within its bounds, for as long as a joint stands: that teaches nothing.
+        if lesson and beyond <= limit and memory[STANDS, j] < MOSTLY:
             total = spread + holds * holds
             for i in range(count):
                 theta[i] += gain[i] * lacking / total

@@ -9,6 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import places, split
 from hil.estimator.chain.model.kernels import room
+from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
@@ -56,8 +57,10 @@ class Simulation:
         self._causes = len(names) + 2 * n if names else 0
         width = AT_ONCE * -(-self._causes // AT_ONCE)
         at = {name: index for index, name in enumerate(names)}
+        rotation, translation, axis, gravity = base.chain.arrays
+        tilt = [parameters.get(name, 0.0) for name in TILT]
         self._arm = (
-            base.chain.arrays,
+            (rotation, translation, axis, tilted(gravity, *tilt)),
             split(base.chain, base.as_all(np.array([parameters[name] for name in base.names]))),
             np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
             np.array(start, dtype=np.float64, order="C"),
@@ -68,6 +71,8 @@ class Simulation:
             where[places(n, base.columns)],
             np.array([[at.get(f"{term}_{joint + 1}", width) for joint in range(n)] for term in JOINT_TERMS]),
             np.array([at.get("delay", width), at.get("lag", width)]),
+            np.array([at[name] for name in TILT if name in at], dtype=np.int64),
+            tilt_slopes(gravity, *tilt) if TILT[0] in at else np.zeros((2, 3)),
         )
         self._gain = np.ascontiguousarray(gain, dtype=np.float64)
         z = np.zeros((3 * n, width))

@@ -23,7 +23,7 @@ from typing import Any
 
 import numba
 
-from hil.estimator.chain.model.kernels import accelerate, differentiate, invert, move, place, regress
+from hil.estimator.chain.model.kernels import accelerate, differentiate, invert, move, place, pull, regress
 from hil.estimator.compiled import compiled
 from hil.estimator.simulation.arm import FADED, GAMMA
 
@@ -194,7 +194,7 @@ def _follow(
     direct: Any,
 ) -> None:
     """Compute the derivatives of a solved stage's equation by q and v (in `work`) and parameters (in `direct`)."""
-    base, at, times = columns
+    base, at, times, tilts, falls = columns
     total = solve[5]
     accelerate(links[1], chain[3], v, total, work)
     differentiate(chain[3], work)
@@ -206,6 +206,8 @@ def _follow(
         column = at[ZERO, j]
         for i in range(v.size):
             direct[i, column] = work[6][i, j]
+    for k in range(tilts.size):
+        pull(falls[k], work, tilts[k], direct)
 
 
 def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:

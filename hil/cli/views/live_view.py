@@ -13,6 +13,7 @@ from hil.experiment.stream import Progress
 
 _NEAR = 0.85  # fraction of a limit above which a value is shown in yellow
 _WIDEST, _NARROWEST = 22, 8  # columns of a gauge
+_TOLD_IN_FULL = 60  # columns from which on the timing is told in full
 _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two limits, of temperature and voltage
 
 
@@ -47,6 +48,7 @@ class LiveView:
         self._joints = config.joints
         self._rate = config.experiment.rate
         self._layout = layout_for(columns, max(len(joint.name) for joint in config.joints))
+        self._is_narrow = columns < _TOLD_IN_FULL
         self._taken = 0
         self._earliest, self._latest = math.inf, 0.0
         self._position = [math.nan] * len(config.joints)
@@ -89,7 +91,10 @@ class LiveView:
         trip = 1e3 * (progress.state.time_after_read - progress.state.time_before_write)
         lost = sum(progress.state.missing)
         silent = f", {lost} servo{'s' if lost > 1 else ''} silent" if lost else ""
-        return f"round trip {trip:.2f} ms, latest write {1e6 * self._latest:.0f} µs after the earliest{silent}"
+        late = f"{1e6 * self._latest:.0f} µs"
+        if self._is_narrow:
+            return f"round trip {trip:.2f} ms, {late} late{silent}"
+        return f"round trip {trip:.2f} ms, latest write {late} after the earliest{silent}"
 
     def _health(self, index: int) -> str:
         heat, supply = self._heat[index], self._supply[index]

@@ -12,12 +12,15 @@ from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.estimator.models.terms import TERMS, joint_of, kind_of, term_of
 from hil.next_step import command, next_step
-from hil.printing import print_table, say
+from hil.printing import print_fitting, say
 from hil.results.parts import Quantity
 from hil.results.result import Result, SettledResult, ShootingResult
 
 _NOTHING = 1e-9
 """Fraction of a value below which a truth is rounding error, so that a relative error means nothing."""
+
+_SHAPES = ("stribeck_rise", "stribeck_velocity")
+"""Parameters that are unknown where their standard error exceeds them. Others may be zero, and are then known to be."""
 
 _MOST_NAMED = 3
 """Number of models tried up to which all are named."""
@@ -28,10 +31,10 @@ _ALIKE = 0.05
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
     """Print the parameter table, the quality of the fit, the verdict and the next commands."""
-    print_table(console, _parameters(result))
+    print_fitting(console, _parameters(result))
     physical = [] if result.physical is None else physical_lines(result.physical)
     told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
-    told = (*told, *_torque_constants(result, config), *physical)
+    told = (*_undetermined(result), *told, *_torque_constants(result, config), *physical)
     for line in (*told, *_next(result, run)):
         say(console, line)
 
@@ -92,6 +95,21 @@ def _parameters(result: SettledResult) -> Table:
         table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
     table.add_row()
     return table
+
+
+def _undetermined(result: SettledResult) -> list[str]:
+    """Name the values that the motion says nothing about, so that nobody takes them for measured ones."""
+    names = [
+        name
+        for name, entry in {**result.parameters, **result.extra}.items()
+        if not math.isfinite(entry.std) or (kind_of(name) in _SHAPES and entry.std > abs(entry.value))
+    ]
+    if not names:
+        return []
+    return [
+        f"Not determined by this motion: {', '.join(names)}. Their values mean nothing by themselves; what the motion "
+        "shows of friction at low speed is in all of its terms together."
+    ]
 
 
 def _constant_std(result: SettledResult, name: str) -> float:

@@ -49,11 +49,12 @@ def estimate_chain_recordings(
     began = time.perf_counter()
     arm = _described(config, recordings[0].joints)
     gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
-    base = BaseParameters.of(Chain(*arm.geometry, gravity))
+    base = BaseParameters.of(Chain(*arm.geometry, gravity), tilts=config.model.base_tilt)
     prior = Prior.of(base, arm.parameters)
     wanted = config.model
     model = ChainModel(
-        base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1
+        *(base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
+        base_tilt=wanted.base_tilt,
     )
     found = identify_recordings(recordings, model, prior)
     foretold = _held_out(recordings, model, prior)

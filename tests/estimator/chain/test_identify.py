@@ -9,8 +9,11 @@ from benchmarks import chain as bench
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.fit.regression import fit_filtered
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
+from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
-from hil.estimator.chain.model.prior import scale_precision
+from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.prior import Prior, scale_precision
+from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS
@@ -160,3 +163,29 @@ def test_auto_adds_what_the_recording_shows(setup: bench.Setup, period: SettledP
     found = choose_chain(replace(period, position=shifted), ChainModel(setup.base), setup.prior)
     assert found.model.zeros
     assert found.parameters["zero_2"] == pytest.approx(0.06, abs=0.01)
+
+
+def test_a_tilted_base_is_found(setup: bench.Setup) -> None:
+    real = replace(setup, arm=setup.arm.model_copy(update={"base": (0.04, -0.02, 0.0)}))
+    path = bench.path_of(bench.BENCHES[4], setup, 101)
+    tilted_period = bench.record(bench.BENCHES[4], real, path)
+    base = BaseParameters.of(setup.base.chain, tilts=True)
+    prior = Prior.of(base, setup.arm.description.parameters)
+    found = identify_chain(tilted_period, ChainModel(base, base_tilt=True), prior)
+    truth = dict(zip(TILT, tilt_between(setup.base.chain.gravity, real.arm.gravity_vector), strict=True))
+    for name, true in truth.items():
+        assert abs(true) > 0.015
+        assert found.parameters[name] == pytest.approx(true, abs=0.002)
+        assert abs(found.parameters[name] - true) < 4 * found.std[found.names.index(name)]
+    assert found.residual_steps.max() < 0.31
+    assert found.unseen == ()
+
+
+def test_a_tilt_that_gravity_cannot_show_is_said(setup: bench.Setup, period: SettledPeriod) -> None:
+    weightless = Chain(*setup.base.chain.arrays[:3], np.array([0.0, 0.0, -1e-9]))
+    base = BaseParameters.of(weightless)
+    found = identify_chain(
+        period, ChainModel(base, zeros=True, base_tilt=True), Prior.of(base, setup.arm.description.parameters)
+    )
+    assert set(TILT) <= set(found.unseen)
+    assert all(found.std[found.names.index(name)] > 0.05 for name in TILT)

@@ -118,6 +118,19 @@ def test_lost_and_corrupted_instructions(bench: Any) -> None:
     assert bench.exchange(light)[0].error == 0
 
 
+@pytest.mark.parametrize("kind", ["lost_instruction", "corrupted_instruction"])
+def test_an_instruction_to_all_that_one_servo_does_not_receive(bench: Any, kind: str) -> None:
+    bench.bus.faults.add(Fault(kind=kind, servo=2, duration=1.0))
+    lights = encode(BROADCAST_ID, Instruction.SYNC_WRITE, b"\x41\0\1\0" + b"\1\1\2\1")
+    bench.exchange(lights)
+    assert [bench.servo(servo_id).value("LED") for servo_id in (1, 2)] == [1, 0]
+    assert raw_replies(bench) == [PONG], "the other one hears what is for it"
+    assert len(bench.exchange(encode(2, Instruction.PING))) == (kind == "corrupted_instruction")
+    bench.wait(1.0)
+    bench.exchange(lights)
+    assert bench.servo(2).value("LED") == 1
+
+
 def test_probability_and_seed() -> None:
     def struck(seed: int) -> list[bool]:
         bus = FakeBus([EmulatedServo(load_model("XM430-W350"), 1)], _Still(), VirtualClock(), seed=seed)

@@ -229,6 +229,15 @@ def test_current_mode_is_limited_by_the_supply_if_asked() -> None:
     assert shaft.velocity[0] < 12.0 / servo.model.back_emf_v_s
 
 
+def test_where_the_supply_limits_the_current_each_new_goal_counts() -> None:
+    servo = EmulatedServo(load_model("XM430-W350"), 1, registers={"Operating Mode": 0}, voltage_limited=True)
+    servo.write(64, b"\1")
+    for ticks in (100, 150, -40):
+        servo.write(102, ticks.to_bytes(2, "little", signed=True))
+        servo.tick(1e-3, 0.0, 0.0, 0.0)
+        assert servo.motor_current_a == pytest.approx(ticks * 2.69e-3)
+
+
 @pytest.mark.parametrize("goal", [500.0, -37.0, 3.0])
 @pytest.mark.parametrize(("fastest", "hardest"), [(2.0, 0.01), (0.5, 0.0), (50.0, 0.3)])
 def test_trajectory_reaches_its_goal_within_its_limits(goal: float, fastest: float, hardest: float) -> None:

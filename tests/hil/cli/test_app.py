@@ -130,6 +130,7 @@ def test_a_failure_is_one_message_and_an_exit_code(
     assert printed.out == ""
     if "outside" in said:
         assert "Torque is off on all 2 servos, read back." in printed.err
+        assert printed.err.splitlines()[-1].startswith("Next: hil check "), "the last line is what to type next"
 
 
 def test_bad_arguments_and_files(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,6 +55,15 @@ FILES: dict[str, bytes] = {
     "id.toml": ARM.replace("id = 1", 'id = "1"', 1).encode(),
     "utf16.toml": ARM.encode("utf-16"),
     "millimetres.toml": ARM.replace("[arm]\n", "[arm]\nlink_lengths = [147, 180]\n", 1).encode(),
+    "arm.yaml": b"port:\n  url: fake\n",
+    "mbaud.toml": ARM.replace("baud = 1_000_000", "baud = 1", 1).encode(),
+    "radians.toml": ARM.replace("band = [0.1, 5.0]", "band = [0.7, 200.0]").encode(),
+    "kilohertz.toml": ARM.replace("rate = 400.0", "rate = 0.4").encode(),
+    "long.toml": ARM.replace("period = 10.0", "period = 10000").encode(),
+    "watch.toml": (ARM + "\n[safety]\nwatchdog = 80\n").encode(),
+    "ratio.toml": ARM.replace("gear_ratio = 353.5", 'gear_ratio = "353:1"', 1).encode(),
+    "fakemm.toml": ARM.replace("length = 0.147", "length = 147.0", 1).encode(),
+    "milliamperes.toml": ARM.replace("current_limit = 1.2", "current_limit = 1200", 1).encode(),
     "page.csv": b"<!DOCTYPE html><html><body>404</body></html>",
     "zip.csv": b"PK\x03\x04" + bytes(range(256)) * 8,
     "milliseconds.csv": ("t,q1,tau1\n" + "".join(f"{5000 * k},{k % 7},{k % 5}\n" for k in range(100))).encode(),
@@ -245,7 +254,24 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate run list.csv", 2, "give either one run folder or recordings"),
     ("estimate arm.toml", 2, "give the folder of a run"),
     ("export run --format stl", 2, "'stl' is not a format"),
+    ("check arm.yaml", 2, "arm.yaml: it is YAML, by its name; hil's files are TOML. `hil init` writes one."),
+    ("check mbaud.toml", 2, "port.baud = 1: must be one of 9600,"),
+    ("identify mbaud.toml", 2, "If it is in millions, write 1000000."),
+    ("check radians.toml", 2, "If it is in rad/s, write [0.1114, 31.83]"),
+    ("check kilohertz.toml", 2, "experiment.rate = 0.4: must be at least 20.0. If it is in kHz, write 400."),
+    ("dry-run long.toml", 2, "experiment.period = 10000: must be at most 1000.0. If it is in ms, write 10."),
+    ("check watch.toml", 2, "safety.watchdog = 80: must be at most 2.54. If it is in ms, write 0.08."),
+    ("check ratio.toml", 2, "fake.arm.drives[1].gear_ratio = '353:1': must be a number"),
+    ("fake arm.toml --move 1:to=90", 2, "to = 90.0: must be at most 12.57. If it is in degrees, write 1.571."),
+    ("fake fakemm.toml", 2, "fake.arm.links[1].length = 147.0: must be at most 3.0. If it is in mm, write 0.147"),
+    (
+        "identify milliamperes.toml",
+        2,
+        "joints[1].current_limit = 1200: must be at most 30.0. If it is in mA, write 1.2.",
+    ),
     ("export no_result --format mjcf", 2, "hil estimate no_result"),
+    ("export .. --format mjcf", 2, ".. is not a run folder, but holds some: did you mean ../here?"),
+    ("export nothing --format mjcf", 2, "nothing is not a run folder: it has neither a result nor a recording."),
     ("calibrate run run --mass -1", 2, "--mass"),
     ("pose arm.toml", 2, "arm.urdf is missing"),
 ]
@@ -276,6 +302,7 @@ def folder(tmp_path: Path, identified_once: Path, monkeypatch: pytest.MonkeyPatc
         for file, content in changed.items():
             if content is not None:
                 (here / name / file).write_bytes(content)
+    (here / "nothing").mkdir()
     monkeypatch.chdir(here)
     monkeypatch.setattr(sys, "argv", sys.argv)
     return here

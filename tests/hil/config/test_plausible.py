@@ -22,7 +22,7 @@ SLIPS = [
         r"position_limit of joint 'shoulder'.*-4\.18",
     ),
     ("velocity_limit = 10.0 ", "velocity_limit = 360.0 ", r"velocity_limit.*degrees/s, write 6\.28"),
-    ("velocity_limit = 10.0 ", "velocity_limit = 46.0 ", r"velocity_limit.*rpm, 4\.82"),
+    ("velocity_limit = 10.0 ", "velocity_limit = 46.0 ", r"velocity_limit.*rpm, write 4\.817"),
     ("current_limit = 0.69 ", "current_limit = 6.9 ", r"current_limit of joint 'shoulder'.*stall current.* is 2\.7 A"),
     ("torque_constant = 1.81 ", "torque_constant = 0.0051 ", r"torque_constant.*published"),
     ("torque_constant = 1.81 ", "torque_constant = 18.5 ", r"torque_constant.*kgf cm"),

@@ -13,14 +13,18 @@ from hil.chain_model import ChainArmModel
 from hil.config.schema import Config, load_config, parse_config
 from hil.description.urdf import read_urdf
 from hil.errors import ConfigError
+from hil.estimation.calibrate import AddedMass, calibrate_runs
 from hil.estimation.chain_estimate import unmoved
-from hil.estimation.compare import compare_run
+from hil.estimation.changes.diff import diff_runs
+from hil.estimation.comparison.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimation.unsettled.estimate import estimate_unsettled
 from hil.estimator.chain.model.dynamics import inverse_dynamics
 from hil.estimator.chain.model.geometry import Chain, parameter_names
 from hil.experiment.run import run_experiment
 from hil.export.formats import export
+from hil.export.posterior import draw_arms
+from hil.export.source import Source
 from hil.plan.chain_plan import make_chain_plan
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
@@ -168,9 +172,46 @@ def test_exported_parameters_are_read_back(run: RunFolder, result: SettledResult
 
 
 def test_what_is_not_there_yet_is_refused(run: RunFolder) -> None:
-    for command in (lambda: compare_run(run, False), lambda: estimate_unsettled(run)):
-        with pytest.raises(ConfigError, match="only planar arms"):
-            command()
+    with pytest.raises(ConfigError, match="only planar arms"):
+        estimate_unsettled(run)
+    with pytest.raises(ConfigError, match="--mujoco is for planar arms"):
+        compare_run(run, True)
+
+
+def test_it_predicts_a_held_out_path_better_than_regressions(run: RunFolder, result: SettledResult) -> None:
+    methods = compare_run(run, False).methods
+    assert set(methods) == {"hil", "fourier_lines", "idim_ls"}
+    held_out = {name: each.held_out_rms or np.inf for name, each in methods.items()}
+    assert held_out["hil"] < 0.5 * min(held_out["fourier_lines"], held_out["idim_ls"])
+    worst = {name: each.worst_relative_error or np.inf for name, each in methods.items()}
+    assert worst["hil"] < 0.03
+    assert worst["hil"] < min(worst["fourier_lines"], worst["idim_ls"])
+    assert methods["hil"].parameters["moment_z_2"] == pytest.approx(result.parameters["moment_z_2"].value, rel=1e-6)
+
+
+def test_a_calibration_asks_for_what_the_kind_of_arm_needs(run: RunFolder, result: SettledResult) -> None:
+    for added, message in (
+        (AddedMass(0.2, distance=0.1), "give the place of the mass"),
+        (AddedMass(0.2, at=(0.1, 0.0, 0.0), joint="wrist"), "the arm's joints are joint1, joint2"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            calibrate_runs(run, run, added)
+
+
+def test_drawn_arms_are_physical_and_scatter_as_the_result_says(run: RunFolder, result: SettledResult) -> None:
+    source = Source.open(run.path, None)
+    drawn = draw_arms(source, 60, torque_constants=False)
+    assert drawn.redrawn < 20
+    column = drawn.values[:, drawn.names.index("moment_z_2")]
+    assert np.std(column) == pytest.approx(result.parameters["moment_z_2"].std, rel=0.5)
+    for model in drawn.models[:5]:
+        assert np.linalg.eigvalsh(model.mass_matrix(np.zeros(4))).min() > 0.0
+
+
+def test_the_same_arm_twice_has_not_changed(run: RunFolder, result: SettledResult) -> None:
+    difference = diff_runs(run.path, run.path)
+    assert difference.changes
+    assert not difference.changed
 
 
 def test_a_path_that_leads_too_near_is_refused_on_a_real_port(tmp_path: Path) -> None:

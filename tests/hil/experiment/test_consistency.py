@@ -4,11 +4,24 @@ import math
 from collections.abc import Callable
 from random import Random
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.experiment.consistency import Consistency
+from hil.experiment.consistency import (
+    CURVED,
+    LAG_S,
+    LEARNT_S,
+    LONG_EVERY_S,
+    LONG_S,
+    MORE_LAG_S,
+    MORE_SCALE,
+    SCALE,
+    SHORT_S,
+    Consistency,
+    _Memory,
+)
 
 RATES = (20, 100, 400, 1000)
 STEP = math.tau / 4096
@@ -155,3 +168,111 @@ def test_a_noisy_encoder_and_single_glitches_are_no_stuck_bit(noise: float) -> N
         return learnt_motion(now)[0] + glitch + random.gauss(0.0, noise * STEP)
 
     assert seen_after(400, position, lambda now: learnt_motion(now)[1]) == math.inf
+
+
+def test_a_creep_slower_than_a_tick_of_velocity_is_taken_for_rounding() -> None:
+    assert seen_after(400, lambda now: 0.03 * now, lambda now: 0.0) == math.inf
+
+
+@pytest.mark.parametrize(("jumps", "seen"), [((0.4, 0.5, 0.6), False), ((0.4, 0.5, 0.6, 0.7), True)])
+def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
+    """To and fro, so that nothing accumulates; each there-and-back is one jump, its return half of the next."""
+    times = [round(400 * jump) for jump in jumps]
+
+    def position(now: float) -> float:
+        return 0.012 * (sum(round(400 * now) >= each for each in times) % 2)
+
+    assert (seen_after(400, position, lambda now: 0.0) < math.inf) is seen
+
+
+class _Reference:
+    """The memory of one time constant, computed anew from everything that was ever added."""
+
+    def __init__(self, seconds: float, first: float) -> None:
+        self.seconds, self.first = seconds, first
+        self.rows: list[tuple[float, ...]] = []
+
+    def of(self) -> dict[str, float]:
+        kept = np.array([max(1.0 - row[3] / self.seconds, 0.0) for row in self.rows])
+        weight = np.array([np.prod(kept[index + 1 :]) for index in range(len(kept))])
+        moved, difference, velocity, _, curved, unknown = np.array(self.rows).T
+        high = low = self.first
+        for each, keep in zip(velocity, kept, strict=True):
+            high, low = max(each, keep * high + (1 - keep) * each), min(each, keep * low + (1 - keep) * each)
+        return {
+            "apart": weight @ difference,
+            "far": weight @ moved,
+            "mean": (weight * (1 - kept)) @ velocity + weight[0] * kept[0] * self.first,
+            "span": high - low,
+            "_curved": (weight * curved).max(),
+            "_unknown": weight @ unknown,
+        }
+
+
+def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> None:
+    """Compared with sums over all samples and a least-squares fit, for a motion that curves, at uneven intervals."""
+    random = Random(1)
+    look, now, before, former = Consistency(), 0.0, 0.0, 0.0
+    short = long = _Reference(SHORT_S, 0.0)
+    waiting: list[tuple[float, ...]] = []
+    lessons: list[tuple[float, float, float, float]] = []
+    for index in range(1100):
+        seconds = random.choice((0.002, 0.0025, 0.004)) if index else 0.0
+        now += seconds
+        position, velocity = learnt_motion(now)[0] * 1.01, learnt_motion(now)[1]
+        unsure = random.choice((0.0, 1e-5))
+        assert not look.look(position, velocity, seconds, unsure)
+        if not index:
+            short, long = _Reference(SHORT_S, velocity), _Reference(LONG_S, velocity)
+        else:
+            moved = position - former
+            row = (moved, moved - 0.5 * (velocity + before) * seconds, velocity, seconds)
+            row = (*row, CURVED * seconds * abs(velocity - before), unsure * abs(velocity))
+            short.rows.append(row)
+            waiting.append(row)
+            if sum(each[3] for each in waiting) >= LONG_EVERY_S:
+                sums = [sum(each[place] for each in waiting) for place in (0, 1, 3, 5)]
+                long.rows.append((*sums[:2], velocity, sums[2], max(each[4] for each in waiting), sums[3]))
+                waiting = []
+            memory = look._short
+            if memory.span > 2.0 and sum(each[2] for each in lessons) < LEARNT_S:
+                lessons.append((velocity - memory.mean, memory.far, seconds, memory.apart))
+        before, former = velocity, position
+    for memory, reference in ((look._short, short), (look._long, long)):
+        for name, value in reference.of().items():
+            assert getattr(memory, name) == pytest.approx(value, rel=1e-9, abs=1e-12), name
+    assert sum(each[2] for each in lessons) >= LEARNT_S
+    signals = np.array(lessons)
+    (lag, scale), *_ = np.linalg.lstsq(signals[:, :2], signals[:, 3], rcond=None)
+    assert look._lag == pytest.approx(2 * lag + MORE_LAG_S) and look._scale == pytest.approx(2 * scale + MORE_SCALE)
+    assert look._lag < LAG_S and look._scale < SCALE
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_tolerance_is_the_sum_of_its_parts(sign: float) -> None:
+    memory = _Memory(SHORT_S, 0.02)
+    memory.far, memory.span, memory.mean = -2.0, 3.0, 1.0
+    memory._curved, memory._unknown = 0.003, 0.002
+    allowed = 0.02 + 0.05 * 2.0 + 0.003 + 0.002 + 0.25 * 0.01 * 3.0
+    of_lag = 0.01 * (1.0 + sign * 1.5 - 1.0)
+    for apart, wrong in (
+        (sign * (allowed + abs(of_lag)) * 0.999, False),
+        (sign * (allowed + abs(of_lag)) * 1.001, True),
+        (-sign * allowed * 0.999, False),
+        (-sign * allowed * 1.001, True),
+    ):
+        memory.apart = apart
+        assert memory.is_wrong(1.0 + sign * 1.5, 0.01, 0.05) is wrong
+
+
+@pytest.mark.parametrize(("moved", "velocities"), [(0.045, (0.0, 1.5)), (-0.09, (0.0, 0.0))])
+def test_lag_and_scale_explain_part_of_a_jump(moved: float, velocities: tuple[float, float]) -> None:
+    """A velocity that changes may lag; of a way that was covered, the scale's share may be wrong."""
+    look = Consistency()
+    steps: list[tuple[float, float]] = []
+    look._steps.look = lambda step, seconds: bool(steps.append((step, seconds)))  # type: ignore[method-assign]
+    look.look(0.0, velocities[0], 0.0)
+    look.look(moved, velocities[1], 0.01, 0.001)
+    change = abs(velocities[1] - velocities[0])
+    known = LAG_S * change + SCALE * abs(moved) + CURVED * 0.01 * change + 0.001 * abs(velocities[1])
+    assert steps == [(pytest.approx(abs(moved - 0.005 * sum(velocities)) - known), 0.01)]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.fault_campaign.arms import RATES, Setting, names, settings
-from benchmarks.fault_campaign.campaign import prepare
+from benchmarks.fault_campaign.attack import Kind
+from benchmarks.fault_campaign.campaign import Outcome, prepare
 from benchmarks.fault_campaign.judge import received
 from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.faults import campaign, figures
@@ -25,12 +26,26 @@ NAMED = 0.95
 REFUSED = re.compile(r"fake_inverted at 20 Hz .*experiment\.rate = 20 is too low for the stabiliser", re.DOTALL)
 """A software spring that acts 75 ms late cannot hold an arm upright."""
 
-MOST_UNSAFE = 1
-"""Unsafe runs of each part; the aim is 0. What is left: a hand that pushes a heavy arm without `arm.link_lengths` from
-its first second on, of which little says how it should have moved (docs/safety.md).
-"""
+LEARNS_S = 1.5
+"""For how long an arm without `arm.link_lengths` is learnt, with whatever else drives it meanwhile [s]."""
+
+LEARNT = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.SLIP, Kind.GOAL_FIGHT})
+"""Faults that show only in the motion."""
+
+MOST_LEARNT = 4
+"""Number of these in each part; the aim is 0. Nothing else may be unsafe."""
 
 EVERY_THIRD = 3
+
+
+def taught(outcome: Outcome) -> bool:
+    """Whether something moved an arm without a description from its first moments on, and was learnt with the arm.
+
+    The one fault that is known to stay unseen for longer than it should (docs/safety.md).
+    """
+    described = prepare(outcome.setting, PERIOD_S).config.arm.link_lengths is not None
+    first = min([each.start for each in outcome.drawn.attacks if each.kind in LEARNT], default=np.inf)
+    return not described and first < LEARNS_S
 
 
 def chosen() -> list[Setting]:
@@ -44,10 +59,10 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
     outcomes, left_out = campaign(chosen()[part::PARTS], INJECTIONS // PARTS, jobs=1, period=PERIOD_S, even=False)
     assert all(REFUSED.match(why) for why in left_out), left_out
     bad = [each for each in outcomes if each.unreadable or each.not_restored or each.verdict.misleading]
-    late = [each for each in outcomes if each.verdict.unsafe or each.beyond_limit]
-    told = "\n\n".join(map(str, [*bad, *late]))
-    assert not bad, told
-    assert len(late) <= MOST_UNSAFE, told
+    bad += [each for each in outcomes if (each.verdict.unsafe and not taught(each)) or each.beyond_limit]
+    assert not bad, "\n\n".join(map(str, bad))
+    learnt = [each for each in outcomes if each.verdict.unsafe]
+    assert len(learnt) <= MOST_LEARNT, "\n\n".join(map(str, learnt))
     counted = figures(outcomes)
     assert counted["unnamed"] <= (1 - NAMED) * counted["stopped"]
     assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it meets stops and runs that go on"

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hil.config.schema import Config
-from hil.drivers.state import Slow, State
+from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment.guard import Guard
 
@@ -293,3 +293,69 @@ def test_a_joint_that_a_run_left_beyond_its_limit_may_move_in_and_no_farther_out
     assert look(guard, *at(0.001)) is Cause.POSITION, "it was inside"
     assert look(Guard(config, left_by_a_run=True), *at(0.006, 0.013, 0.02)) is Cause.POSITION
     assert look(Guard(config, left_by_a_run=True), *at(0.2)) is Cause.POSITION, "no stop leaves it that far away"
+
+
+class Heard:
+    """In place of a check of one joint: keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[Any, ...]] = []
+        self.begun_anew = 0
+
+    def look(self, *told: Any) -> None:
+        self.told.append(told)
+
+    def lost(self) -> None:
+        self.begun_anew += 1
+
+
+def checks(guard: Guard) -> tuple[Heard, Heard]:
+    """The first joint's comparisons of current with goal and of position with velocity, replaced."""
+    following, consistency = Heard(), Heard()
+    guard._following[0], guard._consistency[0] = following, consistency  # type: ignore[call-overload]
+    return following, consistency
+
+
+def test_how_long_an_exchange_took_beyond_the_shortest_is_how_unsure_its_time_is(arm: Arm) -> None:
+    guard = Guard(arm())
+    _, consistency = checks(guard)
+    for number, took in enumerate((0.001, 0.0015, 0.0008, 0.0009)):
+        guard.look(STILL._replace(time_before_write=number / 400, time_after_read=number / 400 + took))
+    assert [told[3] for told in consistency.told] == pytest.approx([0.0, 0.0005, 0.0, 0.0001])
+
+
+@pytest.mark.parametrize(("gap", "begun_anew"), [(2.9, 0), (3.1, 1)])
+def test_after_three_intervals_position_and_velocity_are_compared_anew(arm: Arm, gap: float, begun_anew: int) -> None:
+    guard = Guard(arm())
+    guard.look(at(1, STILL))
+    _, consistency = checks(guard)
+    guard.look(at(1, STILL)._replace(time_before_write=(1 + gap) / 400, time_after_read=(1 + gap) / 400 + 0.001))
+    assert consistency.begun_anew == begun_anew
+
+
+def test_a_punctual_reply_after_a_late_one_and_a_missing_one_stands_for_both_intervals(arm: Arm) -> None:
+    guard = Guard(arm())
+    following, _ = checks(guard)
+    silent = MISSING._replace(missing=(True, True))
+    for when, state in ((0.9, STILL), (1.0, silent), (2.0, STILL)):
+        guard.look(state._replace(time_before_write=when / 400, time_after_read=when / 400 + 0.001))
+    assert following.told[-1][2] == pytest.approx(2 / 400)
+
+
+def test_a_joint_whose_first_reply_is_missing_counts_from_then(arm: Arm) -> None:
+    guard = Guard(arm())
+    following, _ = checks(guard)
+    guard.look(at(400_000, MISSING._replace(missing=(True, True))))
+    guard.look(at(400_001, STILL))
+    assert following.told == [(0.0, 0.0, pytest.approx(2 / 400))]
+
+
+def test_the_status_of_one_joint_among_others_without_one(arm: Arm) -> None:
+    config = arm()
+    armed = round(config.safety.watchdog / 0.02)
+    fine = STILL._replace(status=(None, Status(armed, 0.0, 1.0, torque=True, hardware_error=0)))
+    Guard(config).look(fine)
+    off = STILL._replace(status=(None, Status(armed, 0.0, 1.0, torque=False, hardware_error=0)))
+    with pytest.raises(SafetyStop, match=r"Joint 'elbow'.* has lost its torque") as stop:
+        Guard(config).look(off)
+    assert stop.value.cause is Cause.TORQUE_OFF

@@ -1,6 +1,7 @@
 """The model watch accepts healthy arms, detects others, and its tolerance follows from the prior knowledge."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -79,6 +80,25 @@ def test_arms_of_the_prior_pass_and_what_is_not_their_motion_does_not(config: Co
     still[:, at:] = 0.0
     when = seen_after(ModelWatch(config, planned(config, torque)), config, torque, held, still)
     assert 0.0 < when - at / RATE < 0.1
+
+
+@pytest.mark.parametrize("interval", [1 / RATE, 1 / (4 * RATE)])
+def test_a_joint_that_stands_still_is_told_with_the_torques_of_the_last_moments(
+    config: Config, interval: float
+) -> None:
+    """Whatever is commanded in the very moment of the stop, which often is nothing, and however goals are held."""
+    watch = ModelWatch(config, [0.5, 0.25], interval=interval)
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    rest = tuple(config.arm.rest_pose)
+    with pytest.raises(
+        SafetyStop, match=r"stands still, with [-+]\d\.\d+ to [-+]\d\.\d+ N m commanded in the last 0\.3 s"
+    ) as stop:
+        for index in range(4000):
+            now = index * interval
+            goal = tuple(np.array([1.0, 1.0]) * np.sin(math.tau * 5 * now) / constants)
+            watch.look(State(now, now + 1e-4, goal, goal, (0.0, 0.0), rest, (0, 0), (False, False)))
+    low, high = (float(each) for each in re.findall(r"[-+]\d\.\d+", str(stop.value))[:2])
+    assert high - low > 0.9, "the wave has a peak of 1 N m and 5 Hz"
 
 
 def test_torque_that_reaches_the_arm_no_more(config: Config) -> None:

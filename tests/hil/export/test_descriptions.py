@@ -94,6 +94,22 @@ def test_mujoco_carries_friction_offset_and_the_drive(identified: Path) -> None:
     assert data.qfrc_actuator == pytest.approx(expected, rel=1e-6)
 
 
+def test_mujoco_carries_a_cable_that_pulls_and_one_that_pushes(identified: Path) -> None:
+    mujoco = pytest.importorskip("mujoco", reason=NEEDS_MUJOCO)
+    model = with_values(
+        load_model(identified), cable_stiffness_1=0.3, cable_stiffness_2=-0.2, offset_1=0.004, offset_2=0.01
+    )
+    path, left = write(model, identified, "mjcf")
+    assert not any("cable" in each for each in left)
+    engine = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(engine)
+    data.qpos[:] = -0.7, 0.5
+    mujoco.mj_forward(engine, data)
+    assert [engine.actuator(number).name for number in range(2)] == [joint.name for joint in model.joints]
+    sum_of_both = data.qfrc_passive + data.qfrc_actuator
+    assert sum_of_both == pytest.approx([-0.3 * -0.7 - 0.004, 0.2 * 0.5 - 0.01], rel=1e-9)
+
+
 @pytest.mark.parametrize("name", ARMS)
 def test_pinocchio_has_the_same_inverse_dynamics(identified: Path, name: str) -> None:
     pinocchio = pytest.importorskip("pinocchio", reason=NEEDS_PINOCCHIO)

@@ -1,5 +1,8 @@
 """Spatial arms from description, limits and rest pose to the result, on the fake bus; here the smallest one."""
 
+from dataclasses import replace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
@@ -8,11 +11,11 @@ from hil.config.schema import load_config, parse_config
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import unsafe
-from hil.errors import ConfigError
+from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
-from hil.pilot.chain_search import step_config
+from hil.pilot.chain_search import ChainSearch, Found, step_config
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
 from tests.support.paths import CONFIGS
@@ -111,3 +114,25 @@ def test_learning_moves_the_arms_to_what_was_seen(found: hil.Identification) -> 
     drawn = {key: belief.arms.rigid[:, index] for key, belief in (("before", before), ("after", after))}
     assert abs(drawn["after"].mean() - true) < 0.05 * abs(true)
     assert drawn["after"].std() < 0.2 * drawn["before"].std()
+
+
+def test_only_a_limit_takes_amplitude_away_not_a_joint_that_friction_holds() -> None:
+    config = chain_config(load_config(LEG))
+    belief = ChainBelief.prior(config)
+    search = ChainSearch(config, cast("Any", None), LEG, cast("Any", None), print, belief, cast("Any", None))
+    played = Found(0.3, cast("Any", None), cast("Any", None))
+    search.limit_after(DidNotMove("knee moved by 0 rad"), played)
+    search.limit_after(NotSettled("still drifts"), played)
+    assert search.cap == 1.0
+    search.limit_after(SafetyStop("knee is beyond its limit", Cause.POSITION), played)
+    assert search.cap == pytest.approx(0.21)
+
+
+def test_a_path_too_heavy_for_the_motors_is_not_safe_but_smaller_ones_are_tried() -> None:
+    config = chain_config(load_config(LEG))
+    belief = ChainBelief.prior(config)
+    paths = Paths.of(config, belief.torque)
+    heavy = ChainBelief(config, replace(belief.arms, rigid=6.0 * belief.arms.rigid))
+    search = ChainSearch(config, cast("Any", None), LEG, cast("Any", None), print, heavy, paths)
+    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about"):
+        search.safe(step_config(search.config), (1.0, 0.9))

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,13 @@ import serial
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
-from hil.errors import HilError
+from hil.errors import Cause, HilError, SafetyStop
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.servo_session import SETTINGS_NAME, servo_session
+from hil.setup.servo_session import COUNT_DOWN_S, SETTINGS_NAME, servo_session
 from hil.setup.settings_file import settings_path
 from tests.support.command_line import hil
 
@@ -139,6 +140,21 @@ def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_star
     assert bench.changed() == []
 
 
+def test_an_arm_that_was_stopped_moves_again_only_after_an_announcement(arm: Arm, bench: Bench) -> None:
+    config = arm(SHORT)
+    said: list[str] = []
+    began: list[float] = []
+    with servo_session(config, say=said.append):
+        for number in range(4):
+            before = bench.port.clock.now()
+            with suppress(HilError), servo_session(config):
+                began.append(bench.port.clock.now() - before)
+                if number in (1, 2):
+                    raise SafetyStop("It is late.", Cause.LATE)
+    assert [seconds >= COUNT_DOWN_S for seconds in began] == [False, False, True, True]
+    assert len(said) == 2 and said[0].startswith("THE ARM MOVES AGAIN IN 5 s")
+
+
 class _Gone(BaseException):
     """Simulates the end of the program."""
 
@@ -152,10 +168,27 @@ def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
         play(arm(SHORT), tmp_path / "run")
     assert [servo.value("Torque Enable") for servo in bench.port.bus.servos.values()] == [0, 0]
     assert bench.changed() == []
-    if isinstance(stop.value, TorqueNotOff):
-        assert "Joint 'elbow' (ID 2, XM430-W350) answers again: its torque is off" in capsys.readouterr().err
     stopped = (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8")
+    if isinstance(stop.value, TorqueNotOff):
+        assert str(stop.value).startswith("Torque is off on all 2 servos, read back. Joint 'elbow'"), "the last word"
+        assert "answers again" in str(stop.value) and "rebooted" not in str(stop.value)
+        assert "NOT CONFIRMED" not in capsys.readouterr().err
+        assert "Joint 'elbow' (ID 2, XM430-W350) answers again" in stopped.splitlines()[-1]
     assert "missed" in stopped and "replies in a row" in stopped, "the cause, not only that torque was left on"
+
+
+@pytest.mark.parametrize("servo", [1, 2])
+def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
+    arm: Arm, tmp_path: Path, bench: Bench, servo: int
+) -> None:
+    bench.prepare = lambda port: port.bus.faults.add(Fault(kind="reboot", servo=servo, at=2.0, amount=0.4))
+    with pytest.raises(TorqueNotOff, match=r"answers again\. Joint .* was rebooted: its Bus Watchdog") as stop:
+        play(arm(SHORT), tmp_path / "run")
+    cause = str(stop.value.__context__)
+    if servo == 1:  # it hides the second one
+        assert "'elbow' (ID 2, XM430-W350) answered afterwards and joint 'shoulder' (ID 1, XM430-W350) did not" in cause
+        assert "adapter" not in cause, "it is not what all servos share"
+    assert bench.changed() == []
 
 
 def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(

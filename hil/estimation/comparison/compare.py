@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.errors import ConfigError
+from hil.estimation.comparison.chain_compare import compare_chain, worst_chain_error
 from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
 from hil.estimation.truth import true_parameters
@@ -65,13 +65,25 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
     Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
-    only_planar(config, "a comparison with other methods")
+    if config.is_chain:
+        return _compare_chain(run, facts.config, mujoco)
     samples = load_samples(run.samples_path, len(config.joints))
     period = settled_period(config, facts, samples, IDENTIFY)
     held_out = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     truth = true_parameters(config)
     methods = {peer.name: judged(peer, truth, held_out) for peer in all_methods(config, period, truth, mujoco, seed)}
     compared = Comparison(SCHEMA, facts.config, truth, methods)
+    write_json(run.path / "compare.json", to_json(compared))
+    return compared
+
+
+def _compare_chain(run: RunFolder, config: str, mujoco: bool) -> Comparison:
+    truth, peers, judge = compare_chain(run, mujoco)
+    methods = {}
+    for name, peer in peers.items():
+        worst, error = (None, None) if truth is None else worst_chain_error(peer.parameters, truth)
+        methods[name] = _entry(peer, judge.error(peer.parameters), worst, error)
+    compared = Comparison(SCHEMA, config, truth, methods)
     write_json(run.path / "compare.json", to_json(compared))
     return compared
 
@@ -85,7 +97,7 @@ def all_methods(
     length = link_length(config)
     yield from compare_peers(period, length, config.arm.gravity)
     if mujoco:
-        from hil.estimation.mujoco_peer import fit_with_mujoco
+        from hil.estimation.comparison.mujoco_peer import fit_with_mujoco
 
         if length is None and period.joints == 2:
             raise ConfigError("mujoco.sysid needs the length of link 1: add length_1 under [known].")
@@ -106,13 +118,17 @@ def link_length(config: Config) -> float | None:
 def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> MethodResult:
     """Evaluate one method for compare.json."""
     name, worst = (None, None) if truth is None else worst_error(peer.parameters, truth)
+    return _entry(peer, None if held_out is None else _held_out(held_out, peer.parameters), name, worst)
+
+
+def _entry(peer: Peer, held_out: float | None, name: str | None, worst: float | None) -> MethodResult:
     return MethodResult(
         parameters=peer.parameters,
         std=peer.std,
         seconds=round(peer.seconds, 6),
         settings=peer.settings,
         settings_tried=peer.tried,
-        held_out_rms=None if held_out is None else _held_out(held_out, peer.parameters),
+        held_out_rms=held_out,
         worst_relative_error=worst,
         worst_parameter=name,
     )

@@ -1,0 +1,49 @@
+"""The copy of an arm's file that a run folder keeps: it must be readable without the files beside the original."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hil.description.arm import ArmFileError
+from hil.description.files import is_mjcf
+
+
+def kept_bytes(path: Path) -> bytes:
+    """The bytes to keep of a URDF or MJCF file. Raises OSError, ArmFileError.
+
+    A URDF is kept as it is: without its meshes it still has all inertias. MuJoCo, however, cannot read an MJCF whose
+    meshes, textures or included files are missing. Such a file is kept with everything included, the inertias that
+    MuJoCo computed written out, and the shapes that need another file left out.
+    """
+    if not is_mjcf(path) or not (text := _self_contained(path)):
+        return path.read_bytes()
+    return text.encode()
+
+
+def _self_contained(path: Path) -> str:
+    """The MJCF without other files; "" if it needs none as it is."""
+    import mujoco
+
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        model = spec.compile()
+    except ValueError as error:
+        raise ArmFileError(f"{path}: MuJoCo cannot read it: {error}") from error
+    needs = spec.meshes or spec.textures or spec.hfields or spec.skins
+    if not needs and "<include" not in path.read_text(encoding="utf-8"):
+        return ""
+    for body in spec.bodies[1:]:
+        body.explicitinertial = True
+        number = body.id
+        body.mass, body.ipos, body.iquat = model.body_mass[number], model.body_ipos[number], model.body_iquat[number]
+        body.inertia, body.fullinertia = model.body_inertia[number], np.full(6, np.nan)
+    of_files = (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF)
+    for geom in list(spec.geoms):
+        if geom.type in of_files or geom.meshname:
+            spec.delete(geom)
+        else:
+            geom.material = ""
+    for each in (*spec.skins, *spec.meshes, *spec.hfields, *spec.materials, *spec.textures):
+        spec.delete(each)
+    text: str = spec.to_xml()
+    return text

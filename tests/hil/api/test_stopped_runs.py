@@ -1,0 +1,59 @@
+"""What stopped an arm, and the state of its torque, is what the caller gets: no hint takes its place."""
+
+from pathlib import Path
+
+import pytest
+
+from hil.api import experiment
+from hil.errors import Cause, SafetyStop
+from hil.estimation import after_a_stop
+from hil.estimator.errors import RecordingError
+from hil.plan.plan import IDENTIFY
+
+
+class _Run:
+    """A run folder that has samples."""
+
+    path = Path("run")
+    samples_path = path / "samples.npy"
+
+    def discard_if_unused(self) -> bool:
+        return False
+
+
+def test_a_hint_that_fails_leaves_the_stop_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> list[str]:
+        raise RecordingError("joint 1 ends the period elsewhere")
+
+    monkeypatch.setattr(experiment, "_how_to_go_on", fail)
+    stop = SafetyStop("It has lost its torque.", Cause.TORQUE_OFF)
+    stop.add_note("Torque is off on all 2 servos, read back.")
+    with pytest.raises(SafetyStop) as caught, experiment._discarding(_Run(), Path("arm.toml")):  # type: ignore[arg-type]
+        raise stop
+    assert caught.value is stop and caught.value.__notes__ == ["Torque is off on all 2 servos, read back."]
+
+
+def test_a_recording_that_the_estimator_refuses_cannot_be_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Opened:
+        samples_path = Path("samples.npy")
+
+        @classmethod
+        def open(cls, _path: Path) -> "Opened":
+            return cls()
+
+        def load_config(self) -> "Opened":
+            return self
+
+        def load_facts(self) -> "Opened":
+            return self
+
+        segments = (IDENTIFY,)
+        joints = (1, 2)
+
+    def refuse(*_: object) -> None:
+        raise RecordingError("joint 1 ends the period elsewhere")
+
+    monkeypatch.setattr(after_a_stop, "RunFolder", Opened)
+    monkeypatch.setattr(after_a_stop, "load_samples", lambda *_: None)
+    monkeypatch.setattr(after_a_stop, "settled_period", refuse)
+    assert not after_a_stop.can_be_estimated(Path("run"))
