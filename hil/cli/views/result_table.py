@@ -135,21 +135,10 @@ def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
     return cells
 
 
-def _undetermined(result: SettledResult) -> list[str]:
-    """Further terms that this motion hardly determines: their distance from no effect is below their standard error."""
-    names = [
-        name
-        for name, entry in result.extra.items()
-        if kind_of(name) in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
-    ]
-    return [f"Not determined by this motion (within a standard error of none): {', '.join(names)}."] if names else []
-
-
 def _fit(result: SettledResult) -> list[str]:
     fit = result.fit
     residual = ", ".join(f"{value:.3f}" for value in fit.residual_rms_ticks)
     lines = [
-        *_undetermined(result),
         f"Residual {residual} encoder steps RMS; encoder rounding alone gives {fit.quantisation_floor_ticks}.",
     ]
     held_out = result.validation.held_out_rms
