@@ -25,6 +25,7 @@ MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtfu
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
+NOTICEABLE = 0.005  # fraction of the residual below which what a term explains is not worth a sentence
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
 WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # relative to the time in which a change was seen; s
 IMPROVEMENT = {
@@ -136,7 +137,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
 
 def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
     """Return the most likely cause of the residual, with the evidence."""
-    seen = [each for each in evidence.candidates if each.evidence > 1.0]
+    seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:
         what = _in_words(seen[0].part)
         advice = "" if evidence.tried_all else ' [model] friction = "auto" tries that.'

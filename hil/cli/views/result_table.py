@@ -142,7 +142,6 @@ def _fit(result: SettledResult) -> list[str]:
     fit = result.fit
     residual = ", ".join(f"{value:.3f}" for value in fit.residual_rms_ticks)
     lines = [
-        *_undetermined(result),
         f"Residual {residual} encoder steps RMS; encoder rounding alone gives {fit.quantisation_floor_ticks}.",
     ]
     held_out = result.validation.held_out_rms
